@@ -1,7 +1,7 @@
 """What a `cnn` sees in scenes that it has not learnt from: errors of what it reads off, and its heat maps as a picture.
 
-Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], of a dataset that `manip-il redraw` made with a
-seed of its own. The picture needs a policy that has learnt heat maps (`--policy.heatmap_weight`).
+Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], of a dataset of `manip-il data redraw` with
+a seed of its own. The picture needs a policy that has learnt heat maps (`--policy.heatmap_weight`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from manip_il.data.dataset import Dataset
-from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.learn.cnn.modeling_cnn import CNNPolicy
 
@@ -29,7 +28,7 @@ Batch = dict[str, torch.Tensor]
 def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> Batch:
     """Return frames of a dataset as a policy takes them."""
     keys = [IMAGES + camera for camera in cameras]
-    frames: Any = open_frame_cache(root, keys, max_bytes=int(60e9))
+    frames = {key: Dataset.open(root).camera(key).decode() for key in keys}
     table = Dataset.open(root).columns([STATE, ENVIRONMENT_STATE])
     numbers = {key: torch.from_numpy(np.array(column[rows])) for key, column in table.items()}
     return numbers | {key: torch.from_numpy(frames[key][rows]).float() / 255 for key in keys}

@@ -29,7 +29,6 @@ from lerobot.datasets import LeRobotDataset
 
 import datasets
 from manip_il.data.dataset import Dataset
-from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.learn.batches import Augment, pictures_to_float
 from manip_il.learn.limits import threads
@@ -37,7 +36,6 @@ from manip_il.learn.samples import JoinedFrames, SampleSource, Windows
 
 BATCH = 64
 SECONDS = 2.0  # of ours, each time
-PLENTY = 10**12  # bytes
 ROWS = {"plain": None, "augmented": Augment()}
 
 
@@ -77,15 +75,15 @@ def measure(root: Path, folder: Path, repeats: int) -> list[Repeat]:
     peers = [epochs(root, workers) for workers in (2, 0)]
     for peer in peers:
         next(peer)
-    source = our_source(root, folder)
+    source = our_source(root)
     rows = {name: partial(our_epoch, source, augment, iter(range(10**9))) for name, augment in ROWS.items()}
     for epoch in rows.values():
         epoch()
     results: list[Repeat] = []
-    for number in range(repeats):
+    for _ in range(repeats):
         pace = (next(peers[0]), next(peers[1]))
         ours = {name: samples_per_s(epoch) for name, epoch in rows.items()}
-        results.append(Repeat(pace, ours, build_time(root, folder / f"{number}")))
+        results.append(Repeat(pace, ours, build_time(root)))
     return results
 
 
@@ -101,9 +99,8 @@ def epochs(root: Path, workers: int) -> Iterator[float]:
         yield samples / (time.perf_counter() - started)
 
 
-def our_source(root: Path, folder: Path) -> SampleSource:
-    frames = open_frame_cache(root, Dataset.open(root).cameras, max_bytes=PLENTY, folder=folder / "cache")
-    assert frames is not None
+def our_source(root: Path) -> SampleSource:
+    frames = decoded(root)
     table = {key: values for key, values in Dataset.open(root).columns().items() if values.dtype != object}
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
     texts = read_metadata(root).tasks
@@ -134,10 +131,15 @@ def samples_per_s(epoch: Callable[[], int]) -> float:
     return count / (time.perf_counter() - started)
 
 
-def build_time(root: Path, folder: Path) -> float:
+def decoded(root: Path) -> dict[str, np.ndarray]:
+    dataset = Dataset.open(root)
+    return {key: dataset.camera(key).decode() for key in dataset.cameras}
+
+
+def build_time(root: Path) -> float:
     """Seconds that decoding all frames takes."""
     started = time.perf_counter()
-    open_frame_cache(root, Dataset.open(root).cameras, max_bytes=PLENTY, folder=folder)
+    decoded(root)
     return time.perf_counter() - started
 
 

@@ -70,7 +70,7 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
         folder / "bad",
     )
     join(folder / "good", folder / "bad" / "round_001" / "dataset", half)
-    run(f"score {half} --reward={rewards[0]}", folder / "scores")
+    run(f"data score {half} --reward={rewards[0]}", folder / "scores")
     scores = json.loads((folder / "scores" / "scores.json").read_text())
     weights = f"--weights={folder / 'scores' / 'rabc.parquet'}"
     sources = {"weighted": f"{half} {weights}", "as it is": half, "demonstrations alone": folder / "good"}

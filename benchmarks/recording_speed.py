@@ -129,7 +129,6 @@ def record_seconds(
             for episode in selection.take([(header, rollout)]):
                 writer.add(episode)
             if between is not None:
-                writer.wait()  # else what is still being encoded would slow down what comes now
                 paused -= time.perf_counter()
                 between(episode_path(journals, header.seed))
                 paused += time.perf_counter()

@@ -37,7 +37,7 @@ from manip_il.sim.env import EnvConfig
 FIRST = 100
 TURNS = 3
 ENVIRONMENT = ("--robot.type=fetch", "--task.type=reach", "--workers=1")
-COMMANDS = ("record", "resume", "doctor", "info", "train", "push", "pull")
+COMMANDS = ("record", "resume", "check", "info", "train", "push", "pull")
 ROWS = "rows.json"
 
 
@@ -123,7 +123,7 @@ def others(root: Path) -> dict[str, Run]:
     opened = f"Dataset.open(Path({str(root)!r})).summary"
     info = f"from pathlib import Path; from manip_il.data.dataset import Dataset; {opened}"
     runs = {
-        "doctor": manip_il("doctor", str(root)),
+        "check": manip_il("data", "check", str(root)),
         "info": measured([sys.executable, "-c", info]),
         "train": manip_il("train", f"--dataset.root={root}", "--steps=1", f"--output_dir={root.with_name('run')}"),
         "push": manip_il("push", str(root), f"file://{away}"),

@@ -1,92 +1,137 @@
-"""`manip-il doctor DATASET`: find what is wrong with a dataset, and repair it."""
+"""`manip-il data check` and `manip-il data repair`: find what is wrong with a dataset, and repair it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.inputs import hub_hint, require_folder
-from manip_il.cli.progress import progress, say
-from manip_il.errors import ManipError
+from manip_il.cli.progress import say
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
+    from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
-    from manip_il.doctor.patient import Patient
 
-_MODEL = "model_sha256"
+_NO_PART = ("processor", "config_sha256", "cameras_sha256")  # tolerance and horizon are not part of a dataset
 
 
 @dataclass
-class DoctorOptions:
-    """Check any LeRobot v3.0 dataset: files, rows, decoded video frames, statistics, journals.
+class CheckOptions:
+    """Check any LeRobot v3.0 dataset: files, rows, video frames, statistics, and why a policy would not learn from it.
 
-    One line per finding on standard output; exit code 1 after errors, 0 after warnings alone.
-    --repair builds the dataset again from its journals; without them it computes statistics and moves leftovers away.
-    What it replaces is kept in DATASET.before-repair.
+    One line per finding on standard output, with what to do; exit code 1 after errors, 0 after warnings alone.
     """
 
-    example: ClassVar[str] = "manip-il doctor datasets/demos"
+    example: ClassVar[str] = "manip-il data check datasets/demos"
     dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True)
-    repair: bool = option(False, "repair what can be repaired, and keep a copy")
 
     def check(self) -> None:
         """Refuse what is no folder."""
-        require_folder(self.dataset, f"the folder of a LeRobot dataset{hub_hint(self.dataset, 'datasets/')}")
+        require_dataset_folder(self.dataset)
 
     def run(self) -> None:
-        """Examine, repair where asked, and say the verdict; raises `NotWhole` where something stays wrong."""
-        from manip_il.data.episode_table import summarise_drawn
-        from manip_il.doctor.examine import has_errors, repair, verdict
-        from manip_il.doctor.finding import NotWhole
+        """Examine, and say the verdict; raises `NotWhole` after errors."""
+        root = named(self.dataset)
+        say_verdict(root, examine(root))
 
-        dataset, findings = self._examine()
-        if self.repair and any(finding.remedy.name != "NONE" for finding in findings):
-            for line in repair(dataset, findings):
+
+@dataclass
+class RepairOptions:
+    """Build a dataset again from its journals; without them compute counts and statistics, and move leftovers away.
+
+    What it replaces is kept in DATASET.before-repair. Then the dataset is checked again.
+    """
+
+    example: ClassVar[str] = "manip-il data repair datasets/demos"
+    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True)
+
+    def check(self) -> None:
+        """Refuse what is no folder."""
+        require_dataset_folder(self.dataset)
+
+    def run(self) -> None:
+        """Examine, repair, examine again, and say the verdict; raises `NotWhole` if something stays wrong."""
+        from manip_il.doctor.examine import repair
+
+        root = named(self.dataset)
+        if not (findings := examine(root)):
+            say("repair   nothing to repair")
+        elif done := list(repair(root, findings)):
+            for line in done:
                 say(f"repair   {line}")
-            dataset, findings = self._examine()
-        elif self.repair:
-            say("repair   nothing to repair" if not findings else "repair   nothing that can be repaired")
-        if has_errors(findings):
-            raise NotWhole(verdict(dataset, findings))
-        say(verdict(dataset, findings))
-        if dataset.episodes and (drawn := summarise_drawn(dataset.episodes.drawn.values())):
-            say(f"its episodes draw {drawn}")
-
-    def _examine(self) -> tuple[Patient, list[Finding]]:
-        from manip_il.doctor.examine import CHECKS, examine
-        from manip_il.doctor.patient import Patient
-
-        findings: list[Finding] = []
-        with progress(None, "files examined") as bar:
-            named = self.dataset.name not in ("", "..")  # journals and copies beside it are named after it
-            dataset = Patient(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
-            for finding in examine(dataset, (*CHECKS, check_robot)):
-                say(str(finding))
-                findings.append(finding)
-        return dataset, findings
+            findings = examine(root)
+        else:
+            say("repair   nothing that can be repaired")
+        say_verdict(root, findings)
 
 
-def check_robot(dataset: Patient) -> Iterator[Finding]:
+def require_dataset_folder(root: Path) -> None:
+    """Raise `UsageError` unless there is such a folder; what it holds is for the check."""
+    require_folder(root, f"the folder of a LeRobot dataset{hub_hint(root, 'datasets/')}")
+
+
+def named(root: Path) -> Path:
+    """Return the folder by its name: journals and copies beside it are named after it."""
+    return root if root.name not in ("", "..") else root.resolve()
+
+
+def examine(root: Path) -> list[Finding]:
+    """Examine a dataset and print every finding."""
+    from manip_il.doctor.examine import examine_folder
+
+    findings = examine_folder(root, [check_robot])
+    for finding in findings:
+        say(str(finding))
+    return findings
+
+
+def say_verdict(root: Path, findings: list[Finding]) -> None:
+    """Print how much is whole, and what its episodes draw; raises `NotWhole` with the numbers after errors."""
+    from manip_il.data.dataset import Dataset
+    from manip_il.doctor.examine import has_errors
+    from manip_il.doctor.finding import NotWhole, Severity
+
+    severities = [finding.severity for finding in findings]
+    numbers = {kind.value: severities.count(kind) for kind in Severity}
+    counts = [f"{number} {name}{'' if number == 1 else 's'}" for name, number in numbers.items() if number]
+    if has_errors(findings):
+        raise NotWhole(f"{root}: {', '.join(counts)}")
+    dataset = Dataset.open(root)
+    whole = f"{dataset.info.episodes:,} episodes, {dataset.info.frames:,} frames: whole"
+    say(f"{root}: {', '.join([whole, *counts])}")
+    drawn: dict[str, list[Any]] = {}
+    for one in dataset.episodes.drawn.values():
+        for name, value in one.items():
+            drawn.setdefault(name, []).append(value)
+    if drawn:
+        say(f"its episodes draw {', '.join(name + _span(values) for name, values in sorted(drawn.items()))}")
+
+
+def _span(values: list[Any]) -> str:
+    """Return the range of what was drawn, or the words; nothing for anything else."""
+    if all(isinstance(value, str) for value in values):
+        return f" {' or '.join(sorted(set(values)))}"
+    if not all(isinstance(value, int | float) for value in values):
+        return ""
+    low, high = min(values), max(values)
+    return f" {low:.3g}" if low == high else f" {low:.3g} to {high:.3g}"
+
+
+def check_robot(dataset: Dataset) -> Iterator[Finding]:
     """Compare joints, state and compiled model with those of the robot and task in this program."""
+    from manip_il.collect.environments import env_fingerprint, env_spec, is_known
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.lerobot_layout import OURS
-    from manip_il.doctor.finding import error, warning
-
-    try:
-        own = dataset.own
-    except ManipError:
-        return  # named by the check of the spec
-    if own is None:
-        return
-    spec, fingerprint = own.spec, own.fingerprint
-    from manip_il.collect.environments import env_fingerprint, env_spec, is_known
+    from manip_il.doctor.finding import Finding, warning
     from manip_il.sim.env import EnvConfig
     from manip_il.sim.variation import OLDER
 
+    if (own := dataset.own) is None:
+        return
+    spec, fingerprint = own.spec, own.fingerprint
     if not is_known(spec.robot, spec.task):  # a user's own arm or task, of which a dataset holds the name alone
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
@@ -95,12 +140,12 @@ def check_robot(dataset: Patient) -> Iterator[Finding]:
         found, wanted = getattr(spec, what), getattr(here, what)
         older = what == "sim_state_size" and here.sim_state_size - found in OLDER  # before it held all draws
         if found != wanted and not older:
-            yield error(OURS, f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here")
-    # Versions are compared elsewhere; tolerance and horizon are not part of a dataset.
-    if _MODEL in fingerprint:
-        theirs, ours = ({_MODEL: table[_MODEL]} for table in (fingerprint, env_fingerprint(env)))
-        for text in compare_fingerprints("the dataset", theirs, "this program", ours):
-            yield warning(OURS, text)
+            text = f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here"
+            yield Finding(OURS, text, "use the version of this program that recorded it, or record again")
+    ours = env_fingerprint(env)
+    theirs = {key: value for key, value in fingerprint.items() if key in ours and key not in _NO_PART}
+    for text in compare_fingerprints("the dataset", theirs, "this program", {key: ours[key] for key in theirs}):
+        yield warning(OURS, text, f"if labels should be of today: manip-il data relabel {dataset.root}")
 
 
 def _short(value: Any) -> str:

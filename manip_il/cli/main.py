@@ -41,12 +41,6 @@ class Command(NamedTuple):
 COMMANDS = {
     "view": Command("manip_il.cli.view:ViewOptions", "watch a robot at its task, in a window or a browser"),
     "record": Command("manip_il.cli.record:RecordOptions", "record demonstrations of the expert as a dataset"),
-    "render": Command(
-        "manip_il.cli.record:RenderOptions", "render a dataset again, with other cameras, sizes or lights"
-    ),
-    "redraw": Command("manip_il.cli.redraw:RedrawOptions", "draw visited states anew, for policies on pictures"),
-    "relabel": Command("manip_il.cli.relabel:RelabelOptions", "label a dataset's states anew, by the expert of today"),
-    "build": Command("manip_il.cli.record:BuildOptions", "rebuild a dataset from its journals"),
     "train": Command("manip_il.cli.train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
     "dagger": Command("manip_il.cli.dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
     "eval": Command("manip_il.cli.evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
@@ -68,21 +62,43 @@ COMMANDS = {
         "manip_il.cli.preferences:AnswerOptions", "answer pairs by a simulated teacher, who knows true progress"
     ),
     "preferences fit": Command("manip_il.cli.preferences:PreferencesFitOptions", "learn a reward from answers"),
-    "score": Command("manip_il.cli.score:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
-    "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
     "push": Command(
         "manip_il.cli.push_pull:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"
     ),
     "pull": Command("manip_il.cli.push_pull:PullOptions", "download a dataset or policy, every file verified"),
     "export": Command("manip_il.cli.export:ExportOptions", "export a policy as ONNX or TorchScript"),
-    "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
-    "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
+    "data check": Command("manip_il.cli.doctor:CheckOptions", "find what is wrong with a dataset, of any origin"),
+    "data repair": Command("manip_il.cli.doctor:RepairOptions", "repair a dataset, from its journals or its own data"),
+    "data render": Command(
+        "manip_il.cli.record:RenderOptions", "render a dataset again, with other cameras, sizes or lights"
+    ),
+    "data redraw": Command("manip_il.cli.redraw:RedrawOptions", "draw visited states anew, for policies on pictures"),
+    "data relabel": Command("manip_il.cli.relabel:RelabelOptions", "relabel a dataset with the current expert"),
+    "data build": Command("manip_il.cli.record:BuildOptions", "rebuild a dataset from its journals"),
+    "data merge": Command("manip_il.cli.data_merge:DataMergeOptions", "merge datasets of one robot and task"),
+    "data score": Command(
+        "manip_il.cli.score:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"
+    ),
+    "data to-mcap": Command(
+        "manip_il.cli.mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."
+    ),
+    "data from-mcap": Command(
+        "manip_il.cli.mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"
+    ),
     "robot new": Command("manip_il.cli.robot:RobotNewOptions", "write a first YAML for an arm's MJCF"),
     "robot check": Command("manip_il.cli.robot:RobotCheckOptions", "measure what an arm can do, before recording"),
     "quickstart": Command(
         "manip_il.cli.quickstart:QuickstartOptions", "run a small example: record, clone, DAgger, report"
     ),
+}
+
+RENAMED = {
+    "doctor": "data check, and manip-il data repair in place of --repair",
+    **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
+    "mcap export": "data to-mcap",
+    "mcap import": "data from-mcap",
+    "mcap": "data to-mcap, and manip-il data from-mcap",
 }
 
 _HELP_WORDS = ("--help", "-h", "help")
@@ -170,6 +186,9 @@ def _dispatch(words: list[str]) -> None:
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
     """A command's name, of one word or two, and the words behind it; a group's name where only help is asked for."""
+    for name in (" ".join(words[:2]), words[0]):
+        if name in RENAMED:
+            raise UsageError(f"{name!r} has a new name: {PROGRAM} {RENAMED[name]}")
     group = _group(words[0])
     if not group:
         return words[0], words[1:]

@@ -1,4 +1,4 @@
-"""`manip-il mcap export` and `manip-il mcap import`: datasets to MCAP files and back."""
+"""`manip-il data to-mcap` and `manip-il data from-mcap`: datasets to MCAP files and back."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from manip_il.option import option
 class McapExportOptions:
     """Write a LeRobot v3.0 dataset as MCAP, which Foxglove opens: one file per episode, one topic per column.
 
-    With it, mapping.yaml, from which `manip-il mcap import` makes the same dataset again.
+    With it, mapping.yaml, from which `manip-il data from-mcap` makes the same dataset again.
     """
 
-    example: ClassVar[str] = "manip-il mcap export datasets/demos demos_mcap"
+    example: ClassVar[str] = "manip-il data to-mcap datasets/demos demos_mcap"
     dataset: Path = option(MISSING, "the dataset's folder", positional=True)
     out: Path = option(MISSING, "folder for the files", positional=True)
     overwrite: bool = option(False, "replace an existing export")
@@ -47,7 +47,7 @@ class McapExportOptions:
         if missing := left_out(dataset.info):
             say(f"left out, as MCAP has no place for them: {', '.join(missing)}")
         say(f"exported {dataset.info.episodes:,} episodes to {self.out}")
-        say(f"back to a dataset: manip-il mcap import {self.out} DATASET --mapping={self.out / MAPPING}")
+        say(f"back to a dataset: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
 
 
 @dataclass
@@ -58,7 +58,7 @@ class McapImportOptions:
     nearest or previous, with a tolerance in seconds. A gap beyond it is an error.
     """
 
-    example: ClassVar[str] = "manip-il mcap import demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
+    example: ClassVar[str] = "manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
     source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True)
     dataset: Path = option(MISSING, "folder for the dataset", positional=True)
     mapping: Path = option(MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)")

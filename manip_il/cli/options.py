@@ -56,7 +56,7 @@ class Option:
 def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
     """Return every option of a dataclass, groups resolved, in the order of definition.
 
-    field metadata: `help`, one line; `positional=True` for a value without a name (`manip-il doctor DATASET`);
+    field metadata: `help`, one line; `positional=True` for a value without a name (`manip-il data check DATASET`);
     `command_line_only=True` for an option that no file may set, and that no file of options holds.
     """
     found: list[Option] = []

@@ -203,7 +203,7 @@ class PreferencesFitOptions:
         if answers.contradictory:
             warn(f"{answers.contradictory:,} pairs are answered left and right: both answers count")
         say(f"report: {page}")
-        say(f"next: manip-il score DATASET --reward={folder} --output_dir=runs/scores")
+        say(f"next: manip-il data score DATASET --reward={folder} --output_dir=runs/scores")
 
     def _write(self, folder: Path, found: Any, clips: Any) -> None:
         from manip_il.data.dataset import Dataset

@@ -20,9 +20,9 @@ REMOTES = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://H
 class PushOptions:
     """Push a dataset, or a policy with its run, to the Hugging Face Hub, an object store, another machine or a folder.
 
-    A dataset is checked first, as by manip-il doctor, and refused if it has errors. Only changes are uploaded. Readers
-    see the old version until the new one is complete. After an interruption run the same command again: what has
-    arrived is not sent twice.
+    A dataset is checked first, as by manip-il data check, and refused if it has errors. Only changes are uploaded.
+    Readers see the old version until the new one is complete. After an interruption run the same command again: what
+    has arrived is not sent twice.
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
@@ -91,4 +91,4 @@ class PullOptions:
         what = f"a {manifest.kind} of {len(manifest.files)} files, {size}"
         say(f"{remote.name}: {what}; nothing was done" if self.dry_run else f"{self.target}: {what}, all verified")
         if not self.dry_run and manifest.kind == "dataset":
-            say(f"next: manip-il doctor {self.target}")
+            say(f"next: manip-il data check {self.target}")

@@ -160,7 +160,7 @@ class BuildOptions:
     exit code is then 1.
     """
 
-    example: ClassVar[str] = "manip-il build datasets/demos.journals datasets/demos"
+    example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
     journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True)
     dataset: Path = option(MISSING, "folder of the dataset", positional=True)
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded")
@@ -200,7 +200,7 @@ class OwnRobotGroup:
 class RenderOptions:
     """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. Nothing is simulated."""
 
-    example: ClassVar[str] = "manip-il render datasets/demos datasets/demos_dim --cameras=front --look.brightness=0.6"
+    example: ClassVar[str] = "manip-il data render datasets/demos datasets/dim --cameras=front --look.brightness=0.6"
     source: Path = option(MISSING, "a dataset of this program, with or without pictures", positional=True)
     target: Path = option(MISSING, "folder of the new dataset", positional=True)
     robot: OwnRobotGroup = field(default_factory=OwnRobotGroup)

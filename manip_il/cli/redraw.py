@@ -1,4 +1,4 @@
-"""`manip-il redraw`: new scenes of the states that a dataset or a DAgger run visited, labelled and pictured."""
+"""`manip-il data redraw`: new scenes of the states that a dataset or a DAgger run visited, labelled and pictured."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class RedrawOptions:
     sound label are left out.
     """
 
-    example: ClassVar[str] = "manip-il redraw runs/dagger datasets/redrawn --frames=20000"
+    example: ClassVar[str] = "manip-il data redraw runs/dagger datasets/redrawn --frames=20000"
     source: Path = option(MISSING, "a dataset of this program, or the folder of a DAgger run", positional=True)
     target: Path = option(MISSING, "folder of the new dataset", positional=True)
     frames: int = option(20_000, "scenes to draw")

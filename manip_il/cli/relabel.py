@@ -1,4 +1,4 @@
-"""`manip-il relabel`: a dataset with the labels that the expert of today gives its states."""
+"""`manip-il data relabel`: a dataset with the labels that the expert of today gives its states."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class RelabelOptions:
     expert was not asked are labelled, too. Says how many labels changed.
     """
 
-    example: ClassVar[str] = "manip-il relabel datasets/demos"
+    example: ClassVar[str] = "manip-il data relabel datasets/demos"
     dataset: Path = option(MISSING, "a dataset of this program, with or without pictures", positional=True)
     target: Path | None = option(None, "folder of the new dataset; by default DATASET_relabelled", positional=True)
     robot: OwnRobotGroup = field(default_factory=OwnRobotGroup)

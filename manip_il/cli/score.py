@@ -1,4 +1,4 @@
-"""`manip-il score DATASET`: how good every frame and episode is, by a learnt reward or by true progress."""
+"""`manip-il data score DATASET`: how good every frame and episode is, by a learnt reward or by true progress."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ScoreOptions:
     finds them stands beside what true progress would find.
     """
 
-    example: ClassVar[str] = "manip-il score datasets/demos --reward=runs/reward --output_dir=runs/scores"
+    example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"
     dataset: Path = option(MISSING, "the dataset's folder", positional=True)
     reward: str = option(
         MISSING, "folder of manip-il preferences fit, or of a reward model of LeRobot's; progress: true progress"
@@ -64,7 +64,7 @@ class ScoreOptions:
             write_json(folder / FILE_NAME, scores.to_json())
             write_weights(folder / WEIGHTS_FILE, scores)
             page = folder / "report.html"
-            score_report(scores, command_line("score", self), to_plain(self), timings).write(page)
+            score_report(scores, command_line("data score", self), to_plain(self), timings).write(page)
         print_table(worst_table(scores))
         for line in fact_lines(scores):
             say(line)

@@ -59,10 +59,10 @@ class TrainOptions:
     )
     dataset: SourceGroup
     redraw: int = option(
-        0, "learn from so many scenes that are drawn anew from the dataset's states (manip-il redraw), for pictures"
+        0, "learn from so many scenes drawn anew from the dataset's states (manip-il data redraw), for pictures"
     )
     weights: Path | None = option(
-        None, "draw frames by the progress in this file of manip-il score, as LeRobot's RA-BC weighs them"
+        None, "draw frames by the progress in this file of manip-il data score, as LeRobot's RA-BC weighs them"
     )
     policy: Open = option_of(FitConfig, "policy")
     action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
@@ -131,17 +131,17 @@ class TrainOptions:
         if self.redraw < 0:
             raise UsageError(f"--redraw is {self.redraw}; expected the number of scenes")
         if self.redraw and len(self.dataset.root) > 1:
-            raise UsageError("--redraw is for one dataset; redraw each by manip-il redraw, and give those")
+            raise UsageError("--redraw is for one dataset; redraw each by manip-il data redraw, and give those")
         if self.redraw and not self._fit_config().takes_images:
             raise UsageError("--redraw is for policies on pictures; use --policy.type=cnn, or --observation=images")
         if self.redraw and RANK in os.environ:
-            raise UsageError("--redraw is not for processes that were started together; redraw by manip-il redraw")
+            raise UsageError("--redraw is not for processes that were started together; redraw by manip-il data redraw")
 
     def _check_weights(self) -> None:
         if self.weights is None:
             return
         if not self.weights.is_file():
-            raise UsageError(f"--weights is {self.weights}, which is no file; expected rabc.parquet of manip-il score")
+            raise UsageError(f"--weights is {self.weights}, which is no file; expected rabc.parquet of data score")
         if len(self.dataset.root) > 1 or self.redraw:
             raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
 

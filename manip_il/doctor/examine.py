@@ -2,93 +2,53 @@
 
 from __future__ import annotations
 
-import itertools
-import json
+import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 
-from manip_il.data import lerobot_layout as layout
-from manip_il.data.atomic import exclusive, write_file
+from manip_il import checks
+from manip_il.data.atomic import exclusive
 from manip_il.data.build import build
+from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
-from manip_il.data.info import Feature
-from manip_il.data.parquet_files import to_numpy
-from manip_il.data.statistics import RunningStats
-from manip_il.doctor.cameras import check_pictures, check_videos
-from manip_il.doctor.finding import Finding, Remedy, Severity, count_frames, error, list_first, plural
-from manip_il.doctor.leftovers import (
-    BESIDE,
-    check_journals,
-    check_leftovers,
-    check_recorder,
-    check_stale_files,
-    count_readable,
-)
-from manip_il.doctor.meta import (
-    check_episodes,
-    check_fingerprint,
-    check_footers,
-    check_info,
-    check_regular,
-    check_spec,
-    check_tasks,
-)
-from manip_il.doctor.patient import Patient
-from manip_il.doctor.rows import check_columns, check_finite, check_rows, check_statistics, check_task_numbers
+from manip_il.data.info import NUMBERS
+from manip_il.data.lerobot_layout import DATA_FILES, EPISODE_INDEX, INFO, STATS, write_json
+from manip_il.data.statistics import column_statistics
+from manip_il.doctor import files, learning
+from manip_il.doctor.finding import Finding, Severity, by_journals, by_repair, journals_of
 from manip_il.errors import ManipError
 
-Check = Callable[[Patient], Iterator[Finding]]
-
-CHECKS: tuple[Check, ...] = (
-    check_info,
-    check_regular,
-    check_recorder,
-    check_footers,
-    check_episodes,
-    check_tasks,
-    check_columns,
-    check_rows,
-    check_task_numbers,
-    check_finite,
-    check_statistics,
-    check_videos,
-    check_pictures,
-    check_spec,
-    check_fingerprint,
-    check_stale_files,
-    check_leftovers,
-    check_journals,
-)
+Check = Callable[[Dataset], Iterator[Finding]]
+CHECKS: tuple[Check, ...] = (*files.CHECKS, *learning.CHECKS)
+_FILE = re.compile(r"(?:meta|data|videos)/[\w.\-/]*\w")
+_ADVICE = re.compile(r"\W*(?:run|see)? ?`manip-il .*")  # of readers, to examine the dataset
+_PICTURES = 100  # of a camera, of which its statistics are
 
 
-def examine(dataset: Patient, checks: Sequence[Check] = CHECKS) -> Iterator[Finding]:
-    """Yield every finding, as it is found; none for a dataset that is whole.
+def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
+    """Return every finding about a folder, none for a dataset that is whole. Raises nothing, whatever it holds.
 
-    Every file is opened in a child process first; if that needs too much memory or time, this is the only finding.
-    Raises nothing, whatever the folder holds.
+    Every file is opened in a child process first; if that needs too much memory or time, or the folder is no dataset,
+    this is the only finding. more: checks beside those of this room.
     """
     try:
-        check_arrived(dataset.root, strict=False)
+        check_arrived(root, strict=False)
+        dataset = Dataset.open(root)
     except ManipError as problem:
-        yield error(str(dataset.root), str(problem), Remedy.NONE)
-        return
-    for check in checks:
+        return [_explain(root, problem)]
+    found = dict[Finding, None]()  # several checks may need the same file
+    for check in (*CHECKS, *more):
         try:
-            yield from check(dataset)
-        except Exception as problem:  # one check that fails must not hide the others
-            what = check.__name__.replace("_", " ")
-            text = f"{what} could not be finished: {type(problem).__name__}: {problem}"
-            yield error(str(dataset.root), text, Remedy.NONE)
-
-
-def examine_folder(root: Path) -> list[Finding]:
-    """Return all findings about a folder."""
-    return list(examine(Patient(root)))
+            for finding in check(dataset):
+                found[finding] = None
+        except Exception as problem:  # what one check cannot read or finish must not hide the others
+            found[_explain(root, problem)] = None
+    return list(found)
 
 
 def has_errors(findings: Sequence[Finding]) -> bool:
@@ -96,136 +56,87 @@ def has_errors(findings: Sequence[Finding]) -> bool:
     return any(finding.severity is Severity.ERROR for finding in findings)
 
 
-def verdict(dataset: Patient, findings: Sequence[Finding]) -> str:
-    """Return one line: how many episodes and frames are whole, or how many errors and warnings there are."""
-    severities = [finding.severity for finding in findings]
-    counts = {kind.value: severities.count(kind) for kind in Severity}
-    text = ", ".join(plural(count, name) for name, count in counts.items() if count)
-    if has_errors(findings) or dataset.info is None:
-        return f"{dataset.root}: {text}"
-    whole = count_frames(dataset.info.episodes, dataset.info.frames)
-    return f"{dataset.root}: {whole}: whole{f', {text}' if text else ''}"
+def _explain(root: Path, problem: Exception) -> Finding:
+    text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
+    text = _ADVICE.sub("", text).replace(f"{root}/", "").removeprefix(f"{root}: ")
+    text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as if its recorder had died")
+    place = found[-1] if (found := _FILE.findall(text)) else str(root)  # the last is a file in a folder
+    return Finding(place, text, (by_repair if place in (INFO, STATS) else by_journals)(root))
 
 
-def repair(dataset: Patient, findings: Sequence[Finding]) -> Iterator[str]:
+def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
     """Repair what can be repaired; yield one line for each thing that was done, or was not and why.
 
-    Raises `FolderBusyError` where another process is at work on the dataset. Examine the folder anew afterwards.
+    Nothing is deleted: what is replaced or moved is kept in `ROOT.before-repair`. Raises `ManipError` for what is
+    reached through links, and while another process is at work on it. Examine it anew afterwards.
     """
-    with exclusive(dataset.root):
-        to_rebuild = [one for one in findings if one.remedy is Remedy.REBUILD]
-        reason = _why_no_rebuild(dataset) if to_rebuild else ""
-        if to_rebuild and not reason:
-            yield from _rebuild(dataset, findings)
-            return
-        kept = _free_name(dataset.root)
-        yield from _in_place(dataset, findings, kept)
+    kept = root.with_name(f"{root.name}.before-repair")
+    if kept.exists():
+        raise ManipError(f"{kept} is there already, from an earlier repair; move it elsewhere first")
+    if linked := [path for path in root.rglob("*") if not path.resolve().is_relative_to(root.resolve())]:
+        raise ManipError(f"{linked[0]} is a link to elsewhere, where nothing is changed; repair a copy of the dataset")
+    with exclusive(root):
+        if has_errors(findings) and journals_of(root).is_dir():
+            yield _rebuild(root, kept)
+        for path in files.leftovers(root):
+            kept.mkdir(exist_ok=True)
+            shutil.move(path, kept)
+            yield f"moved away: {path.name}"
+        try:
+            for name, compute in ((INFO, _recount), (STATS, _recompute)):
+                if content := compute(root):
+                    kept.mkdir(exist_ok=True)
+                    for path in root.glob(name):
+                        shutil.copy2(path, kept)
+                    write_json(root / name, content)
+                    yield f"computed from the data: {name}"
+        except (ManipError, OSError, ValueError) as problem:
+            yield f"not repaired further: {checks.one_line(problem)}"
         if kept.exists():
             yield f"what was replaced or moved is kept in {kept}"
-        if to_rebuild:
-            yield f"not repaired, as {reason}: {list_first(one.place for one in to_rebuild)}"
-        for one in findings:
-            if one.remedy is Remedy.NONE and one.severity is Severity.ERROR:
-                yield f"not repaired, as there is no copy of it: {one.place}"
 
 
-def _why_no_rebuild(dataset: Patient) -> str:
-    """Return why the dataset cannot be built from its journals; empty where it can."""
-    folder = dataset.journals
-    if not folder.is_dir():
-        return f"there are no journals in {folder.name} to build it from"
+def _rebuild(root: Path, kept: Path) -> str:
+    """Build the dataset from its journals, unless they hold less than it does."""
+    journals, fresh = journals_of(root), root.with_name(f"{root.name}.rebuilt")
     try:
-        count = count_readable(folder)
+        held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
+    except ManipError:
+        held = 0  # nothing of it can be read
+    try:
+        result = build(journals, fresh, replace=True)
     except ManipError as problem:
-        return str(problem)
-    held = len(np.unique(dataset.scan.runs.episode))
-    if count == 0:
-        return f"{folder.name} holds no readable journal"
-    if count < held:
-        return f"{folder.name} makes {plural(count, 'episode')} and the dataset's files still hold {held}"
-    return ""
-
-
-def _rebuild(dataset: Patient, findings: Sequence[Finding]) -> Iterator[str]:
-    root = dataset.root
-    kept = _free_name(root)
+        return f"not rebuilt: {problem}"
+    if result.info.episodes < held:
+        shutil.rmtree(fresh)
+        return f"not rebuilt: {journals.name} makes {result.info.episodes} episodes, and {held} are still readable"
     root.rename(kept)
-    for one in findings:
-        if one.remedy is Remedy.MOVE and one.place.startswith(BESIDE):  # which the builder would delete
-            _move(*_paths(dataset, one.place, kept))
-    try:
-        result = build(dataset.journals, root)
-    except BaseException:
-        if not root.exists():
-            kept.rename(root)
-        raise
-    for line in result.damaged:
-        yield f"left out: {line}"
-    count = plural(result.info.episodes, "episode")
-    yield f"built again from {dataset.journals.name}: {count}; what was there is kept in {kept}"
+    fresh.rename(root)
+    return "; left out: ".join([f"rebuilt from {journals.name}: {result.info.episodes} episodes", *result.damaged])
 
 
-def _in_place(dataset: Patient, findings: Sequence[Finding], kept: Path) -> Iterator[str]:
-    """Move leftovers away and compute statistics."""
-    if any(one.remedy is Remedy.STATISTICS for one in findings) and dataset.reads_all_rows:
-        yield _compute_statistics(dataset, kept)
-    for place in dict.fromkeys(one.place for one in findings if one.remedy is Remedy.MOVE):
-        source, target = _paths(dataset, place, kept)
-        if not _is_inside(dataset.root, source, beside=place.startswith(BESIDE)):
-            yield f"not moved, as it is outside the dataset (reached through a link): {place}"
+def _recount(root: Path) -> dict[str, Any]:
+    """Return info.json with the counts of episodes, rows and tasks that are there; empty if it has them."""
+    dataset, about = Dataset.open(root), checks.read_json(root / INFO, "a dataset's description")
+    rows = sum(pq.read_metadata(path).num_rows for path in root.glob(DATA_FILES))
+    counts = {"total_episodes": len(dataset.episodes), "total_frames": rows, "total_tasks": len(dataset.tasks)}
+    right = {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}}
+    return {} if about.items() >= counts.items() else right
+
+
+def _recompute(root: Path) -> dict[str, Any]:
+    """Return statistics of finite columns and, from some pictures, of cameras; empty if the stored ones are right."""
+    if not any(finding.place.startswith(STATS) for finding in examine_folder(root)):
+        return {}
+    dataset, stats = Dataset.open(root), dict[str, Any]()
+    for key, feature in dataset.features.items():
+        if feature.is_rgb:
+            rows = np.unique(np.linspace(0, len(dataset) - 1, _PICTURES).astype(np.int64))
+            values, shape = dataset.frames(key, rows).reshape(-1, 3) / 255, (3, 1, 1)
+        elif feature.dtype in NUMBERS and np.isfinite(values := dataset.columns([key])[key]).all():
+            values, shape = values.reshape(-1, *feature.shape[-1:]), (-1,)
+        else:
             continue
-        _move(source, target)
-        yield f"moved away: {place}"
-
-
-def _compute_statistics(dataset: Patient, kept: Path) -> str:
-    """Compute statistics of all columns of numbers; those of pictures stay as they are."""
-    path = dataset.root / layout.STATS
-    if not _is_inside(dataset.root, path):
-        return f"not recomputed: {layout.STATS} is outside the dataset (reached through a link)"
-    if path.exists():
-        (kept / layout.STATS).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(path, kept / layout.STATS)
-    stats: dict[str, Any] = dict(dataset.stats or {})
-    features = dataset.info.features if dataset.info else {}
-    sound = [key for key, moments in dataset.scan.moments.items() if moments.rows and not moments.bad_rows]
-    for key in sound:
-        stats[key] = _statistics(dataset, features[key])
-    write_file(path, json.dumps(stats, indent=4, ensure_ascii=False).encode())
-    return f"recomputed from the data: {layout.STATS}, {plural(len(sound), 'column')}"
-
-
-def _statistics(dataset: Patient, feature: Feature) -> dict[str, list[float]]:
-    """Compute one column's statistics; a matrix' over its last axis, as LeRobot has them."""
-    last = feature.shape[-1] if feature.shape else 1
-    with closing(RunningStats(dataset.root)) as running:
-        for shard in dataset.data_shards:
-            for table in shard.tables([feature.key]):
-                values = to_numpy(table.column(feature.key), feature.dtype, feature.shape, exact=True)
-                running.add({feature.key: values.reshape(-1, last)})
-        return {**running.result()[feature.key], "count": [dataset.scan.moments[feature.key].rows]}
-
-
-def _paths(dataset: Patient, place: str, kept: Path) -> tuple[Path, Path]:
-    """Return the path of a leftover, and the one that it is moved to."""
-    if place.startswith(BESIDE):
-        return dataset.root.with_name(Path(place).name), kept / Path(place).name
-    return dataset.root / place, kept / place
-
-
-def _is_inside(root: Path, path: Path, *, beside: bool = False) -> bool:
-    """Return whether a file or folder is in the dataset itself, or beside it, and not reached through a link."""
-    folder, home = path.parent.resolve(), root.resolve()
-    return folder == home.parent if beside else folder.is_relative_to(home)
-
-
-def _move(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.move(source, target)
-
-
-def _free_name(root: Path) -> Path:
-    """Return the first of `<root>.before-repair`, `<root>.before-repair-2`, ... that is not there."""
-    name = f"{root.name}.before-repair"
-    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-    return next(path for path in map(root.with_name, names) if not path.exists())
+        table = {**column_statistics({key: values})[key], "count": np.array([len(dataset)])}
+        stats[key] = {name: one.reshape(shape if one.size > 1 else -1).tolist() for name, one in table.items()}
+    return stats

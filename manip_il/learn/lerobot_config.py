@@ -36,7 +36,7 @@ _OF_THE_MACHINE = ("device", "pretrained_path")  # where a policy runs and where
 _LACKING = {
     STATE: "every policy needs the measured joints",
     ENVIRONMENT_STATE: "choose the observation 'images', or record with `manip-il record`",
-    IMAGES: "record with --cameras=front,wrist, add pictures with `manip-il render`, or choose the observation 'state'",
+    IMAGES: "record with --cameras=front,wrist, add pictures (`manip-il data render`), or choose observation 'state'",
     ACTION: "there is nothing to learn",
 }
 

@@ -1,4 +1,4 @@
-"""The page and the lines of `manip-il score`."""
+"""The page and the lines of `manip-il data score`."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def _refuse_damaged(dataset: Path) -> None:
     first = next((finding for finding in examine_folder(dataset) if finding.severity is Severity.ERROR), None)
     if first is not None:
         text = f"{dataset} is damaged and was not pushed: {' '.join(str(first).split())}"
-        raise NotWhole(f"{text}; see all with manip-il doctor {dataset}, and repair it with --repair=true")
+        raise NotWhole(f"{text}; see all with manip-il data check {dataset}, and repair it with --repair=true")
 
 
 def _compare(local: Mapping[str, Path], kind: Kind, remote: Hub | Objects) -> Plan:

@@ -1,4 +1,4 @@
-"""`manip-il mcap export` and `manip-il mcap import`, as typed."""
+"""`manip-il data to-mcap` and `manip-il data from-mcap`, as typed."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def dataset(tmp_path_factory) -> Path:
 @pytest.mark.slow
 def test_what_is_exported_is_imported_and_what_the_mapping_leaves_out_is_said(dataset, tmp_path, capsys):
     out, mapping = tmp_path / "out", tmp_path / "m.yaml"
-    assert main(["mcap", "export", str(dataset), str(out)]) == 0
-    assert f"manip-il mcap import {out} DATASET --mapping={out / 'mapping.yaml'}" in capsys.readouterr().out
-    assert main(["mcap", "import", str(out), str(tmp_path / "all"), f"--mapping={out / 'mapping.yaml'}"]) == 0
+    assert main(["data", "to-mcap", str(dataset), str(out)]) == 0
+    assert f"manip-il data from-mcap {out} DATASET --mapping={out / 'mapping.yaml'}" in capsys.readouterr().out
+    assert main(["data", "from-mcap", str(out), str(tmp_path / "all"), f"--mapping={out / 'mapping.yaml'}"]) == 0
     assert capsys.readouterr().out == f"imported 2 episodes, 8 frames to {tmp_path / 'all'}\n"
     feature = "{topic: /action, field: 'joints[name=b].position', dtype: float32, resample: previous, tolerance: 0.1}"
     mapping.write_text(f"fps: 10\ntask: t\nfeatures:\n  action: {feature}\n")
-    assert main(["mcap", "import", str(out), str(tmp_path / "new"), f"--mapping={mapping}"]) == 0
+    assert main(["data", "from-mcap", str(out), str(tmp_path / "new"), f"--mapping={mapping}"]) == 0
     rest, done = capsys.readouterr().out.splitlines()
     assert rest.startswith("topics that the mapping does not name: /actor, /beta, ")
     assert done.startswith("imported 2 episodes, 4 frames")
@@ -45,7 +45,7 @@ def test_what_is_exported_is_imported_and_what_the_mapping_leaves_out_is_said(da
 
 def test_an_export_is_replaced_only_when_told_to(dataset, tmp_path, error):
     out = tmp_path / "out"
-    words = ["mcap", "export", str(dataset), str(out)]
+    words = ["data", "to-mcap", str(dataset), str(out)]
     assert main(words) == 0
     before = {path.name: path.read_bytes() for path in out.glob("*.mcap")}
     assert len(before) == 2
@@ -58,7 +58,7 @@ def test_an_export_is_replaced_only_when_told_to(dataset, tmp_path, error):
 
 def test_an_export_never_overwrites_its_own_dataset(dataset, error):
     for out in (dataset, dataset / ".." / dataset.name, dataset.parent):
-        assert main(["mcap", "export", str(dataset), str(out), "--overwrite=true"]) == 2
+        assert main(["data", "to-mcap", str(dataset), str(out), "--overwrite=true"]) == 2
         assert "holds the dataset itself" in error()
     assert len(Dataset.open(dataset).columns()["seed"]) == 8
 
@@ -67,17 +67,17 @@ def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path
     mapping = tmp_path / "m.yaml"
     mapping.write_text("fps: 10\ntask: t\nfeatures: {a: {topic: /a, video: true, resample: previous, tolerance: 1}}\n")
     (tmp_path / "a.mcap").touch()
-    words = ["mcap", "import", str(tmp_path / "a.mcap"), str(dataset), f"--mapping={mapping}"]
+    words = ["data", "from-mcap", str(tmp_path / "a.mcap"), str(dataset), f"--mapping={mapping}"]
     assert main(words) == 2
     assert error().endswith("exists already; choose another folder, or delete it first")
 
 
 def test_help_of_two_words(capsys):
-    for words in (["mcap"], ["mcap", "--help"]):
+    for words in (["data"], ["data", "--help"]):
         assert main(words) == 0
         out = capsys.readouterr().out
-        assert "usage: manip-il mcap COMMAND" in out
-        assert "  mcap import  " in out
+        assert "usage: manip-il data COMMAND" in out
+        assert "  data from-mcap  " in out
         assert "record" not in out
-    assert main(["mcap", "import", "--help"]) == 0
-    assert "usage: manip-il mcap import SOURCE DATASET [--option=value ...]" in capsys.readouterr().out
+    assert main(["data", "from-mcap", "--help"]) == 0
+    assert "usage: manip-il data from-mcap SOURCE DATASET [--option=value ...]" in capsys.readouterr().out

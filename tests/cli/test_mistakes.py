@@ -56,7 +56,7 @@ def mistakes(cases: dict[str, str], cwd: Path, heavy: list[str] = HEAVY) -> None
 def test_help_of_every_command_imports_nothing_heavy(tmp_path):
     of_results = ("compare", "study")
     light = [[*name.split(), "--help"] for name in COMMANDS if name not in of_results]
-    given = answers([[], ["--help"], ["mcap"], *light], tmp_path, LIGHT)
+    given = answers([[], ["--help"], ["data"], *light], tmp_path, LIGHT)
     given += answers([[name, "--help"] for name in of_results], tmp_path)
     assert all(code == 0 and out.startswith("usage: manip-il") for _, code, out, _ in given)
     assert given[0][2] == given[1][2]
@@ -65,7 +65,7 @@ def test_help_of_every_command_imports_nothing_heavy(tmp_path):
 
 
 def test_a_mistyped_command_or_option_imports_nothing_heavy(tmp_path):
-    cases = [["trian"], ["mcap", "exprot"], *([*name.split(), "--nosuch=1"] for name in COMMANDS)]
+    cases = [["trian"], ["data", "chekc"], *([*name.split(), "--nosuch=1"] for name in COMMANDS)]
     for _, code, _, err in answers(cases, tmp_path):
         assert (code, err.count("\n"), err.startswith("manip-il: error: ")) == (2, 1, True)
 
@@ -91,21 +91,25 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             "merge a b": "a does not exist; expected an eval.json",
             "compare a b": "a does not exist; expected an eval.json, a policy",
             "study missing.yaml": "missing.yaml does not exist; expected the YAML of a study",
-            "render missing out": no_dataset,
-            "doctor missing": no_dataset,
-            "mcap export missing out": no_dataset,
-            "mcap import missing out --mapping=m.yaml": "missing does not exist; expected an MCAP file",
-            "mcap import . out --mapping=m.yaml": "m.yaml does not exist; expected a mapping file",
-            "mcap import missing out": "--mapping is missing",
-            "mcap import missing out --maping=m.yaml": "(did you mean '--mapping'?)",
-            "mcap export": "DATASET is missing",
-            "mcap expotr a b": "unknown command 'mcap expotr' (did you mean 'mcap export'?); known: mcap export, ",
-            "build missing out": "missing does not exist; expected one of episode-*.mcap files",
-            f"build {ROOT}": "DATASET is missing",
-            "render SAMPLE": "TARGET is missing",
-            "doctor": "DATASET is missing",
-            "doctor a b": "unexpected 'b'",
-            "doctor . --fix": "unknown option '--fix'",
+            "data render missing out": no_dataset,
+            "data check missing": no_dataset,
+            "data to-mcap missing out": no_dataset,
+            "data from-mcap missing out --mapping=m.yaml": "missing does not exist; expected an MCAP file",
+            "data from-mcap . out --mapping=m.yaml": "m.yaml does not exist; expected a mapping file",
+            "data from-mcap missing out": "--mapping is missing",
+            "data from-mcap missing out --maping=m.yaml": "(did you mean '--mapping'?)",
+            "data to-mcap": "DATASET is missing",
+            "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: data build, ",
+            "data merge a --output=x": "a is the only one; expected two or more datasets",
+            "doctor x --repair": "'doctor' has a new name: manip-il data check, and manip-il data repair",
+            "mcap export a b": "'mcap export' has a new name: manip-il data to-mcap",
+            "score --help": "'score' has a new name: manip-il data score",
+            "data build missing out": "missing does not exist; expected one of episode-*.mcap files",
+            f"data build {ROOT}": "DATASET is missing",
+            "data render SAMPLE": "TARGET is missing",
+            "data check": "DATASET is missing",
+            "data check a b": "unexpected 'b'",
+            "data check . --fix": "unknown option '--fix'",
             "merge": "FILES",
             "merge a": "two or more",
             "merge a a": "given twice",
@@ -138,13 +142,13 @@ def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
             "record --engine=rai": "did you mean 'ray'?",
             "record --dataset.num_episodes=0": "expected at least 1",
             "record --dataset.repo_id=name": "expected USER/NAME",
-            "render SAMPLE x --cameras=": "--cameras names none; expected any of front, side, wrist",
-            "redraw SAMPLE x --cameras=": "--cameras names none; expected any of front, side, wrist",
-            "redraw SAMPLE x --frames=0": "--frames is 0; expected at least 1",
-            "redraw SAMPLE x --branch_steps=0": "--branch_steps is 0; expected at least 1",
-            "redraw nowhere x": "nowhere does not exist; expected the folder of a LeRobot dataset",
-            "redraw SAMPLE SAMPLE": "overlaps SOURCE",
-            "render SAMPLE x --look.brightness=9": "brightness is 9.0; expected a factor from 0.1 to 2.0",
+            "data render SAMPLE x --cameras=": "--cameras names none; expected any of front, side, wrist",
+            "data redraw SAMPLE x --cameras=": "--cameras names none; expected any of front, side, wrist",
+            "data redraw SAMPLE x --frames=0": "--frames is 0; expected at least 1",
+            "data redraw SAMPLE x --branch_steps=0": "--branch_steps is 0; expected at least 1",
+            "data redraw nowhere x": "nowhere does not exist; expected the folder of a LeRobot dataset",
+            "data redraw SAMPLE SAMPLE": "overlaps SOURCE",
+            "data render SAMPLE x --look.brightness=9": "brightness is 9.0; expected a factor from 0.1 to 2.0",
             f"{train} --policy.type=atc": "unknown policy 'atc' (did you mean 'act'?)",
             f"{train} --policy.type=mpl": "did you mean 'mlp'?",
             f"{train} --policy.lr=1": "unknown option of --policy.type=mlp: 'lr'",

@@ -40,7 +40,7 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert main(["dagger", robot, *REACH, *SHORT, "--output_dir=dagger"]) == 0
     assert (tmp_path / "dagger" / "best").is_dir()
     assert "pretrained_model --robot.type=arms/mine.yaml --output_dir=dagger/test" in capsys.readouterr().out
-    render = ["render", "datasets/mine_reach", "seen", "--cameras=front"]
+    render = ["data", "render", "datasets/mine_reach", "seen", "--cameras=front"]
     assert main(render) == 1
     assert "a robot of your own is given by --robot.type=PATH/mine.yaml" in capsys.readouterr().err
     assert main([*render, "--robot.type=panda"]) == 1

@@ -46,7 +46,7 @@ def test_resuming_what_never_began_begins(recorded, tmp_path, capsys):
 
 
 def test_the_journals_give_the_datasets_bytes_again(recorded, tmp_path):
-    assert main(["build", str(journals_of(recorded)), str(tmp_path / "again")]) == 0
+    assert main(["data", "build", str(journals_of(recorded)), str(tmp_path / "again")]) == 0
     assert files(tmp_path / "again") == files(recorded)
 
 
@@ -55,7 +55,7 @@ def test_a_damaged_journal_is_left_out_and_said(recorded, tmp_path, capsys):
     shutil.copytree(journals_of(recorded), journals)
     cut = list_episodes(journals)[1]
     cut.write_bytes(cut.read_bytes()[:-40])
-    assert main(["build", str(journals), str(tmp_path / "x")]) == 1
+    assert main(["data", "build", str(journals), str(tmp_path / "x")]) == 1
     err = capsys.readouterr().err
     assert f"warning: {cut} is not a complete episode" in err
     assert "error: 1 journal could not be read" in err
@@ -67,7 +67,7 @@ def test_a_damaged_journal_is_left_out_and_said(recorded, tmp_path, capsys):
 
 
 def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, error):
-    words = ["build", str(journals_of(recorded)), str(tmp_path / "x")]
+    words = ["data", "build", str(journals_of(recorded)), str(tmp_path / "x")]
     assert main(words) == 0
     before = files(tmp_path / "x")
     assert main(words) == 2
@@ -82,7 +82,7 @@ def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, error):
 
 def test_no_journals_are_an_error(here, error):
     Path("empty.journals").mkdir()
-    assert main(["build", "empty.journals", "x"]) == 1
+    assert main(["data", "build", "empty.journals", "x"]) == 1
     assert "holds no readable episode" in error()
     assert not Path("x").exists()
 
@@ -94,7 +94,7 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
     assert main(record(tmp_path / "one", *pictured)) == 0
     assert main(record(tmp_path / "two", *pictured, "--workers=2")) == 0
     assert files(tmp_path / "one") == files(tmp_path / "two")
-    assert main(["build", str(journals_of(tmp_path / "one")), str(tmp_path / "again")]) == 0
+    assert main(["data", "build", str(journals_of(tmp_path / "one")), str(tmp_path / "again")]) == 0
     assert files(tmp_path / "again") == files(tmp_path / "one")
     frames = Dataset.open(tmp_path / "one").columns(["index"])["index"]
     episodes = list(Dataset.open(tmp_path / "one").read_episodes())
@@ -104,9 +104,9 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
         assert len(np.unique(decoded)) > 50  # something is to be seen
     [video, _] = (tmp_path / "again").rglob("*.mp4")
     video.write_bytes(video.read_bytes()[:-1000])
-    assert main(["doctor", str(tmp_path / "again")]) == 1
+    assert main(["data", "check", str(tmp_path / "again")]) == 1
     shutil.copytree(journals_of(tmp_path / "one"), journals_of(tmp_path / "again"))
-    assert main(["doctor", str(tmp_path / "again"), "--repair=true"]) == 0
+    assert main(["data", "repair", str(tmp_path / "again")]) == 0
     assert files(tmp_path / "again") == files(tmp_path / "one")
 
 
@@ -123,7 +123,7 @@ def demos(here) -> Path:
 @pytest.mark.gl
 @pytest.mark.slow
 def test_the_command_makes_a_dataset_with_the_asked_pictures(demos, capsys):
-    assert main(["render", "demos", "seen", "--workers=1", "--image.height=48", "--image.width=64"]) == 0
+    assert main(["data", "render", "demos", "seen", "--workers=1", "--image.height=48", "--image.width=64"]) == 0
     said = capsys.readouterr()
     assert "rendered 3 episodes, 18 frames: front, side, wrist, 48 x 64 pixels\ndataset: seen\n" in said.out
     assert "render demos: 3/3" in said.err
@@ -137,9 +137,9 @@ def test_the_command_makes_a_dataset_with_the_asked_pictures(demos, capsys):
 @pytest.mark.slow
 def test_two_workers_write_the_bytes_of_one(demos):
     words = ["--cameras=wrist", "--image.height=32", "--image.width=32", "--look.shadows=true", "--look.light_turn=30"]
-    assert main(["render", "demos", "one", "--workers=1", *words]) == 0
+    assert main(["data", "render", "demos", "one", "--workers=1", *words]) == 0
     Path("again").mkdir()
-    assert main(["render", "demos", "again/one", "--workers=2", *words]) == 0
+    assert main(["data", "render", "demos", "again/one", "--workers=2", *words]) == 0
     assert files(Path("one")) == files(Path("again/one"))
     assert Dataset.open(Path("one")).provenance["rendered"]["cameras"]["look"] == asdict(
         Look(shadows=True, light_turn=30)
@@ -159,7 +159,7 @@ def test_two_workers_write_the_bytes_of_one(demos):
 def test_wrong_words_are_answered_with_one_line_and_nothing_changes(demos, error, words, code, message):
     atomic_write(Path("full/thesis.txt"), "")
     before = files(Path())
-    assert main(["render", *words]) == code
+    assert main(["data", "render", *words]) == code
     assert message in error()
     assert files(Path()) == before
 
@@ -172,6 +172,6 @@ def test_without_opengl_what_was_there_stays(demos, error, monkeypatch):
     monkeypatch.setattr("mujoco.egl.GLContext", broken)
     shutil.copytree("demos", "x")
     before = files(Path())
-    assert main(["render", "demos", "x", "--workers=1", "--overwrite=true", "--quiet"]) == 1
+    assert main(["data", "render", "demos", "x", "--workers=1", "--overwrite=true", "--quiet"]) == 1
     assert "no off-screen OpenGL (ImportError: cannot load libEGL.so.1); on Debian: apt" in error()
     assert files(Path()) == before

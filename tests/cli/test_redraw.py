@@ -1,4 +1,4 @@
-"""`manip-il redraw`: a dataset to train from, the same on two workers, and read by LeRobot."""
+"""`manip-il data redraw`: a dataset to train from, the same on two workers, and read by LeRobot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def demos(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def redrawn(demos, tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("redrawn") / "new"
-    assert main(["redraw", str(demos), str(root), *SMALL]) == 0
+    assert main(["data", "redraw", str(demos), str(root), *SMALL]) == 0
     return root
 
 
@@ -49,7 +49,7 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
         assert ((places >= 0) & (places <= 1)).all()
         assert places.reshape(60, -1, 3)[:, :2, 2].any()
     assert Dataset.open(redrawn).columns(["label_valid"])["label_valid"].all()
-    assert main(["doctor", str(redrawn)]) == 0
+    assert main(["data", "check", str(redrawn)]) == 0
     dataset: Any = LeRobotDataset("local/new", root=redrawn)
     assert dataset[7]["observation.images.side"].shape == (3, 32, 32)
     inputs = dataset_to_policy_features(dataset.meta.features)
@@ -60,7 +60,7 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
 @pytest.mark.slow
 def test_two_workers_write_the_same_bytes(redrawn, demos, tmp_path):
     two = tmp_path / "new"
-    assert main(["redraw", str(demos), str(two), *SMALL[:3], "--workers=2", "--quiet"]) == 0
+    assert main(["data", "redraw", str(demos), str(two), *SMALL[:3], "--workers=2", "--quiet"]) == 0
     assert digests(two) == digests(redrawn)
 
 
@@ -69,7 +69,7 @@ def test_two_workers_write_the_same_bytes(redrawn, demos, tmp_path):
 def test_branches_are_episodes_for_policies_that_plan(demos, tmp_path):
     target = tmp_path / "branches"
     words = ["--frames=6", "--branch_steps=4", *SMALL[1:]]
-    assert main(["redraw", str(demos), str(target), *words]) == 0
+    assert main(["data", "redraw", str(demos), str(target), *words]) == 0
     assert (Dataset.open(target).summary.episodes, Dataset.open(target).summary.frames) == (6, 24)
     table = Dataset.open(target).columns(["action", "executed_action"])
     np.testing.assert_array_equal(table["action"], table["executed_action"])
@@ -85,7 +85,7 @@ def test_branches_are_episodes_for_policies_that_plan(demos, tmp_path):
 )
 def test_wrong_words_are_one_line_and_nothing_is_written(demos, words, message, tmp_path, capsys):
     before = files(tmp_path)
-    assert main(["redraw", str(demos), str(tmp_path / "new"), *words]) in (1, 2)
+    assert main(["data", "redraw", str(demos), str(tmp_path / "new"), *words]) in (1, 2)
     said = capsys.readouterr().err
     assert message in said
     assert said.count("\n") == 1
@@ -100,7 +100,7 @@ def test_a_dataset_of_another_scene_is_refused(lacks, demos, tmp_path, capsys):
     about = json.loads(ours.read_text())
     about["spec"]["sim_state_size" if lacks == "sim_state" else "task"] = 7 if lacks == "sim_state" else "sculpt"
     ours.write_text(json.dumps(about))
-    assert main(["redraw", str(other), str(tmp_path / "new"), *SMALL]) == 1
+    assert main(["data", "redraw", str(other), str(tmp_path / "new"), *SMALL]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 

@@ -108,7 +108,7 @@ def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvC
 @pytest.mark.slow
 def test_relabelling_copies_videos(tmp_path):
     root = write(recorded(REACH, cameras=SMALL), tmp_path / "demos", REACH, SMALL)
-    assert main(["relabel", str(root), "--workers=1", "--quiet"]) == 0
+    assert main(["data", "relabel", str(root), "--workers=1", "--quiet"]) == 0
     before, after = digests(root / "videos"), digests(tmp_path / "demos_relabelled" / "videos")
     assert before == after != {}
 

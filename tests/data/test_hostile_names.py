@@ -56,7 +56,7 @@ def attack(tmp_path: Path, make_episode: MakeEpisode, seen: s.RobotTaskSpec, mon
 
 def test_a_camera_named_as_a_path_overwrites_no_other_dataset(attack, victim, capsys):
     before = digests(victim)
-    assert main(["build", str(attack), str(attack.with_name("lift"))]) == 1
+    assert main(["data", "build", str(attack), str(attack.with_name("lift"))]) == 1
     error = capsys.readouterr().err.strip()
     assert error.count("\n") == 0
     assert "a camera is 'x/../../../victim" in error

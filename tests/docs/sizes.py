@@ -46,7 +46,7 @@ OF_COMMAND: dict[str, Sizes] = {
     "gail": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
     "airl": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
     "ppo": {"episodes": 2, "episode_steps": 20, "ppo.minibatches": 2, "ppo.epochs": 1},
-    "redraw": {"frames": 30, "image.height": 96, "image.width": 96},  # diffusion cuts out 84 x 84 pixels
+    "data redraw": {"frames": 30, "image.height": 96, "image.width": 96},  # diffusion cuts out 84 x 84 pixels
     "view": {"output": "seen.rrd"},  # a viewer that is served lives as long as its process, which runs all the lines
 }
 OF_POLICY: dict[str, Sizes] = {

@@ -17,9 +17,10 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "datasets/demos": "record --dataset.root=datasets/demos",
     "datasets/demos.journals": "record --dataset.root=datasets/demos",
     "datasets/seen": "record --cameras=front,wrist --dataset.root=datasets/seen",
+    "datasets/more": "record --dataset.root=datasets/more",
     "datasets/carry": "record --task.type=carry --dataset.root=datasets/carry",
     "runs/irl": "irl datasets/carry --output_dir=runs/irl",
-    "demos_mcap": "mcap export datasets/demos demos_mcap",
+    "demos_mcap": "data to-mcap datasets/demos demos_mcap",
     "runs/act": "train --policy.type=act --dataset.root=datasets/demos --output_dir=runs/act",
     "runs/cloned": "train --dataset.root=datasets/demos --output_dir=runs/cloned",
     "policy": "train --dataset.root=datasets/demos --output_dir=policy",
@@ -37,7 +38,7 @@ READ_BY = {"pairs.json": "runs/dagger"}  # what a file names, and a command that
 ARM = Path("my_arm.yaml")
 SAMPLE = "datasets/sample"  # comes with the repository
 _OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root")
-_TARGETS = ("build", "render", "mcap export", "mcap import", "pull")  # their second place is made, not read
+_TARGETS = ("data build", "data render", "data to-mcap", "data from-mcap", "pull")  # make their second
 
 
 class Stock:

@@ -24,7 +24,7 @@ from .stock import Stock
 from .workplace import PROGRAM, RULES, LeRobot, Workplace
 
 BUCKET = "robots"  # the one in the docs
-_DRAWS = ("--cameras=", "redraw", "--video", "manip-il render", "manip-il health", "datasets/seen", "preferences ask")
+_DRAWS = ("--cameras=", "redraw", "--video", "data render", "manip-il health", "datasets/seen", "preferences ask")
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,7 @@ _OTHERS = {  # of other programs, by their own manuals
 }  # fmt: skip
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _VALUE = "\0"  # in an f-string
-_INLINE_COMMAND = re.compile(r"`manip-il ([a-z]+(?: [a-z]+)?)")
+_INLINE_COMMAND = re.compile(r"`manip-il ([a-z]+(?: [a-z-]+)?)")
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -35,7 +35,7 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     assert "are answered left and right: both answers count" in err
     found = json.loads((here / "reward" / "fit.json").read_text())
     assert found["agreement_with_progress"]["of"] + found["ties"] == 40
-    assert run("score bad --reward=reward --output_dir=scores") == 0
+    assert run("data score bad --reward=reward --output_dir=scores") == 0
     assert "next: manip-il train --dataset.root=bad --weights=scores/rabc.parquet" in capsys.readouterr().out
     words = "--dataset.root=bad --weights=scores/rabc.parquet --steps=2 --batch_size=8 --policy.width=8"
     assert run(f"train {words} --output_dir=weighted") == 0
@@ -52,7 +52,7 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
 
 
 def test_true_progress_scores_without_a_reward(here, capsys):
-    assert run("score good --reward=progress --output_dir=scores") == 0
+    assert run("data score good --reward=progress --output_dir=scores") == 0
     assert len(json.loads((here / "scores/scores.json").read_text())["episodes"]) == 8
     assert {path.name for path in (here / "scores").iterdir()} == {
         *("config.yaml", "rabc.parquet", "report.html", "scores.json"),
@@ -72,8 +72,8 @@ def test_true_progress_scores_without_a_reward(here, capsys):
         ("preferences answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
         ("preferences fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
         ("preferences fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),
-        ("score good --reward=nowhere", "nowhere does not exist; expected a reward", 2),
-        ("score nowhere --reward=progress", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        ("data score good --reward=nowhere", "nowhere does not exist; expected a reward", 2),
+        ("data score nowhere --reward=progress", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
         ("train --dataset.root=good --weights=nowhere.parquet", "--weights is nowhere.parquet, which is no file", 2),
         ("train --dataset.root=good,bad --weights=good/meta/info.json", "give one, and no --redraw", 2),
     ],

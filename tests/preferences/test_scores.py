@@ -69,7 +69,7 @@ def test_failed_episodes_are_found_and_listed_first(scored):
 def test_scores_need_neither_progress_nor_success(scored):
     bare = replace(scored, data=replace(scored.data, progress=None, success=None))
     assert (bare.auc, bare.true_auc, bare.correlation) == (None, None, None)
-    assert "number" in score_report(bare, "manip-il score", {}, {}).render()
+    assert "number" in score_report(bare, "manip-il data score", {}, {}).render()
 
 
 @pytest.mark.parametrize("ahead", [1, 7, 100])

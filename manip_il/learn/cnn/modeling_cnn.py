@@ -264,7 +264,7 @@ class CNNPolicy(MLPPolicy):
         if missing := [key for key in keys if key not in columns]:
             raise UsageError(
                 f"policy.heatmap_weight is {self.heatmap_weight:g}, but the dataset has no {missing[0]}; "
-                "manip-il redraw and manip-il render write it"
+                "manip-il data redraw and manip-il data render write it"
             )
         found = np.stack([np.asarray(columns[key], np.float32) for key in keys], axis=1)
         return torch.from_numpy(found).unflatten(2, (-1, 3))

@@ -1,0 +1,212 @@
+"""Why a policy will not learn from a dataset, of any origin: its motions and its cameras. Warnings, with numbers.
+
+Motions are looked at in episodes that a teacher drove: where a learner drives, actions are labels and move nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from manip_il import checks
+from manip_il.data import schema as s
+from manip_il.data.dataset import Dataset
+from manip_il.data.info import NUMBERS
+from manip_il.doctor.finding import Finding, by_deletion, by_journals, edit, list_first, warning
+from manip_il.errors import ManipError
+from manip_il.mdp import Actor
+
+F64, Mask = NDArray[np.float64], NDArray[np.bool_]
+Rows = dict[int, slice]  # of episodes, by their numbers
+_GRIPPER = re.compile(r"grip|finger|jaw|hand|claw", re.IGNORECASE)
+_STILL, _IDLE = 0.01, 0.1  # of every joint's range, within a second; of all frames
+_LEAD = 0.4  # by which actions may be ahead of the joints that follow them [s]
+_CLIPPED = 0.05  # of all frames
+_LEAST = 10  # episodes that are compared with each other
+_EPISODES, _PICTURES, _SIDE = 100, 6, 16  # that are decoded, of each; height and width of a thumbnail
+_SAME, _DARK = 1.5, 10.0  # levels, of 255: change of the most changed part of a thumbnail; mean of a picture
+_AGAIN = "correct what recorded it, and record again"
+
+
+def check_motions(dataset: Dataset) -> Iterator[Finding]:
+    """Check for idle stretches, late or early actions, joints that changed, commands in vain, texts of two motions."""
+    features = [dataset.features.get(key) for key in (s.STATE, s.ACTION)]
+    if not all(one and one.dtype in NUMBERS and len(one.shape) == 1 and one.size for one in features):
+        return
+    columns = dataset.columns([s.STATE, s.ACTION, *({s.ACTOR} & dataset.features.keys())])
+    state, action = (columns[key].reshape(len(dataset), -1).astype(np.float64) for key in (s.STATE, s.ACTION))
+    learner, table = columns.get(s.ACTOR, np.zeros(len(state))).reshape(-1) == Actor.LEARNER, dataset.episodes
+    spans = zip(table.index.tolist(), map(slice, table.start, table.stop), strict=True)
+    rows = {episode: one for episode, one in spans if len(state[one]) > 1 and not learner[one].any()}
+    if not rows or not np.isfinite(state).all() or not np.isfinite(action).all():
+        return  # named by another check
+    yield from _check_idle(dataset, rows, np.hstack([state, action]))
+    yield from _check_texts(dataset, rows, state)
+    if action.shape == state.shape:  # of the same joints, as LeRobot's robots have them
+        names = np.array(dataset.features[s.ACTION].labels)
+        gripper = np.array([bool(_GRIPPER.search(name)) for name in names])
+        arm = ~gripper if gripper.any() else np.arange(len(names)) < len(names) - 1
+        yield from _check_lag(dataset, rows, action[:, arm], state[:, arm])
+        yield from _check_joints(dataset, rows, action[:, arm], state[:, arm], names[arm])
+        yield from _check_commands(rows, action, state, names, arm)
+
+
+def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
+    """Seconds in which neither actions nor joints move; to rest at the end is no fault."""
+    both = both / np.where(np.ptp(both, axis=0) > 1e-9, np.ptp(both, axis=0), np.inf)
+    second, idle = max(2, round(dataset.fps)), dict[int, int]()
+    for episode, span in rows.items():
+        starts = range(span.start, span.stop - second + 1, second)
+        moving = [np.ptp(both[start : start + second], axis=0).max() > _STILL for start in starts]
+        idle[episode] = max(np.flatnonzero(moving), default=-1) + 1 - sum(moving)
+    if (share := sum(idle.values()) * second / len(both)) > _IDLE:
+        odd = [episode for episode, seconds in idle.items() if seconds]
+        text = f"nothing moves for seconds, in {share:.0%} of the frames (episodes {list_first(odd)})"
+        yield warning(s.ACTION, f"{text}: a policy learns to stand still there", by_deletion(dataset.root, odd))
+
+
+def _check_lag(dataset: Dataset, rows: Rows, told: F64, found: F64) -> Iterator[Finding]:
+    """Actions that come after the motion that they should cause, or long before it, by cross-correlation."""
+    reach = min(round(dataset.fps / 2) + 1, int(np.median([span.stop - span.start for span in rows.values()])) // 4)
+    inner = np.concatenate([np.arange(span.start + reach, span.stop - reach) for span in rows.values()])
+    leads = range(-reach, reach + 1)
+    curves = np.array([_correlate(told[inner - lead], found[inner]) for lead in leads])
+    followed = curves.max(axis=0) > 0.9  # the others' actions are no targets
+    if reach < 2 or followed.sum() < max(2, len(followed) / 2):
+        return
+    curve = curves[:, followed].mean(axis=1)
+    best = leads[int(curve.argmax())]
+    fine = min(max(best, 1), max(2, round(_LEAD * dataset.fps)))
+    if fine != best and 1 - curve[fine + reach] > 1.3 * (1 - curve.max()) + 1e-6:
+        how = f"lead the joints by {best}" if best > 0 else f"lag the joints by {-best}"
+        figures = f"correlation {curve.max():.4f}; {curve[fine + reach]:.4f} at a lead of {fine}"
+        remedy = f"the action of a frame is what is sent after its observation: {_AGAIN}"
+        yield warning(s.ACTION, f"actions {how} frames ({figures})", remedy)
+
+
+def _correlate(left: F64, right: F64) -> F64:
+    """Return the correlations (n,) of columns (T, n); 0 if one does not move."""
+    left, right = left - left.mean(axis=0), right - right.mean(axis=0)
+    return (left * right).sum(axis=0) / np.maximum(np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0), 1e-9)
+
+
+def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: NDArray[np.str_]) -> Iterator[Finding]:
+    """A joint whose zero or sign differs between episodes: by where it starts, and by how it follows its action."""
+    starts = np.array([found[span.start] for span in rows.values()])
+    agree = np.array([_correlate(told[span], found[span]) for span in rows.values()])
+    against = (agree < -0.8) & (np.median(agree, axis=0) > 0.8)
+    for place, name in enumerate(names if len(rows) >= _LEAST else ()):
+        apart = _find_apart(starts[:, place], 5, 0.1 * np.ptp(found[:, place]))
+        measures = (("starts at", starts, apart), ("correlates with its action by", agree, against[:, place]))
+        for what, values, odd in measures:
+            if odd.any():
+                episodes = np.array([*rows])[odd]
+                text = f"{name} {what} {values[odd, place].mean():.3g} in episodes {list_first(episodes)}"
+                text += f", else {values[~odd, place].mean():.3g}: its zero or sign differs"
+                yield warning(s.STATE, text, by_deletion(dataset.root, episodes))
+
+
+def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
+    """Return which of the numbers (E,) stand apart from most, by a gap of `least` and `times` what those differ by."""
+    ranked = np.sort(values)
+    cut = int(np.argmax(np.diff(ranked)))
+    gap, extent = ranked[cut + 1] - ranked[cut], max(ranked[cut] - ranked[0], ranked[-1] - ranked[cut + 1])
+    above = values > ranked[cut]
+    return (above if 2 * above.sum() <= len(values) else ~above) & (gap > max(times * extent, least))
+
+
+def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_], arm: Mask) -> Iterator[Finding]:
+    """Commands, of the gripper as a rule, that are never reached; those of the arm that are cut off at a limit.
+
+    Units of both are the same, or a joint follows by a small share. At rest at an episode's end nothing is cut off.
+    """
+    for name, told, found, is_arm in zip(names, action.T, state.T, arm, strict=True):
+        (low, high), (below, above) = np.quantile(told, [0.01, 0.99]), np.quantile(found, [0.01, 0.99])
+        share = (above - below) / max(high - low, 1e-9)
+        stuck = share < 0.05 and abs(_correlate(told, found)) < 0.5
+        inside = 0.05 <= share < 0.5 and min(below - low, high - above) > 0.1 * (high - low)
+        if high - low > 1e-6 and (stuck or inside):
+            text = f"{name} is told {low:.3g} to {high:.3g}, and is {below:.3g} to {above:.3g}: commands never reached"
+            yield warning(s.ACTION, text, f"calibrate or free that joint: {_AGAIN}")
+        for limit in {told.min(), told.max()} if is_arm and len(np.unique(told)) > 50 else ():
+            at = [told[span] == limit for span in rows.values()]
+            share = sum(int(one.sum()) for one in at if not one[0] and not one[-1]) / len(told)
+            if share > _CLIPPED:
+                text = f"{name} is cut off at {limit:.6g} in {share:.0%} of the frames"
+                yield warning(s.ACTION, text, f"widen that limit: {_AGAIN}")
+
+
+def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
+    """Two different motions, with nothing between, that neither text nor first observation tells apart."""
+    points = np.array([np.linspace(span.start, span.stop - 1, 12).astype(int) for span in rows.values()])
+    paths = (state / np.maximum(state.std(axis=0), 1e-9))[points].reshape(len(points), -1)
+    seen = [one.key for one in dataset.info.of_dtype(*NUMBERS) if one.key.startswith("observation.")]
+    firsts = np.hstack([dataset.columns([key])[key][points[:, 0]].reshape(len(points), -1) for key in seen])
+    known = dict(zip(dataset.episodes.index.tolist(), dataset.episodes.tasks, strict=True))
+    texts = np.array([" ".join(known[episode]) for episode in rows])
+    for text in {*texts}:
+        same = np.flatnonzero(texts == text)
+        centred = paths[same] - paths[same].mean(axis=0)
+        if len(same) < _LEAST:
+            continue
+        apart = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
+        here, there, episodes = firsts[same[apart]], firsts[same[~apart]], np.array([*rows])[same[apart]]
+        if 5 * len(here) < len(same) or (here.max(0) < there.min(0)).any() or (there.max(0) < here.min(0)).any():
+            continue  # few, or the first observation tells which
+        what = f"{len(here)} of {len(same)} episodes ({list_first(episodes)}) move in another way than the rest"
+        own = json.dumps(dict.fromkeys(map(str, episodes), "NEW TEXT"))
+        remedy = (
+            f"give them a text of their own: {edit(dataset.root, 'modify_tasks')} --operation.episode_tasks='{own}'"
+        )
+        yield warning("task", f"{what}, for one text {text[:60]!r}", remedy)
+
+
+def check_cameras(dataset: Dataset) -> Iterator[Finding]:
+    """Check some pictures of every episode: they are decoded and have their size, and show what they should."""
+    table, root, _ = dataset.episodes, dataset.root, dataset.data_files  # what raises here is said once
+    chosen = np.flatnonzero(table.length > 1)
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(_EPISODES, len(chosen))).astype(int)]
+    rows = np.linspace(table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1)
+    seen: dict[str, F64] = {}
+    for key in [key for key in dataset.cameras if dataset.features[key].is_rgb and len(rows)]:
+        try:
+            seen[key] = np.stack([_thumbnails(dataset.frames(key, one)) for one in rows])
+        except ManipError as problem:
+            text = checks.one_line(problem).replace(f"{root}/", "").partition("; run `manip-il")[0]
+            yield Finding(key, text, by_journals(root))
+    moved = np.zeros((len(rows), _PICTURES - 1), bool)  # by a tenth of a joint's range, from picture to picture
+    if seen and s.STATE in dataset.features:
+        state = dataset.columns([s.STATE])[s.STATE].reshape(len(dataset), -1).astype(np.float64)
+        moved = (np.abs(np.diff(state[rows], axis=1)) > 0.1 * np.maximum(np.ptp(state, axis=0), 1e-9)).any(axis=2)
+    for key, pictures in seen.items():
+        dark = (pictures.mean(axis=(2, 3, 4)) < _DARK).mean(axis=1) > 0.5
+        still = np.abs(np.diff(pictures, axis=1)).max(axis=(2, 3, 4)) < _SAME
+        frozen = (still & moved).sum(axis=1) > np.maximum(1, moved.sum(axis=1) / 2)
+        odd = {"is black": dark, "stands still while the joints move": frozen & ~dark}
+        odd |= {f"is swapped with {other}": _find_swapped(pictures, seen[other]) for other in seen if other > key}
+        for what, which in odd.items():
+            if which.any():
+                episodes = table.index[chosen[which]]
+                text = f"{what} in {which.sum()} of {len(which)} episodes ({list_first(episodes)})"
+                yield warning(key, text, by_deletion(root, episodes))
+
+
+def _thumbnails(pictures: NDArray[np.uint8]) -> F64:
+    small = [Image.fromarray(one).resize((_SIDE, _SIDE), Image.Resampling.BOX) for one in pictures]
+    return np.stack([np.asarray(one, dtype=np.float64) for one in small])
+
+
+def _find_swapped(left: F64, right: F64) -> Mask:
+    """Return the episodes, (E,), in which two cameras look like each other in the other episodes."""
+    pictures = np.stack([left.mean(axis=1), right.mean(axis=1)])
+    typical = np.median(pictures, axis=1, keepdims=True)
+    straight, crossed = (np.abs(pictures - one).mean(axis=(2, 3, 4)).sum(axis=0) for one in (typical, typical[::-1]))
+    return (crossed < 0.5 * straight) & (straight > _DARK)
+
+
+CHECKS = (check_cameras, check_motions)

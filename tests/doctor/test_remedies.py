@@ -1,0 +1,117 @@
+"""What a finding says to do helps: repair from journals or the data, LeRobot's tool, an edit of info.json."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.atomic import exclusive
+from manip_il.data.journal import list_episodes
+from manip_il.doctor.examine import examine_folder, repair
+from manip_il.doctor.finding import Finding
+from manip_il.errors import FolderBusyError
+
+from ..damage import DATA, cut, damage_at_random, digests, edit_json, edit_table, lines
+from ..warm import Warm
+from .teaching import make
+
+FRONT = "observation.images.front"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One of ours with cameras beside its journals, and one of LeRobot's."""
+    folder = tmp_path_factory.mktemp("made")
+    make(folder / "ours", 3)
+    make(folder / "theirs", 2)
+    return folder
+
+
+@pytest.fixture
+def ours(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "ours"
+
+
+@pytest.fixture
+def theirs(ours: Path) -> Path:
+    return ours.with_name("theirs")
+
+
+def mend(root: Path) -> list[str]:
+    return list(repair(root, examine_folder(root)))
+
+
+def test_a_damaged_dataset_is_rebuilt_from_its_journals_and_kept(ours):
+    whole = digests(ours)
+    cut(ours / DATA, 0.5)
+    damaged = digests(ours)
+    kept = ours.with_name("ours.before-repair")
+    assert mend(ours) == ["rebuilt from ours.journals: 12 episodes", f"what was replaced or moved is kept in {kept}"]
+    assert (digests(ours), digests(kept)) == (whole, damaged)
+
+
+def test_journals_that_hold_less_than_the_dataset_replace_nothing(ours):
+    list_episodes(ours.with_name("ours.journals"))[0].unlink()
+    (ours / layout.TASKS).unlink()
+    before = digests(ours)
+    assert mend(ours)[0] == "not rebuilt: ours.journals makes 11 episodes, and 12 are still readable"
+    assert digests(ours) == before
+
+
+def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
+    whole = json.loads((theirs / layout.STATS).read_text())
+    edit_json(theirs / layout.INFO, lambda info: info.update(total_frames=3, total_episodes=1))
+    edit_json(theirs / layout.STATS, lambda stats: (stats.pop(FRONT), stats[s.ACTION].update(mean=[9] * 5)))
+    (theirs / "images").mkdir()
+    (theirs / "images/left.png").write_bytes(b"x")
+    mend(theirs)
+    assert examine_folder(theirs) == []
+    stats = json.loads((theirs / layout.STATS).read_text())
+    np.testing.assert_allclose(stats[s.ACTION]["mean"], whole[s.ACTION]["mean"], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(stats[FRONT]["mean"], whole[FRONT]["mean"], atol=0.05)
+    kept = theirs.with_name("theirs.before-repair")
+    assert sorted(path.name for path in kept.iterdir()) == ["images", "info.json", "stats.json"]
+
+
+def test_a_dataset_that_is_being_written_is_left_alone(ours):
+    with exclusive(ours), pytest.raises(FolderBusyError):
+        mend(ours)
+
+
+def test_lerobots_tool_deletes_the_episodes_that_a_remedy_names(theirs, warm_lerobot: Warm):
+    edit_table(theirs / DATA, lambda table: table[s.ACTION].__setitem__(4, [float("nan")] * 5))
+    [finding] = [one for one in examine_folder(theirs) if "no number" in one.text]
+    done = warm_lerobot.run(*shlex.split(finding.remedy.partition("out: ")[2]), folder=theirs.parent)
+    assert done.returncode == 0, done.stderr
+    assert lines(theirs.with_name("theirs_kept")) == []
+
+
+@pytest.mark.parametrize("names", [None, ["width", "height", "channels"], ["channels", "height", "width"]])
+def test_a_camera_on_which_lerobot_does_not_train_is_named(theirs, names):
+    edit_json(theirs / layout.INFO, lambda info: info["features"][FRONT].update(names=names))
+    [finding] = [one for one in examine_folder(theirs) if "LeRobot does not train" in one.text]
+    right = json.loads(finding.remedy[finding.remedy.index('["height') :].removesuffix(" there"))
+    edit_json(theirs / layout.INFO, lambda info: info["features"][FRONT].update(names=right))
+    assert examine_folder(theirs) == []
+
+
+def test_no_damage_stops_the_examination_and_none_that_counts_goes_unseen(made, tmp_path):
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        shutil.rmtree(tmp_path / "copy", ignore_errors=True)
+        way, path = damage_at_random(shutil.copytree(made / "ours", tmp_path / "copy"), rng)
+        found = lines(tmp_path / "copy")
+        assert not any("a check failed" in line for line in found), (way, path, found)
+        assert found or way not in ("cut", "delete"), (way, path)
+
+
+def test_a_finding_is_one_printable_line():
+    assert str(Finding("a\x1b[31m", "b\nc", "d")).isprintable()
