@@ -98,7 +98,7 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
 
 def _rebuild(root: Path, kept: Path) -> str:
     """Build the dataset from its journals, unless they hold less than it does."""
-    journals, fresh = journals_of(root), root.with_name(f"{root.name}.rebuilt")
+    journals, fresh = journals_of(root), root.with_name(f".{root.name}.rebuilt.partial")
     try:
         held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
     except ManipError:

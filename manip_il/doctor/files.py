@@ -166,7 +166,7 @@ def check_own(dataset: Dataset) -> Iterator[Finding]:
             yield warning(layout.OURS, text, "copy it from the dataset that this one was made from")
         return
     there = {key: ([*one.shape], one.names) for key, one in features.items()} | {"fps": dataset.fps}
-    said = {key: ([*one["shape"]], one["names"]) for key, one in layout.all_features(s.features(own.spec)).items()}
+    said = {key: ([*one["shape"]], one["names"]) for key, one in s.features(own.spec).items()}
     for key, wanted in {**said, "fps": own.spec.fps}.items():
         if there.get(key) != wanted:
             text = f"{key} is {str(there.get(key, 'missing'))[:80]}; {layout.OURS} says {str(wanted)[:80]}"
