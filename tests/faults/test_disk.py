@@ -19,8 +19,10 @@ pytestmark = pytest.mark.slow
 
 SCENE = ("--robot.type=fetch", "--task.type=reach")
 RECORD = ("record", *SCENE, "--dataset.num_episodes=4", "--dataset.root={}/demos")
-DAGGER = ("dagger", *SCENE, "--rounds=1", "--demonstrations=2", "--episodes_per_round=2", "--validation_episodes=1")
-DAGGER = (*DAGGER, "--workers=1", "--steps=4", "--policy.width=64", "--output_dir={}/out")
+DAGGER = (
+    *("dagger", *SCENE, "--rounds=1", "--demonstrations=2", "--episodes_per_round=2", "--validation_episodes=1"),
+    *("--workers=1", "--steps=4", "--policy.width=64", "--output_dir={}/out"),
+)
 EVAL = ("eval", "--policy.type=expert", *SCENE, "--eval.n_episodes=6", "--eval.films=0", "--output_dir={}/out")
 # root writes where it likes, unless it gives that up
 BOUND = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.getuid() == 0 else []

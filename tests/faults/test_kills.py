@@ -25,8 +25,10 @@ DAGGER = (
     *("dagger", *REACH, "--rounds=1", "--demonstrations=3", "--episodes_per_round=4", "--steps=300"),
     *("--policy.width=16", "--validation_episodes=4", "--workers=2", "--output_dir={folder}/out"),
 )
-EVAL = ("eval", *REACH, "--eval.n_episodes=16", "--eval.batch_size=2", "--eval.films=0", "--workers=2")
-EVAL = (*EVAL, "--output_dir={folder}/out")
+EVAL = (
+    *("eval", *REACH, "--eval.n_episodes=16", "--eval.batch_size=2", "--eval.films=0", "--workers=2"),
+    "--output_dir={folder}/out",
+)
 UNEQUAL = ("config.yaml", "report.html")  # they name the folder, and when what happened
 CLOCK = ("seconds", "samples_per_s")
 
