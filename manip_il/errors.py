@@ -125,7 +125,7 @@ def shorten(text: str) -> str:
 
 
 def silence_ffmpeg_warning() -> None:
-    """Silence LeRobot's page of warning of missing FFmpeg libraries: pictures are read with PyAV, which has its own."""
+    """Hide LeRobot's page of warning of missing FFmpeg libraries: pictures are read with PyAV, which has its own."""
     import logging  # here, as help needs none
 
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

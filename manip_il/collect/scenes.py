@@ -6,7 +6,7 @@ The expert is a function of the state, so it labels scenes that nobody drove to:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -131,9 +131,9 @@ class SceneDrawer:
                 world.place(name, _near_hand(world, at, rng) if near else at, turn)
                 moved.append(body)
         world.update()
-        if any(depth > _DEEP for depth in _overlaps(world, moved)):
-            return None
-        return replace(visited, physics=world.physics())
+        roots, depths = _contacts(world)
+        overlaps = np.isin(roots, moved).any(axis=1) & (roots[:, 0] != roots[:, 1]) & (depths > _DEEP)
+        return None if overlaps.any() else replace(visited, physics=world.physics())
 
     @cached_property
     def _markers(self) -> set[int]:
@@ -144,9 +144,7 @@ class SceneDrawer:
 
     def _untouched(self, world: World) -> set[int]:
         """Objects and furniture, as bodies, that touch nothing but what is fixed to the world, and rest."""
-        model, data = world.model, world.data
-        mujoco.mj_collision(model, data)
-        roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]  # (contacts, 2)
+        model, (roots, _) = world.model, _contacts(world)
         touched = set(roots[(roots > 0).all(axis=1) & (roots[:, 0] != roots[:, 1])].ravel().tolist())
         ee = world.ee.position.tolist()
         free = {
@@ -162,11 +160,8 @@ def _near_hand(world: World, at: F64, rng: np.random.Generator) -> F64:
     return np.append(world.ee.position[:2] + rng.normal(0.0, _AROUND, 2), at[2])
 
 
-def _overlaps(world: World, bodies: Sequence[int]) -> Iterator[float]:
-    """Yield how deep these bodies are in others [m]."""
-    model, data = world.model, world.data
-    mujoco.mj_collision(model, data)
-    for contact in data.contact:
-        roots = [int(model.body_rootid[model.geom_bodyid[geom]]) for geom in contact.geom]
-        if roots[0] != roots[1] and not set(bodies).isdisjoint(roots):
-            yield -float(contact.dist)
+def _contacts(world: World) -> tuple[NDArray[np.int32], F64]:
+    """Bodies that are in contact, by their roots, (C, 2), and how deep [m], (C,)."""
+    model, contacts = world.model, world.data.contact
+    mujoco.mj_collision(model, world.data)
+    return model.body_rootid[model.geom_bodyid[contacts.geom]], -contacts.dist

@@ -78,7 +78,7 @@ class Hub:
         return added if copies.keys() & local.keys() else added | {name: local[path] for name, path in copies.items()}
 
     def write(self, plan: Plan) -> None:
-        """Commit on top of `plan.before`, which the Hub refuses if that is old; move the tag of a dataset."""
+        """Make a commit on top of `plan.before`, which the Hub refuses if that is old; move the tag of a dataset."""
         with explained(f"push to {self.name}"):
             before = plan.before or self._create()
             gone = before.files.keys() - plan.manifest.files.keys()
@@ -98,7 +98,7 @@ class Hub:
                 self._move_tag()
 
     def fetch(self, manifest: Manifest, paths: list[str], folder: Path) -> None:
-        """Download a commit's files that are not in `folder`; their hashes are not looked at."""
+        """Fetch a commit's files that are not in `folder`; their hashes are not looked at."""
         left_out = [".*", "*/.*", *(glob.escape(path) for path in (*manifest.copies, MANIFEST_FILE))]
         with explained(f"pull from {self.name}"):
             self._api.snapshot_download(

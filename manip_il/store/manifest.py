@@ -45,7 +45,7 @@ class File:
 
     @classmethod
     def of(cls, path: Path) -> File:
-        """Hash a file."""
+        """Return a file's size [bytes] and hash."""
         with open(checks.open_regular(path), "rb") as file:
             return cls(os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
 

@@ -91,13 +91,6 @@ def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: Ro
     assert written(replace(job, batch=1).run(SEEDS[::-1])) == bits
 
 
-def test_a_noisy_expert_has_its_noise():
-    for episode in run(RolloutJob(EnvConfig("panda"), NoisyExpertDriver(NOISE), hold=3)).values():
-        assert (episode.columns["actor"] == Actor.NOISY_EXPERT).all()
-        off = np.subtract(episode.columns["executed_action"], episode.columns["action"])
-        assert off.std(axis=0)[:7] == pytest.approx(0.01, rel=0.4)
-
-
 def test_where_the_expert_was_not_queried_the_label_is_not_to_be_learnt_from(job: RolloutJob):
     for episode in run(replace(job, query=Query("probability", 0.3))).values():
         queried, columns = labelled(episode), episode.columns

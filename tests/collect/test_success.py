@@ -12,8 +12,8 @@ from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import KINDS, Perturbation, kinds_for
 from manip_il.tasks.table import TASKS
 
-from ..scenes import SIZES, sizes_of
-from ..tables import LARGE, SCENES, WITH_A_CUBE
+from ..scenes import sizes_of
+from ..tables import SCENES, WITH_A_CUBE
 
 KNOCKED = Condition("knocked", action_noise=(0.05, 0.05), knock=(0.05, 0.08))
 
@@ -47,16 +47,6 @@ def failures(condition: Condition, robot: str, task: str, count: int) -> list[in
 @pytest.mark.parametrize(("robot", "task", "condition"), CASES, ids=lambda case: getattr(case, "name", case))
 def test_the_expert_solves_every_task_whatever_the_cube(robot: str, task: str, condition: Condition):
     assert failures(condition, robot, task, 3) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("robot", "task", "condition"),
-    [case for case in CASES if case[2] is NOMINAL or (case[2] is SIZES and case[0] in LARGE)],
-    ids=lambda case: getattr(case, "name", case),
-)
-def test_the_expert_solves_every_task_from_40_starts(robot: str, task: str, condition: Condition):
-    assert failures(condition, robot, task, 40) == []
 
 
 # Where it leaves the object in no sound state: in a gap beside a laptop that the hand does not fit into.

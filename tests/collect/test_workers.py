@@ -107,15 +107,6 @@ def test_a_seed_runs_again_where_its_worker_died_and_after_three_times_is_left_o
 
 
 @pytest.mark.slow
-def test_of_a_lockstep_batch_only_the_seed_that_kills_is_left_out(checkpoint, tmp_path):
-    job = RolloutJob(EnvConfig(horizon=10), PolicyDriver((checkpoint,)), label="per_state")
-    with Engine(2) as engine:
-        done = {episode.seed for episode in engine.run(job, SEEDS, DeadlyJournal.of(tmp_path, job, SEEDS[0]))}
-        assert engine.given_up == [SEEDS[0]]
-    assert done == set(SEEDS[1:]) == set(list_seeds(tmp_path / "journals"))
-
-
-@pytest.mark.slow
 def test_where_every_worker_dies_the_work_ends_with_an_error(tmp_path):
     with Engine(2) as engine, pytest.raises(ManipError, match="rollout workers died one after the other"):
         list(engine.run(JOB, SEEDS, DeadlyJournal.of(tmp_path, JOB, *SEEDS)))
