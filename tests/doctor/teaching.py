@@ -8,12 +8,12 @@ from typing import Any
 
 import av
 import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import schema as s
 from manip_il.data.build import build
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import Journal
-from manip_il.data.lerobot_library import write_with_library
 from manip_il.mdp import Episode
 
 EPISODES, SIZE, CAMERAS = 12, (48, 64), ("front", "wrist")
@@ -89,9 +89,12 @@ def _write_theirs(root: Path, episodes: list[Columns], fps: int, kind: str, name
     """A dataset of LeRobot's writer. kind: dtype of its cameras."""
     features: dict[str, Any] = {key: {"dtype": kind, "shape": (*SIZE, 3), "names": AXES} for key in episodes[0]}
     features |= {key: {"dtype": "float32", "shape": (5,), "names": names} for key in (s.STATE, s.ACTION)}
-    task = {"task": "Put it\nthere."}
-    frames = ([task | dict(zip(one, row, strict=True)) for row in zip(*one.values(), strict=True)] for one in episodes)
-    list(write_with_library(root, fps, None, features, frames))
+    dataset: Any = LeRobotDataset.create("a/b", fps, features, root=root, use_videos=kind == "video")
+    for one in episodes:
+        for row in zip(*one.values(), strict=True):
+            dataset.add_frame(dict(zip(one, row, strict=True)) | {"task": "Put it\nthere."})
+        dataset.save_episode()
+    dataset.finalize()
     return root
 
 
