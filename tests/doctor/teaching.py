@@ -89,11 +89,10 @@ def _write_theirs(root: Path, episodes: list[Columns], fps: int, kind: str, name
     """A dataset of LeRobot's writer. kind: dtype of its cameras."""
     features: dict[str, Any] = {key: {"dtype": kind, "shape": (*SIZE, 3), "names": AXES} for key in episodes[0]}
     features |= {key: {"dtype": "float32", "shape": (5,), "names": names} for key in (s.STATE, s.ACTION)}
-    task = {"task": "Put it\nthere."}
     dataset: Any = LeRobotDataset.create("a/b", fps, features, root=root, use_videos=kind == "video")
     for one in episodes:
         for row in zip(*one.values(), strict=True):
-            dataset.add_frame(task | dict(zip(one, row, strict=True)))
+            dataset.add_frame(dict(zip(one, row, strict=True)) | {"task": "Put it\nthere."})
         dataset.save_episode()
     dataset.finalize()
     return root

@@ -70,7 +70,7 @@ def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     whole = json.loads((theirs / layout.STATS).read_text())
     edit_json(theirs / layout.INFO, lambda info: info.update(total_frames=3, total_episodes=1))
     edit_json(theirs / layout.STATS, lambda stats: (stats.pop(FRONT), stats[s.ACTION].update(mean=[9] * 5)))
-    (theirs / "images").mkdir()
+    (theirs / "images").mkdir(exist_ok=True)
     (theirs / "images/left.png").write_bytes(b"x")
     mend(theirs)
     assert examine_folder(theirs) == []
