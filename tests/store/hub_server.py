@@ -222,7 +222,7 @@ def hub_server() -> Iterator[Hub]:
             if self.command != "HEAD":
                 self.wfile.write(data)
 
-        log_message: Any = lambda self, *words: None  # noqa: E731
+        log_message: Any = lambda self, *words: None
         do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = handle_any  # noqa: N815
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
