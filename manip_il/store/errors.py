@@ -16,7 +16,7 @@ _SHORTEST, _LONGEST = 4, 400  # characters of a secret that no word has by chanc
 _SECRET_VARIABLE = re.compile(r"TOKEN$|SECRET|PASSW|ACCESS_KEY|S3_KEY")
 _SECRETS = (
     re.compile(r"\b()(?:hf_[A-Za-z0-9]{8,}|(?:AKIA|ASIA)[A-Z0-9]{12,})"),
-    re.compile(r"(\w://[^/\s:@]*:)\S*(?=@)"),
+    re.compile(r"(\w://[^/\s:@]*:).*(?=@)"),
     re.compile(r"(?i)((?:signature|credential|security-token|awsaccesskeyid)=)[^&\s'\"]+"),
     re.compile(r"(?i)(authorization['\"]?\s*[:=]\s*['\"]?)(?:bearer |basic |aws4[\w-]* )?[^\s'\"]+"),
 )

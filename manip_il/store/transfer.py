@@ -107,7 +107,7 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
     with atomic.new_folder(target, replace=overwrite) as partial:
         _fetch(partial, remote, manifest)
         for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:
-            if name := newest(checkpoints):
+            if (name := newest(checkpoints)) and not (checkpoints / LAST).exists():
                 (checkpoints / LAST).symlink_to(name)
         if journals:
             with atomic.new_folder(beside, replace=True) as folder:
