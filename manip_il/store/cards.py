@@ -6,9 +6,7 @@ program made claims neither our licence nor our making.
 
 from __future__ import annotations
 
-import io
 import re
-from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from typing import Any
 import jinja2
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import schema as s
@@ -28,7 +25,6 @@ from manip_il.store.manifest import CARD, CONFIG, Kind, journals_of, policy_fold
 
 PICTURE = "assets/episodes.png"
 _FRAMES, _EPISODES = 6, 50  # of each camera, whose paths are drawn
-_WIDTH = 8.0  # of the picture [inches]
 _OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is made again
 _NOT_SHOWN = re.compile(  # lines of options that are places, concern one machine, or may be secrets
     r"/|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
@@ -42,31 +38,27 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
     A `README.md` of another origin is kept: then the result holds none. Raises `ManipError` for a folder that cannot be
     read.
     """
-    made, dataset = dict[str, bytes](), Dataset.open(root) if kind == "dataset" else None
-    if dataset and (picture := draw_picture(dataset)):
-        made[PICTURE] = picture
+    made, dataset = dict[str, Path](), Dataset.open(root) if kind == "dataset" else None
+    if dataset and draw_picture(dataset, folder / "episodes.png"):
+        made[PICTURE] = folder / "episodes.png"
     if not (root / CARD).is_file() or any(mark in (root / CARD).read_bytes() for mark in _OURS):
         environment = jinja2.Environment(finalize=lambda value: redact(value) if isinstance(value, str) else value)
         environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")
         template = environment.from_string(Path(__file__).with_name("card.md.jinja").read_text(encoding="utf-8"))
         facts = {"place": place, "version": version("manip_il"), "picture": PICTURE if made else None}
         try:
-            facts |= dataset_facts(dataset) if dataset else policy_facts(root)
-            made[CARD] = f"{template.render(facts)}\n".encode()
+            if dataset:
+                seeds = np.unique(dataset.columns([s.SEED])[s.SEED]).tolist() if s.SEED in dataset.features else []
+                made_by = options(journals_of(root)) or options(root.absolute().parent)
+                facts |= {"dataset": dataset, "is_ours": bool(dataset.own), "seeds": seeds, "options": made_by}
+            else:
+                facts |= policy_facts(root)
+            made[CARD] = folder / CARD
+            made[CARD].write_text(f"{template.render(facts)}\n", encoding="utf-8")
         except (AttributeError, LookupError, TypeError, ValueError, jinja2.TemplateError) as error:
             text = f"{type(error).__name__}: {checks.one_line(error)}"
             raise ManipError(f"{root}: a JSON file in it holds unexpected values ({text}); restore the file") from error
-    paths = {name: folder / Path(name).name for name in made}
-    for name, data in made.items():
-        paths[name].write_bytes(data)
-    return paths
-
-
-def dataset_facts(dataset: Dataset) -> dict[str, Any]:
-    """Return what the template says of a dataset."""
-    seeds = np.unique(dataset.columns([s.SEED])[s.SEED]).tolist() if s.SEED in dataset.features else []
-    made_by = options(journals_of(dataset.root)) or options(dataset.root.absolute().parent)
-    return {"dataset": dataset, "is_ours": dataset.own is not None, "seeds": seeds, "options": made_by}
+    return made
 
 
 def policy_facts(root: Path) -> dict[str, Any]:
@@ -74,13 +66,16 @@ def policy_facts(root: Path) -> dict[str, Any]:
     inside = policy_folder(path.relative_to(root).as_posix() for path in root.rglob(CONFIG))
     if inside is None:
         raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
-    config, ours, training = (_read(root / inside / f"{name}.json") for name in ("config", "manip_il", "train_config"))
-    evaluation, was_chosen_by = _evaluation(root)
+    found = {name: root / inside / f"{name}.json" for name in ("config", "manip_il", "train_config")}
+    facts = {name: checks.read_json(path, "JSON") if path.is_file() else {} for name, path in found.items()}
+    evaluations = [  # with the most episodes; that of a round chose the policy
+        {**checks.read_json(path, "JSON"), "is_test": not path.parent.name.startswith("round_")}
+        for path in root.rglob("eval.json")
+    ]
+    order = ("is_test", "n_episodes", "success_rate")
+    facts["evaluation"] = max(evaluations, key=lambda one: [one[key] for key in order], default={})
     fitted_to = Dataset.open(root / "dataset").summary if (root / "dataset" / INFO).is_file() else None
-    return {
-        **{"config": config, "ours": ours, "is_ours": bool(ours), "training": training, "fitted_to": fitted_to},
-        **{"evaluation": evaluation, "was_chosen_by": was_chosen_by, "options": options(root)},
-    }
+    return {**facts, "is_ours": bool(facts["manip_il"]), "fitted_to": fitted_to, "options": options(root)}
 
 
 def options(folder: Path) -> str:
@@ -91,56 +86,36 @@ def options(folder: Path) -> str:
     return "\n".join(shown) if text.startswith("# manip-il") else ""
 
 
-def _evaluation(root: Path) -> tuple[Mapping[str, Any], bool]:
-    """Return a run's `eval.json` with the most episodes, else the best one of a round, which chose the policy."""
-    found = [(path.parent.name.startswith("round_"), _read(path)) for path in root.rglob("eval.json")]
-    known = [(was, one) for was, one in found if {"success_rate", "n_episodes"} <= one.keys()]
-    was_chosen_by, best = max(
-        known, key=lambda pair: (not pair[0], pair[1]["n_episodes"], pair[1]["success_rate"]), default=(False, {})
-    )
-    return best, was_chosen_by
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return checks.read_json(path, "a JSON file beside a policy") if path.is_file() else {}
-
-
-def draw_picture(dataset: Dataset) -> bytes | None:
-    """Return a PNG: frames of the first episode, or without cameras the paths of the object; None without either."""
+def draw_picture(dataset: Dataset, path: Path) -> bool:
+    """Draw frames of the first episode, or without cameras the paths of the object; return False without either."""
     feature = dataset.features.get(s.ENVIRONMENT_STATE)
-    names = list(feature.labels) if feature else []
+    names, figure = list(feature.labels) if feature else [], Figure((8, 4), layout="constrained")
     if dataset.cameras:
-        figure = _draw_frames(dataset)
+        _draw_frames(dataset, figure)
     elif {f"{thing}.{axis}" for thing in ("object", "goal") for axis in "xyz"} <= set(names):
-        figure = _draw_paths(dataset, names)
+        _draw_paths(dataset, names, figure)
     else:
-        return None
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=100, metadata={"Software": None})
-    return buffer.getvalue()
+        return False
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+    return True
 
 
-def _draw_frames(dataset: Dataset) -> Figure:
+def _draw_frames(dataset: Dataset, figure: Figure) -> None:
     """Draw one row for each camera: evenly spaced frames of the first episode."""
-    rows = dataset.rows_of(0)
+    rows, cameras = dataset.rows_of(0), dataset.cameras
     picked = rows[np.unique(np.linspace(0, len(rows) - 1, _FRAMES).round().astype(int))]
-    strips: list[NDArray[Any]] = [np.concatenate(list(dataset.frames(key, picked)), axis=1) for key in dataset.cameras]
-    heights = [_WIDTH * strip.shape[0] / strip.shape[1] for strip in strips]
-    figure = Figure((_WIDTH, sum(heights)), layout="constrained")
-    axes = figure.subplots(len(strips), squeeze=False, height_ratios=heights)[:, 0]
-    for axis, strip in zip(axes, strips, strict=True):
-        axis.imshow(strip)
+    figure.set_figheight(figure.get_figwidth() / _FRAMES * len(cameras))
+    for axis, key in zip(figure.subplots(len(cameras), squeeze=False)[:, 0], cameras, strict=True):
+        axis.imshow(np.concatenate(list(dataset.frames(key, picked)), axis=1))
         axis.axis("off")
-    return figure
 
 
-def _draw_paths(dataset: Dataset, names: list[str]) -> Figure:
+def _draw_paths(dataset: Dataset, names: list[str], figure: Figure) -> None:
     """Draw the object's paths in the first episodes, from above and from the side, and the goals [m]."""
     table = dataset.columns([s.ENVIRONMENT_STATE, EPISODE_INDEX])
     index, values = table[EPISODE_INDEX].reshape(-1), table[s.ENVIRONMENT_STATE]
     episodes = [values[index == episode] for episode in np.unique(index)[:_EPISODES]]
     firsts = np.array([rows[0] for rows in episodes])
-    figure = Figure((_WIDTH, _WIDTH / 2), layout="constrained")
     axes = figure.subplots(1, 2)
     for axis, (across, up), side in zip(axes, ("xy", "xz"), ("above", "the side"), strict=True):
         x, y, goal_x, goal_y = (names.index(f"{thing}.{one}") for thing in ("object", "goal") for one in (across, up))
@@ -151,4 +126,3 @@ def _draw_paths(dataset: Dataset, names: list[str]) -> Figure:
         axis.set(title=f"from {side}, {len(episodes)} episodes", xlabel=f"{across} [m]", ylabel=f"{up} [m]")
         axis.set_aspect("equal", adjustable="datalim")
     axes[0].legend()
-    return figure

@@ -12,13 +12,11 @@ from manip_il.checks import one_line
 from manip_il.errors import ManipError
 
 HIDDEN = "[hidden]"
-_SHORTEST = 4  # characters of a secret: shorter ones may be parts of words
-_LONGEST = 400  # of a library's message
-_FOR_MORE = re.compile(r" For more information check: \S+")  # of httpx
+_SHORTEST, _LONGEST = 4, 400  # characters of a secret that no word has by chance, of a library's message
 _SECRET_VARIABLE = re.compile(r"TOKEN$|SECRET|PASSW|ACCESS_KEY|S3_KEY")
 _SECRETS = (
     re.compile(r"\b()(?:hf_[A-Za-z0-9]{8,}|(?:AKIA|ASIA)[A-Z0-9]{12,})"),
-    re.compile(r"(\w://[^/\s:@]*:)\S*(?=@)"),
+    re.compile(r"(\w://[^/\s:@]*:).*(?=@)"),
     re.compile(r"(?i)((?:signature|credential|security-token|awsaccesskeyid)=)[^&\s'\"]+"),
     re.compile(r"(?i)(authorization['\"]?\s*[:=]\s*['\"]?)(?:bearer |basic |aws4[\w-]* )?[^\s'\"]+"),
 )
@@ -55,7 +53,7 @@ def explained(what: str) -> Generator[None]:
         status = getattr(getattr(error, "response", None), "status_code", "")
         names = [str(status), *(base.__name__ for base in type(error).__mro__)]
         remedy = next((_REMEDIES[name] for name in names if name in _REMEDIES), "try again")
-        reason = _FOR_MORE.sub("", one_line(error))[:_LONGEST] or type(error).__name__
+        reason = one_line(error).replace(" For more information check: ", "; see ")[:_LONGEST] or type(error).__name__
         raise RemoteError(f"cannot {what}: {reason}; {remedy}") from error
 
 

@@ -24,7 +24,6 @@ from manip_il.errors import UsageError
 from manip_il.store.errors import RemoteError, explained
 from manip_il.store.manifest import CARD, CONFIG, MANIFEST_FILE, File, Kind, Manifest, Plan, policy_folder
 
-MAIN = "main"
 _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?")
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
@@ -86,23 +85,18 @@ class Hub:
                 *(CommitOperationAdd(path, str(plan.local[path])) for path in plan.upload),
                 *(CommitOperationDelete(path, is_folder=False) for path in sorted(gone)),
             ]
+            on: Any = {"revision": self._revision, "parent_commit": before.version}
             if operations:
-                self._api.create_commit(
-                    **self._repo,
-                    operations=operations,
-                    commit_message=f"manip-il push: {len(plan.upload)} files added, {len(gone)} removed",
-                    revision=self._revision,
-                    parent_commit=before.version,
-                )
-            if self.kind == "dataset" and self._revision in (None, MAIN):
+                self._api.create_commit(**self._repo, operations=operations, commit_message="manip-il push", **on)
+            if self.kind == "dataset" and self._revision in (None, "main"):
                 self._move_tag()
 
     def fetch(self, manifest: Manifest, paths: list[str], folder: Path) -> None:
-        """Fetch a commit's files that are not in `folder`; their hashes are not looked at."""
+        """Write a commit's files into `folder`; their hashes are not looked at."""
         left_out = [".*", "*/.*", *(glob.escape(path) for path in (*manifest.copies, MANIFEST_FILE))]
         with explained(f"pull from {self.name}"):
             self._api.snapshot_download(
-                **self._repo, revision=manifest.version, local_dir=folder, ignore_patterns=left_out
+                **self._repo, revision=manifest.version, local_dir=folder, ignore_patterns=left_out, force_download=True
             )
         shutil.rmtree(folder / ".cache")  # where the library notes what has arrived
 
@@ -119,7 +113,7 @@ class Hub:
     def _move_tag(self) -> None:
         """Move LeRobot's tag to the main branch. A Hub cannot move tags: it is missing for a moment."""
         refs = self._api.list_repo_refs(**self._repo)
-        head = next(one.target_commit for one in refs.branches if one.name == MAIN)
+        head = next(one.target_commit for one in refs.branches if one.name == "main")
         tag = next((one.target_commit for one in refs.tags if one.name == VERSION), None)
         if tag not in (None, head):
             self._api.delete_tag(**self._repo, tag=VERSION)

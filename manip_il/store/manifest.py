@@ -19,7 +19,6 @@ MANIFEST_FILE = "manip_il_manifest.json"
 JOURNALS = "journals"  # folder of a pushed dataset's journals; in a run every folder of that name holds some
 CHECKPOINTS, LAST = "checkpoints", "last"  # the link to the newest checkpoint: not pushed, made again by a pull
 CARD, CONFIG = "README.md", "config.json"  # of a repository, of every policy
-_VERSION = 1
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
 _PICKLE_OR_CODE = re.compile(
@@ -45,7 +44,7 @@ class File:
 
     @classmethod
     def of(cls, path: Path) -> File:
-        """Return a file's size [bytes] and hash."""
+        """Return a file's size and sha256."""
         with open(checks.open_regular(path), "rb") as file:
             return cls(os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
 
@@ -69,23 +68,23 @@ class Manifest:
     copies: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        """Raise `RemoteError` for a path that leads outside the folder, or names a pickle or code."""
+        """Raise `RemoteError` as `check_path` does."""
         for path in self.files:
             check_path(path)
 
     def to_json(self) -> bytes:
         """Return the text that a store keeps."""
         files = [{"path": path, "size": one.size, "sha256": one.sha256} for path, one in sorted(self.files.items())]
-        return json.dumps({"version": _VERSION, "kind": self.kind, "files": files}, indent=1).encode()
+        return json.dumps({"version": 1, "kind": self.kind, "files": files}, indent=1).encode()
 
     @classmethod
     def from_json(cls, data: bytes, version: str) -> Manifest:
         """Read what `to_json` writes. Raises `RemoteError` for anything else."""
         table = checks.parse_json("the manifest", data)
         try:
-            if table["version"] != _VERSION or table["kind"] not in ("dataset", "policy"):
+            if table["version"] != 1 or table["kind"] not in ("dataset", "policy"):
                 raise RemoteError("the manifest is of another version of manip-il; use a newer one")
-            files = {check_path(one["path"]): File(one["size"], one["sha256"]) for one in table["files"]}
+            files = {one["path"]: File(one["size"], one["sha256"]) for one in table["files"]}
             return cls(table["kind"], files, version)
         except (LookupError, TypeError, AttributeError) as error:
             raise RemoteError("the manifest is not what a push writes; push again, to an empty folder") from error
@@ -98,20 +97,19 @@ class Plan:
     manifest: Manifest
     before: Manifest | None
     local: Mapping[str, Path]
-    upload: tuple[str, ...]
-    remove: tuple[str, ...]
+    upload: list[str]
+    remove: list[str]
 
 
-def check_path(path: object) -> str:
-    """Return a file's path inside a folder. Raises `RemoteError` for any other, for hidden files, pickles and code."""
+def check_path(path: object) -> None:
+    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or names a pickle or code."""
     parts = path.split("/") if isinstance(path, str) and path.isprintable() and "\\" not in path else [""]
+    text = "pickles and code are neither pushed nor pulled, as they run when they are opened"
     if not all(part and not part.startswith(".") for part in parts):
-        reason = "expected a relative path inside the folder, without hidden files"
-    elif _PICKLE_OR_CODE.fullmatch(str(path)):
-        reason = "pickles and code are neither pushed nor pulled, as they run when they are opened"
-    else:
-        return str(path)
-    raise RemoteError(f"the file {checks.shorten(path)} is refused; {reason}")
+        text = "expected a relative path inside the folder, without hidden files"
+    elif not _PICKLE_OR_CODE.fullmatch(parts[-1]):
+        return
+    raise RemoteError(f"the file {checks.shorten(path)} is refused; {text}")
 
 
 def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
@@ -158,7 +156,6 @@ def policy_folder(paths: Iterable[str]) -> str | None:
     The best one, if the run has chosen it; else that of the newest checkpoint.
     """
     folders = {path.rpartition("/")[0] for path in paths if path.rpartition("/")[2] == CONFIG}
-    steps = {folder: int(found[1]) for folder in folders if (found := _CHECKPOINT.fullmatch(folder))}
-    newest_first = sorted(steps, key=lambda folder: -steps[folder])
-    order = ("", "pretrained_model", "best/pretrained_model", *newest_first)
+    steps = sorted((int(found[1]), folder) for folder in folders if (found := _CHECKPOINT.fullmatch(folder)))
+    order = ("", "pretrained_model", "best/pretrained_model", *(folder for _, folder in reversed(steps)))
     return next((folder for folder in order if folder in folders), None)

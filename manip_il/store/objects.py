@@ -28,13 +28,9 @@ from manip_il.store.errors import RemoteError, explained
 from manip_il.store.manifest import MANIFEST_FILE, Kind, Manifest, Plan
 
 TIMEOUT = 30.0  # of connecting to an ssh server, and of any one answer [s]
-_KNOWN = ("hf", "s3", "sftp", "file", "gs", "az")  # the last two with gcsfs and adlfs
-_ASYNC = {"skip_instance_cache": True, "use_listings_cache": False}  # of object stores: what others push is seen
-_OPTIONS: dict[str, dict[str, Any]] = {
-    "file": {"auto_mkdir": True},
-    "s3": {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_ASYNC},
-    "sftp": {},
-}
+_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # of object stores: what others push is seen
+_S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
+_OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, "sftp": {}}
 _SFTP = re.compile(r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:\d{1,4}|:[1-5]\d{4})?/[^@]+")
 _AT_ONCE = 4  # files; s3fs holds as many parts of each in memory [50 MB]
 
@@ -86,7 +82,8 @@ class Objects:
         except ImportError as error:
             raise UsageError(f"{scheme}:// needs another package: {error}") from None
         except ValueError:
-            raise UnknownName("scheme", f"{scheme}://", [f"{known}://" for known in _KNOWN]) from None
+            known = ("hf://", "s3://", "sftp://", "file://", "gs://", "az://")
+            raise UnknownName("scheme", f"{scheme}://", known) from None
         if scheme == "sftp" and not _SFTP.fullmatch(url):
             text = "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40, : as %3A"
             raise UsageError(f"the sftp:// address cannot be read; {text}")
@@ -96,13 +93,16 @@ class Objects:
 
     @cached_property
     def _fs(self) -> Any:
-        return self._class(**self._login, **_OPTIONS.get(self._scheme, _ASYNC))
+        return self._class(**self._login, **_OPTIONS.get(self._scheme, _FRESH))
 
     def read(self) -> Manifest | None:
         """Return the version that readers see now; None if there is none."""
         with explained(f"read {self.name}"):
-            found = self._read()
-            return Manifest.from_json(*found) if found else None
+            try:
+                info, data = self._fs.info(self._manifest), self._fs.cat_file(self._manifest)
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+            return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
 
     def write(self, plan: Plan) -> None:
         """Upload the objects that are not there, then replace the manifest; remove what no reader can need."""
@@ -117,7 +117,7 @@ class Objects:
                 if plan.local[path].stat().st_size != files[path].size:
                     raise RemoteError(f"{plan.local[path]} was written to while it was pushed; push again after that")
             if files != before:
-                self._switch(plan.manifest.to_json(), plan.before)
+                self._switch(plan.manifest, plan.before)
                 named = {one.sha256 for one in (*files.values(), *before.values())}
                 if unused := there.keys() - named:
                     self._fs.rm([self._object(key) for key in unused])
@@ -133,33 +133,24 @@ class Objects:
         bar = TqdmCallback({"desc": what, "unit": " files", "disable": True if self._quiet else None})
         return {"callback": bar, **({"batch_size": _AT_ONCE} if self._fs.async_impl else {})}
 
-    def _read(self) -> tuple[bytes, str] | None:
-        """Return the manifest's text and what names this version of it: the store's ETag, or else its hash."""
-        try:
-            info = self._fs.info(self._manifest)
-            data = self._fs.cat_file(self._manifest)
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        return data, info.get("ETag") or hashlib.sha256(data).hexdigest()
-
-    def _switch(self, data: bytes, before: Manifest | None) -> None:
+    def _switch(self, new: Manifest, before: Manifest | None) -> None:
         """Replace the manifest if it is still `before`: S3 sees to that itself; elsewhere it is read just before."""
-        version, found = before.version if before else None, self._read()
+        found, version = self.read(), before.version if before else None
         try:
-            if (found[1] if found else None) != version:
+            if (found.version if found else None) != version:
                 raise FileExistsError
             if self._scheme in ("file", "sftp"):  # others replace a file in one step
                 partial = f"{self._root}/.{MANIFEST_FILE}.{secrets.token_hex(8)}.partial"
-                self._fs.pipe_file(partial, data)
+                self._fs.pipe_file(partial, new.to_json())
                 self._fs.mv(partial, self._manifest)
             else:
                 condition = {"IfMatch": version} if version else {"IfNoneMatch": "*"}
-                self._fs.pipe_file(self._manifest, data, **(condition if self._scheme == "s3" else {}))
+                self._fs.pipe_file(self._manifest, new.to_json(), **(condition if self._scheme == "s3" else {}))
         except OSError as error:
-            found = self._read()
-            if found and found[0] == data:
+            found = self.read()
+            if found and found.files == new.files:
                 return  # it had worked, and only the answer was lost
-            if (found[1] if found else None) != version:
+            if (found.version if found else None) != version:
                 text = "was changed by another push in the meantime; nothing of this push is visible there; push again"
                 raise RemoteError(f"{self.name} {text}") from error
             raise

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +32,6 @@ from manip_il.store.manifest import (
 )
 from manip_il.store.objects import Objects
 
-FORMS = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
 TRIES = 2  # to fetch a file with the right hash
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")
 _OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
@@ -46,7 +44,7 @@ def open_remote(url: str, *, revision: str | None = None, private: bool = False,
     """
     found = _ADDRESS.fullmatch(url)
     if not found:
-        raise UsageError(f"the remote is not a URL; expected {FORMS}")
+        raise UsageError("the remote is not a URL; expected one such as hf://datasets/USER/NAME or file://FOLDER")
     if found[1] == "hf":
         return Hub(found[2], revision, private=private, quiet=quiet)
     if revision is not None:
@@ -60,54 +58,32 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
     journals: include them. Raises `NotWhole` for a dataset in which the doctor finds errors, in a run too, `UsageError`
     for a dataset in place of a policy or the other way round, and `RemoteError`.
     """
-    kind = kind_of(source)
+    kind: Kind = "dataset" if (source / INFO).is_file() else "policy"
+    if kind == "policy" and not any((source / name).exists() for name in _OF_A_RUN):
+        text = f"neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_OF_A_RUN)})"
+        raise UsageError(f"{source} is {text}; name the folder that holds one")
     if remote.kind not in (None, kind):
-        right = "hf://datasets/USER/NAME" if kind == "dataset" else "hf://USER/NAME"
-        raise UsageError(f"{source} is a {kind}, {remote.name} is for a {remote.kind}; push it to {right}")
+        text = "datasets go to hf://datasets/USER/NAME, runs to hf://USER/NAME"
+        raise UsageError(f"{source} is a {kind}, {remote.name} is for a {remote.kind}; {text}")
     for dataset in datasets_in(source):
-        _refuse_damaged(dataset)
+        if errors := [one for one in examine_folder(dataset) if one.severity is Severity.ERROR]:
+            text = f"{dataset} is damaged and was not pushed: {' '.join(str(errors[0]).split())}"
+            raise NotWhole(f"{text}; see all with manip-il data check {dataset}, and repair it with --repair=true")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         local = list_files(source.absolute(), kind, journals=journals)
         if isinstance(remote, Hub):  # elsewhere a pull gives the folder back as it was
             local |= remote.additions(source, local, Path(folder))
-        plan = _compare(local, kind, remote)
+        before = remote.read()
+        if before and before.kind != kind:
+            raise UsageError(f"{remote.name} holds a {before.kind}, not a {kind}; choose another name")
+        with ThreadPoolExecutor() as pool:
+            manifest = Manifest(kind, dict(zip(local, pool.map(File.of, local.values()), strict=True)))
+        old, new = before.files if before else {}, manifest.files
+        same = {path for path in old.keys() & new.keys() if old[path] == new[path] or old[path].fits(local[path])}
+        plan = Plan(manifest, before, local, sorted(new.keys() - same), sorted(old.keys() - new.keys()))
         if not dry_run:
             remote.write(plan)
     return plan
-
-
-def kind_of(root: Path) -> Kind:
-    """Return what a folder holds. Raises `UsageError` if it is neither a dataset nor a run."""
-    if (root / INFO).is_file():
-        return "dataset"
-    if any((root / name).exists() for name in _OF_A_RUN):
-        return "policy"
-    text = f"{root} is neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_OF_A_RUN)})"
-    raise UsageError(f"{text}; name the folder that holds one")
-
-
-def _refuse_damaged(dataset: Path) -> None:
-    first = next((finding for finding in examine_folder(dataset) if finding.severity is Severity.ERROR), None)
-    if first is not None:
-        text = f"{dataset} is damaged and was not pushed: {' '.join(str(first).split())}"
-        raise NotWhole(f"{text}; see all with manip-il data check {dataset}, and repair it with --repair=true")
-
-
-def _compare(local: Mapping[str, Path], kind: Kind, remote: Hub | Objects) -> Plan:
-    """Return the plan of a push. Raises `UsageError` if something of another kind is there."""
-    before = remote.read()
-    if before and before.kind != kind:
-        raise UsageError(f"{remote.name} holds a {before.kind}, not a {kind}; choose another name")
-    with ThreadPoolExecutor() as pool:
-        manifest = Manifest(kind, dict(zip(local, pool.map(File.of, local.values()), strict=True)))
-    old = before.files if before else {}
-
-    def is_there(path: str) -> bool:
-        there = old.get(path)
-        return there is not None and (there == manifest.files[path] if there.sha256 else there.fits(local[path]))
-
-    upload = tuple(path for path in sorted(local) if not is_there(path))
-    return Plan(manifest, before, local, upload, tuple(sorted(old.keys() - local.keys())))
 
 
 def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_run: bool = False) -> Manifest:
@@ -121,35 +97,35 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
         text = "check the address (of a dataset on the Hub: hf://datasets/USER/NAME), log in if it is private, or push"
         raise RemoteError(f"{remote.name} holds nothing that can be pulled; {text} there first")
     files = {path: file for path, file in manifest.files.items() if path not in manifest.copies}
+    manifest = replace(manifest, files=files)
     if dry_run:
-        return replace(manifest, files=files)
+        return manifest
     beside, skip = journals_of(target), len(f"{JOURNALS}/")
     journals = [path for path in files if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")]
     if beside.exists() and not overwrite and not all(files[path].fits(beside / path[skip:]) for path in journals):
         raise FolderExistsError(beside)  # else what a killed pull has left
     with atomic.new_folder(target, replace=overwrite) as partial:
-        _fetch(partial, remote, manifest, files)
+        _fetch(partial, remote, manifest)
         for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:
-            if name := newest(checkpoints):
+            if (name := newest(checkpoints)) and not (checkpoints / LAST).exists():
                 (checkpoints / LAST).symlink_to(name)
         if journals:
             with atomic.new_folder(beside, replace=True) as folder:
                 for path in list((partial / JOURNALS).iterdir()):
                     path.rename(folder / path.name)
             (partial / JOURNALS).rmdir()
-    return replace(manifest, files=files)
+    return manifest
 
 
-def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest, files: Mapping[str, File]) -> None:
+def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
     """Fill a folder with all files of a version, each verified and, of datasets, opened in a child process."""
-    wrong = list(files)
+    wrong = list(manifest.files)
     for _ in range(TRIES):
         for path in wrong:
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (folder / path).unlink(missing_ok=True)
         remote.fetch(manifest, wrong, folder)
         with ThreadPoolExecutor() as pool:
-            fits = pool.map(lambda path: files[path].fits(folder / path), wrong)
+            fits = pool.map(lambda path: manifest.files[path].fits(folder / path), wrong)
             wrong = [path for path, is_right in zip(wrong, fits, strict=True) if not is_right]
         if not wrong:
             break

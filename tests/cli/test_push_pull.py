@@ -75,7 +75,7 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
     ("words", "says"),
     [
         (["push", "empty", "URL"], "is neither a LeRobot dataset (meta/info.json) nor a run or policy"),
-        (["push", "RUN", "hf://datasets/me/x"], "hf://datasets/me/x is for a dataset; push it"),
+        (["push", "RUN", "hf://datasets/me/x"], "hf://datasets/me/x is for a dataset; datasets go to"),
     ],
 )
 def test_wrong_words(words, says, run, url, here, error):

@@ -82,7 +82,7 @@ def test_a_hub_that_names_a_path_or_a_commit_outside_the_folder(hub: Hub, tmp_pa
 @pytest.mark.parametrize(
     ("url", "code", "says"),
     [
-        ("datasets/demos", 2, "the remote is not a URL; expected hf://"),
+        ("datasets/demos", 2, "the remote is not a URL; expected one such as hf://"),
         ("s4://bucket/x", 2, "unknown scheme 's4://' (did you mean 's3://'?)"),
         ("gs://bucket/x", 2, "gs:// needs another package: Please install gcsfs"),
         ("hf://demos", 2, "expected hf://datasets/USER/NAME"),

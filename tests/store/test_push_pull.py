@@ -39,9 +39,9 @@ def test_a_run_comes_back_as_it_was_and_only_changes_travel(place: str, tmp_path
     (run / "more.json").write_text("[12]")
     (run / "empty.txt").unlink()
     plan = push(run, open_quietly(place))
-    assert (plan.upload, plan.remove) == (("more.json", "same.json"), ("empty.txt",))
+    assert (plan.upload, plan.remove) == (["more.json", "same.json"], ["empty.txt"])
     plan = push(run, open_quietly(place), dry_run=True)
-    assert (plan.upload, plan.remove) == ((), ())
+    assert (plan.upload, plan.remove) == ([], [])
     with pytest.raises(FolderExistsError):
         pull(open_quietly(place), tmp_path / "got")
     pull(open_quietly(place), tmp_path / "got", overwrite=True)
@@ -63,9 +63,9 @@ def test_of_two_pushes_one_wins_and_the_other_is_told(place: str, tmp_path: Path
     runs = [make_run(tmp_path / name, seed) for seed, name in enumerate("abc")]
     push(runs[0], open_quietly(place))
     late = open_quietly(place)
-    before = late.read()
+    read, answers = late.read, iter([late.read()])
     push(runs[1], open_quietly(place))
-    late.read = lambda: before
+    late.read = lambda: next(answers, None) or read()
     with pytest.raises(RemoteError, match="push again"):
         push(runs[2], late)
     pull(open_quietly(place), tmp_path / "got")
@@ -76,11 +76,11 @@ def test_s3_itself_refuses_a_manifest_that_replaces_another_than_was_read(bucket
     remote = Objects("s3", f"s3://{bucket}/a", quiet=True)
     push(make_run(tmp_path / "run"), remote)
     found = remote.read()
-    answers = iter([(b"", '"an older tag"'), remote._read()])
-    monkeypatch.setattr(remote, "_read", lambda: next(answers))
+    older = replace(found, version='"an older tag"', files={})
+    answers = iter([older, found])
+    monkeypatch.setattr(remote, "read", lambda: next(answers))
     with pytest.raises(RemoteError, match="changed by another push"):
-        remote._switch(b"{}", replace(found, version='"an older tag"'))
-    monkeypatch.undo()
+        remote._switch(older, older)
 
 
 def test_journals_go_along_when_asked_and_lie_beside_again(
