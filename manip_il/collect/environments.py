@@ -20,8 +20,7 @@ from manip_il.collect.rollout import Environment, Labeller
 from manip_il.data.fingerprint import canonical_json, environment_fingerprint
 from manip_il.data.schema import SERVOS, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import META_FILE, read_meta
-from manip_il.learn.pretrained import read_interface
+from manip_il.learn.checkpoint import META_FILE, Checkpoint
 from manip_il.mdp import STATE_EXTRAS, State
 from manip_il.robots import ROBOTS
 from manip_il.robots.action_space import ActionSpace
@@ -164,7 +163,8 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
     The light is the default where the checkpoint does not say. Raises `MismatchError` for cameras that environments do
     not have or whose pictures differ in size, `ManipError` for a folder or a size that cannot be.
     """
-    pictures, meta = read_interface(policy).pictures, read_meta(policy)
+    checkpoint = Checkpoint.open(policy)
+    pictures, meta = checkpoint.pictures, checkpoint.origin
     if not pictures:
         return None
     if not set(pictures) <= set(CAMERAS):

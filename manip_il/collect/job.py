@@ -14,7 +14,7 @@ from manip_il.collect.query import Every, LabelMode, Query, branches, cut_at_tak
 from manip_il.collect.rollout import Act, Environment, Labeller, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError, UsageError
-from manip_il.learn.pretrained import check_interface
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
@@ -139,9 +139,9 @@ def _load(job: RolloutJob, path: Path, env: Environment) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     trust = isinstance(job.driver, PolicyDriver) and job.driver.trust
-    policy = LearnedPolicy.load(path, task=env.task_description, trust=trust)
-    check_interface(policy.interface, env_spec(job.env, observed_cameras(job)))
-    return policy
+    checkpoint = Checkpoint.open(path)
+    checkpoint.check_fits(env_spec(job.env, observed_cameras(job)))
+    return LearnedPolicy.load(checkpoint, task=env.task_description, trust=trust)
 
 
 def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, branch_env: Environment | None) -> Episode:
