@@ -36,7 +36,6 @@ from manip_il.data.dataset import Dataset
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
-from manip_il.learn.card import learnt_by_reinforcement, write_card
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork
@@ -187,10 +186,8 @@ class LearningRun:
         fingerprint, space = env_fingerprint(config.env), self.conversion.space
         origin = Origin.of(self._spec, fingerprint, self._options(), action_space=space)
         step = {"step": self._number, "simulated": self._simulated, "metrics": self._metrics}
-        story = learnt_by_reinforcement(self._demonstrations, self._simulated, config.seed, clone=bool(config.start))
         with unpublished(self.folder / "checkpoints" / f"{self._number:06d}") as new:
             save_policy(self._policy, self.conversion, new / PRETRAINED_MODEL)
-            write_card(new / PRETRAINED_MODEL, self._policy.config, origin, story)
             (new / TRAINING_STATE).mkdir()
             self._learner.save(new / TRAINING_STATE, self._modules)
             write_own_files(new, origin, step | {"validated_at": self._validated_at, "given": self._given})

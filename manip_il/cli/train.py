@@ -145,12 +145,12 @@ class TrainOptions:
         """Return how often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
         if self.weights is None:
             return None
-        from manip_il.learn.weights import rabc_weights, read_progress
+        from manip_il.learn.weights import rabc_weights
 
         episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
         ahead = getattr(lerobot.policy, "chunk_size", None) or int(dataset.fps)
-        weights = rabc_weights(read_progress(self.weights, episodes), episodes, ahead)
-        say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
+        weights = rabc_weights(self.weights, episodes, ahead)
+        say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == weights.max()).mean():.1%} weigh most")
         return weights
 
     def _redrawn(self, held: contextlib.ExitStack) -> Path:

@@ -8,8 +8,7 @@ and weights alone are listed in `PLAIN`, the steps of their processors in `_STEP
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -31,16 +30,10 @@ _PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 _LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
 _MOST_STEPS, _LONGEST_SIDE, _MOST_NAMES = 100, 100_000, 1_000
 _PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
-_NORMALISER = frozenset({"eps", "features", "norm_map", "normalize_observation_keys"})
-_STEPS: dict[str, frozenset[str]] = {  # LeRobot's default processors, and ours: step -> the options that it may have
-    "rename_observations_processor": frozenset({"rename_map"}),
-    "to_batch_processor": frozenset(),
-    "device_processor": frozenset({"device", "float_dtype"}),
-    "normalizer_processor": _NORMALISER,
-    "unnormalizer_processor": _NORMALISER,
-    MEASURED: frozenset(),
-    DECODER: frozenset({"action_space", "robot"}),
-}
+_STEPS = (  # of LeRobot's default processors, and ours: they load nothing
+    *("rename_observations_processor", "to_batch_processor", "device_processor"),
+    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
+)
 _NAMING = ("model", "tokenizer", "encoder_name", "vlm", "path")  # in the names of options that name what is loaded
 _MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp")
 _MUST_AGREE = {
@@ -250,8 +243,13 @@ class Checkpoint:
 
     def require_trust(self, trust: bool) -> None:
         """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
-        steps = [one for name, steps in self.processors.items() for one in _other_steps(name, steps)]
-        require_trust(self.config, str(self.path), trust, steps)
+        others = [
+            _list_options(f"the step {checks.shorten(step['registry_name'])} of {name}", step["config"])
+            for name, steps in self.processors.items()
+            for step in steps
+            if step["registry_name"] not in _STEPS
+        ]
+        require_trust(self.config, str(self.path), trust, others)
 
     def require_processors(self) -> None:
         """Raise `ManipError` unless both processors are there."""
@@ -304,8 +302,6 @@ def read_config(path: Path) -> dict[str, Any]:
         adapter = (path / "adapter_model.safetensors").is_file()
         hint = "it is an adapter: merge it into its base policy first" if adapter else "the weights are missing"
         raise ManipError(f"no {WEIGHTS} in {path}; {hint}")
-    if not os.access(path / WEIGHTS, os.R_OK):
-        raise ManipError(f"{path / WEIGHTS} may not be read by this user (uid {os.getuid()}); run as its owner")
     config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json", _LARGEST_JSON)
     try:
         checks.text("type", config.get("type"), checks.LONGEST_NAME)
@@ -366,16 +362,6 @@ def _step(path: Path, step: dict[str, Any]) -> dict[str, Any]:
         if not (path.parent / known["state_file"]).is_file():
             raise ManipError(f"no {known['state_file']} beside it")
     return known
-
-
-def _other_steps(name: str, steps: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """The steps of a processor's file that are not LeRobot's default, or have options that those have not."""
-    for step in steps:
-        kind, options = step["registry_name"], step["config"]
-        if kind not in _STEPS:
-            yield _list_options(f"the step {checks.shorten(kind)} of {name}", options)
-        elif extra := {key: options[key] for key in options if key not in _STEPS[kind]}:
-            yield _list_options(f"the step {kind!r} of {name} with options of its own", extra)
 
 
 def _list_options(what: str, options: Mapping[str, Any]) -> str:

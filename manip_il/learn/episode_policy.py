@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import itertools
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -20,7 +20,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 
 from manip_il.errors import ManipError
 from manip_il.learn.lerobot_policy import line_of
-from manip_il.learn.shared_plans import SharedPlans, Turn
+from manip_il.learn.shared_plans import SharedPlans
 
 Batch = dict[str, Any]
 
@@ -43,18 +43,21 @@ class EpisodePolicy:
         self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
-        self._plans = _plans_of(policy)
+        self._plans = SharedPlans(policy) if policy.config.type == "diffusion" else None
         self._instructions: dict[int, str] = {}
-        self._memories: dict[int, tuple[PreTrainedPolicy, Iterator[int]]] = {}  # and the number of each step
+        self._steps = Counter[int]()  # taken in every episode
+        self._memories: dict[int, PreTrainedPolicy] = {}
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
-        self.forget(self._memories.keys() - set(episodes))
+        self.forget([episode for episode in self._steps if episode not in set(episodes)])
         try:
             # mixed precision where the policy was trained so, as lerobot-eval has it
             with torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext():
                 if self._plans is not None:
-                    actions = [self._together(self._plans, batch, episodes)]
+                    generators = [torch.Generator(self._device).manual_seed(self._next_seed(one)) for one in episodes]
+                    planned = self._plans.select(self._observed(batch, episodes), episodes, generators)
+                    actions = [self._after(planned)]
                 else:
                     actions = [self._one(_row(batch, i), episode) for i, episode in enumerate(episodes)]
         except ManipError:
@@ -66,40 +69,29 @@ class EpisodePolicy:
     def forget(self, episodes: Iterable[int]) -> None:
         """Drop the memory of these episodes."""
         for episode in episodes:
-            self._memories.pop(episode, None)
-            self._instructions.pop(episode, None)
+            for kept in (self._memories, self._steps, self._instructions):
+                kept.pop(episode, None)
+            if self._plans is not None:
+                self._plans.forget(episode)
 
     def instruct(self, instructions: Mapping[int, str]) -> None:
         """Take the texts of episodes that begin, by their numbers."""
         self._instructions.update({episode: text for episode, text in instructions.items() if text})
 
     def _one(self, row: Batch, episode: int) -> torch.Tensor:
-        policy, step = self._remembered(episode)
-        with _drawing(_seed(episode, step), self._device):
-            return self._after(policy.select_action(self._observed(row, [episode])))
-
-    def _together(self, plans: SharedPlans, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
-        observed = self._observed(batch, episodes)
-        turns: list[Turn] = []
-        for i, episode in enumerate(episodes):
-            policy, step = self._remembered(episode)
-            generator = torch.Generator(self._device).manual_seed(_seed(episode, step))
-            turns.append(Turn(episode, generator, policy, _row(observed, i)))
-        plans.make(turns)
-        return self._after(torch.cat([turn.memory.select_action(dict(turn.observation)) for turn in turns]))
-
-    def _remembered(self, episode: int) -> tuple[PreTrainedPolicy, int]:
-        """The policy with an episode's memory, and the number of this step."""
         if episode not in self._memories:
-            policy = copy.deepcopy(self.module, dict(self._shared))
-            if self._plans is not None:
-                self._plans.serve(policy)
-            self._memories[episode] = policy, itertools.count()
-        policy, steps = self._memories[episode]
-        return policy, next(steps)
+            self._memories[episode] = copy.deepcopy(self.module, dict(self._shared))
+        with _drawing(self._next_seed(episode), self._device):
+            return self._after(self._memories[episode].select_action(self._observed(row, [episode])))
 
     def _observed(self, batch: Batch, episodes: Sequence[int]) -> Batch:
         return self._before({**batch, "task": [self._instructions.get(one, self._task) for one in episodes]})
+
+    def _next_seed(self, episode: int) -> int:
+        """The seed of what is drawn in an episode's next step."""
+        step = self._steps[episode]
+        self._steps[episode] += 1
+        return int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
 
 
 def _row(batch: Batch, i: int) -> Batch:
@@ -115,16 +107,6 @@ def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
         if all(type(part).__module__.startswith(("torch.", "torchvision.")) for part in module.modules())
     )
     return {id(part): part for part in (policy.config, *policy.parameters(), *policy.buffers(), *layers)}
-
-
-def _plans_of(policy: PreTrainedPolicy) -> SharedPlans | None:
-    """Return the maker of plans for many episodes at once; None for a policy that plans row by row."""
-    return SharedPlans(policy) if policy.config.type == "diffusion" else None
-
-
-def _seed(episode: int, step: int) -> int:
-    """The seed of what is drawn in a step."""
-    return int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
 
 
 @contextlib.contextmanager

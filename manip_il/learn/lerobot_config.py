@@ -5,11 +5,11 @@ from __future__ import annotations
 import copy
 import dataclasses
 import importlib
+import json
 import logging
 import typing
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
-from enum import Enum
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -141,13 +141,7 @@ def option_lines(kind: str) -> list[tuple[str, str]]:
 
 def _printed(value: Any) -> str:
     """The default as a user would type it."""
-    if isinstance(value, Enum):
-        return value.name
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_printed(one)}" for key, one in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_printed, value)) + "]"
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return json.dumps(draccus.encode(value)).replace('"', "")
 
 
 def policy_features(

@@ -30,7 +30,6 @@ from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
-from manip_il.learn.card import fit_story, write_card
 from manip_il.learn.checkpoint import JOINT_TARGET, OWN_SPACE, Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit, without_places
@@ -162,13 +161,13 @@ class Trainer:
                     write(record)
                 saved = self.step % self.config.steps_per_checkpoint == 0 or self.step == self.steps
                 if saved:
-                    self.save(record)
+                    self.save()
                 try:
                     if on_step is not None:
                         on_step(record)
                 except KeyboardInterrupt:  # by the user, between two steps: nothing is lost
                     if not saved:
-                        self.save(record)
+                        self.save()
                     raise
         self.accelerator.end_training()
         return self.output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
@@ -230,8 +229,8 @@ class Trainer:
         policy.train()
         return dict(sums)
 
-    def save(self, record: Mapping[str, Any]) -> None:
-        """Write a checkpoint of this step and make it the last one. record: metrics for the model card."""
+    def save(self) -> None:
+        """Write a checkpoint of this step and make it the last one."""
         if self.accelerator.is_main_process:
             policy = self.accelerator.unwrap_model(self.policy)
             own = {"data": self.digest, "options": self.options, "batch_size": self.batch_size}
@@ -239,8 +238,6 @@ class Trainer:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
                 save_checkpoint(new, self.step, without_places(self.pipeline), policy, *state, *processors)
                 write_own_files(new, self.origin, read_step(new) | own)
-                story = fit_story(self.pipeline, self.meta, record)
-                write_card(new / PRETRAINED_MODEL, policy.config, self.origin, story)
         self.accelerator.wait_for_everyone()
 
     def _update(self, batch: Batch) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Checkpoints of a run in LeRobot's layout: written whole or not at all, and gone on from.
 
     OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors policy_*processor*.json|safetensors
-                                                  train_config.json manip_il.json README.md
+                                                  train_config.json manip_il.json
                              /training_state/     optimizer_*.safetensors|json scheduler_state.json
                                                   rng_state.safetensors training_step.json
     OUTPUT/checkpoints/last -> 004000
