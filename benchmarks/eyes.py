@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from manip_il.data.frame_cache import open_frame_cache
 from numpy.typing import NDArray
 from PIL import Image
 
 from manip_il.data.dataset import Dataset
-from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.learn.cnn.modeling_cnn import CNNPolicy
 

@@ -47,7 +47,6 @@ forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignor
 LONG = (
     "docs/test_commands.py",
     "evaluation/test_certificate.py",
-    "learn/test_fit_policy.py",
     "store/test_kills.py",
     "lerobot_commands/test_policies.py",
     "store/test_round_trip.py",
@@ -60,7 +59,6 @@ LONG = (
     "collect/test_ray_pool.py",
     "store/test_faults.py",
     "lerobot_commands/test_pictures.py",
-    "learn/test_plugin.py",
     "evaluation/test_runner.py",
     "learn/test_train.py",
     "store/test_large_files.py",

@@ -150,7 +150,7 @@ class TrainOptions:
         episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
         ahead = getattr(lerobot.policy, "chunk_size", None) or int(dataset.fps)
         weights = rabc_weights(self.weights, episodes, ahead)
-        say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == weights.max()).mean():.1%} weigh most")
+        say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         return weights
 
     def _redrawn(self, held: contextlib.ExitStack) -> Path:

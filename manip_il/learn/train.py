@@ -146,6 +146,7 @@ class Trainer:
             with readable_state(checkpoint):
                 self.step, optimizer, scheduler = load_training_state(checkpoint, optimizer, scheduler)
         self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
+        self.unwrapped = self.accelerator.unwrap_model(self.policy)  # of the processes that share a batch
 
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
         """Take the steps that are left, with metrics and checkpoints; return the last one's `pretrained_model`.
@@ -215,7 +216,7 @@ class Trainer:
         held_out, size = self.data.held_out, self.config.samples_per_step
         if len(held_out) == 0:
             return {}
-        policy = self.accelerator.unwrap_model(self.policy)
+        policy = self.unwrapped
         policy.eval()
         sums = defaultdict[str, float](float)
         with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
@@ -232,11 +233,10 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of this step and make it the last one."""
         if self.accelerator.is_main_process:
-            policy = self.accelerator.unwrap_model(self.policy)
             own = {"data": self.digest, "options": self.options, "batch_size": self.batch_size}
             with unpublished(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
-                save_checkpoint(new, self.step, without_places(self.pipeline), policy, *state, *processors)
+                save_checkpoint(new, self.step, without_places(self.pipeline), self.unwrapped, *state, *processors)
                 write_own_files(new, self.origin, read_step(new) | own)
         self.accelerator.wait_for_everyone()
 
@@ -253,8 +253,7 @@ class Trainer:
         self.optimizer.zero_grad()
         if self.scheduler is not None:
             self.scheduler.step()
-        unwrapped = self.accelerator.unwrap_model(self.policy)
-        if callable(update := getattr(unwrapped, "update", None)):
+        if callable(update := getattr(self.unwrapped, "update", None)):
             update()  # averages of weights and the like, as lerobot-train calls it
         return _numbers(outputs) | {"loss": value, "grad_norm": math.nan if norm is None else float(norm)}
 

@@ -18,7 +18,7 @@ from manip_il.errors import ManipError, MismatchError
 
 
 def rabc_weights(path: Path, episodes: NDArray[np.int64], ahead: int) -> NDArray[np.float64]:
-    """Return the weight of every frame, (N,), relative to the others, by the progress in a file.
+    """Return the weight of every frame, (N,), 1 at most, by the progress in a file.
 
     episodes: the dataset's `episode_index`, (N,). ahead: frames that an action reaches. Raises `ManipError` for a file
     that is no such table and where every frame weighs 0, `MismatchError` for one of another dataset.
@@ -33,4 +33,4 @@ def rabc_weights(path: Path, episodes: NDArray[np.int64], ahead: int) -> NDArray
     weights, _ = found.compute_batch_weights({"index": np.arange(len(episodes))})
     if not weights.any():
         raise ManipError(f"all {len(weights)} frames weigh 0: progress falls from each of them; nothing to learn from")
-    return weights.double().numpy()
+    return (weights / weights.max()).double().numpy()

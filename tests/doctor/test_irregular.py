@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from manip_il.data.frame_cache import open_frame_cache
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import dataset_sha256, merge_datasets
 from manip_il.data.dataset import Dataset
-from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.journal import list_episodes, read_header
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError

@@ -15,7 +15,7 @@ from PIL import Image
 
 from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.store.card_dataset import read_paths
 from manip_il.store.cards import CARD, PICTURE, card_for
 
@@ -108,9 +108,9 @@ def test_a_policy_that_nobody_evaluated_says_so(run: Path):
 
 def test_a_dagger_runs_card_is_of_its_best_policy(tmp_path: Path):
     spec, run = Dataset.open(SAMPLE).spec, tmp_path / "run"
-    meta = CheckpointMeta("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
+    meta = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
     write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
-    write_checkpoint(run / "best" / "pretrained_model", "act", spec, meta=meta)
+    write_checkpoint(run / "best" / "pretrained_model", "act", spec, origin=meta)
     text = card_for(run, "policy", "hf://user/act")[CARD].decode()
     assert "# act for panda pick_place\n" in text
     assert "--env.task=PandaPickPlace-v0" in text
