@@ -6,10 +6,8 @@ import copy
 import dataclasses
 import importlib
 import json
-import logging
 import typing
 from collections.abc import Mapping, Sequence
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -108,23 +106,10 @@ def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
         if name not in known:
             raise UnknownName(f"option of {source}:", name, known)
     try:
-        with _quiet():
-            return draccus.decode(cls, dict(settings))
+        return draccus.decode(cls, dict(settings))
     except (DecodingError, ParsingError, ValueError, TypeError, NotImplementedError, ImportError) as error:
         reason = error if isinstance(error, DecodingError) else error.__cause__ or error
         raise UsageError(f"{source}: {' '.join(str(reason).split())}") from error
-
-
-@contextmanager
-def _quiet():
-    """Drop LeRobot's warning of a device that it looks for before it knows which one the user wants."""
-    logger = logging.getLogger("lerobot.configs.policies")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 def option_lines(kind: str) -> list[tuple[str, str]]:

@@ -71,38 +71,18 @@ class Shape:
         return cls(**{name: config[name] for name in needed})
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Float32 vectors over inputs (d,) and targets (n,), in raw units ([rad], [m]).
+Statistics = Mapping[str, Tensor]  # by the names of `MLPNetwork`'s buffers
+
+
+def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str) -> Statistics:
+    """Return statistics of inputs (N, d) and targets (N, n), in raw units ([rad], [m]), as float32 vectors.
 
     x = (input - input_mean) * input_scale; target = target_mean + target_scale * y, clamped to
     [target_low, target_high], the range of the data.
-    """
-
-    input_mean: Tensor
-    input_scale: Tensor
-    target_mean: Tensor
-    target_scale: Tensor
-    target_low: Tensor
-    target_high: Tensor
-
-    @classmethod
-    def identity(cls, inputs: int, targets: int) -> Statistics:
-        """Return statistics that change nothing, of d inputs and n targets."""
-        everything, zeros, ones = torch.full((targets,), torch.inf), torch.zeros, torch.ones
-        return cls(zeros(inputs), ones(inputs), zeros(targets), ones(targets), -everything, everything)
-
-
-def fit_statistics(
-    inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str, rows: NDArray[np.int64] | None = None
-) -> Statistics:
-    """Return statistics of inputs (N, d) and targets (N, n), of all rows or of some, (S,).
 
     Targets are scaled by mean and deviation, for `categorical` by the middle and half-width of
     their range, which puts them in [-1, 1]. A constant target has scale 0: it is its mean.
     """
-    if rows is not None:
-        inputs, targets = inputs[rows], targets[rows]
     low, high = targets.min(0).astype(np.float64), targets.max(0).astype(np.float64)
     if loss == "categorical":
         target_mean, target_scale = (low + high) / 2, (high - low) / 2
@@ -111,8 +91,9 @@ def fit_statistics(
     target_scale = np.where(target_scale < CONSTANT_TARGET, 0.0, target_scale)
     input_mean, deviation = _mean_and_deviation(inputs)
     input_scale = np.where(deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT))
-    values = (input_mean, input_scale, target_mean, target_scale, low, high)
-    return Statistics(*(torch.from_numpy(value.astype(np.float32)) for value in values))
+    found = {"input_mean": input_mean, "input_scale": input_scale, "target_mean": target_mean}
+    found |= {"target_scale": target_scale, "target_low": low, "target_high": high}
+    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in found.items()}
 
 
 def _mean_and_deviation(values: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -145,12 +126,15 @@ class MLPNetwork(nn.Module):
         for width in (inputs, *[shape.width] * (shape.depth - 1)):
             layers += [nn.Linear(width, shape.width), _ACTIVATIONS[shape.activation]()]
         self.layers = nn.Sequential(*layers, nn.Linear(shape.width, self.head.size))
-        for name, tensor in vars(Statistics.identity(inputs, n)).items():
-            self.register_buffer(name, tensor)
+        for name, size in (("input", inputs), ("target", n)):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_scale", torch.ones(size))
+        self.register_buffer("target_low", torch.full((n,), -torch.inf))
+        self.register_buffer("target_high", torch.full((n,), torch.inf))
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Take the units of the data, saved with the weights. Inputs beyond those of `statistics` have none."""
-        for name, tensor in vars(statistics).items():
+        for name, tensor in statistics.items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
     def encode(self, inputs: Tensor) -> Tensor:

@@ -240,8 +240,8 @@ class CNNPolicy(MLPPolicy):
         super()._learn_columns(columns)
         if truth is not None and config.privileged_size == sizes[0]:  # a checkpoint from another task goes on without
             statistics = fit_statistics(truth.numpy(), truth.numpy(), "mse")
-            self.truth_mean.copy_(statistics.input_mean)
-            self.truth_scale.copy_(statistics.input_scale)
+            self.truth_mean.copy_(statistics["input_mean"])
+            self.truth_scale.copy_(statistics["input_scale"])
             self._remember(ENVIRONMENT_STATE, columns, truth)
         if places is not None and config.named_points == sizes[1]:
             self._remember(KEYPOINTS, columns, places)
