@@ -236,8 +236,8 @@ def test_a_warm_mlp_acts_as_the_one_it_came_from_in_the_units_of_new_data(table,
     for name, settings, more in (("a", MLP, {"init_from": first}), ("b", {"path": str(first)}, {})):
         second = fit(settings, name, write(wider, f"wider_{name}"), steps=1, lr=1e-12, **more)
         assert not torch.equal(weights(first)["model.input_scale"], weights(second)["model.input_scale"])
-        acted = [LearnedPolicy.load(path).act(*inputs) for path in (first, second)]
-        np.testing.assert_allclose(*acted, atol=2e-5)
+        before, after = (LearnedPolicy.load(path).act(*inputs) for path in (first, second))
+        np.testing.assert_allclose(after, before, atol=2e-5)
 
 
 def test_a_policy_of_lerobots_starts_from_a_checkpoints_weights(fit, weights):
