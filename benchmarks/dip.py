@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 import manip_il.collect.expert as expert
 import manip_il.collect.job as jobs
-import manip_il.learn.train as train
+import manip_il.learn.mlp.modeling_mlp as mlp
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.table import run_algorithm
 from manip_il.collect.workers import Engine
@@ -47,13 +47,13 @@ def as_it_is() -> Iterator[None]:
 @contextmanager
 def frozen_units() -> Iterator[None]:
     """Every fit takes the statistics of the first."""
-    plain, first = train.fit_statistics, list[Statistics]()
+    plain, first = mlp.fit_statistics, list[Statistics]()
 
     def fit_statistics(*data: Any) -> Statistics:
         first.append(plain(*data))
         return first[0]
 
-    with patch.object(train, "fit_statistics", fit_statistics):
+    with patch.object(mlp, "fit_statistics", fit_statistics):
         yield
 
 

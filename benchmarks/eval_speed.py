@@ -27,8 +27,11 @@ from _machine import describe_machine
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
+from manip_il.data.dataset import Dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.sources import Sources
 from manip_il.learn.train import fit
 from manip_il.mdp import Episode
 from manip_il.robots.robot import ROBOTS
@@ -66,10 +69,9 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
     """A policy cloned from 200 demonstrations: it solves nearly all, as what one evaluates in earnest does."""
     count, steps = (10, 50) if quick else (200, 4_000)
     config = EnvConfig(robot, TASK)
-    demos = list(RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count)))
-    table = {key: np.concatenate([episode.columns[key] for episode in demos]) for key in demos[0].columns}
-    table["episode_index"] = np.repeat(np.arange(len(demos)), [len(episode) for episode in demos])
-    return fit(table, FitConfig(steps=steps), folder, spec=env_spec(config))
+    demos = RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count))
+    write_dataset(demos, folder / "dataset", env_spec(config), repo_id="local/demos", fingerprint={})
+    return fit(Sources((Dataset.open(folder / "dataset"),)), FitConfig(steps=steps), folder)
 
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:

@@ -29,10 +29,9 @@ from lerobot.datasets import LeRobotDataset
 
 import datasets
 from manip_il.data.dataset import Dataset
-from manip_il.data.lerobot_library import read_metadata
 from manip_il.learn.batches import Augment, pictures_to_float
-from manip_il.learn.limits import threads
-from manip_il.learn.samples import JoinedFrames, SampleSource, Windows
+from manip_il.learn.samples import Pictures, Samples, Windows
+from manip_il.learn.threads import threads
 
 BATCH = 64
 SECONDS = 2.0  # of ours, each time
@@ -58,7 +57,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         root = options.dataset or record(Path(folder) / "dataset", 4 if options.quick else 20)
         with threads(1):
-            repeats = measure(root, Path(folder), 1 if options.quick else 5)
+            repeats = measure(root, 1 if options.quick else 5)
         report(root, repeats)
     return 0
 
@@ -70,12 +69,12 @@ def record(root: Path, episodes: int) -> Path:
     return root
 
 
-def measure(root: Path, folder: Path, repeats: int) -> list[Repeat]:
+def measure(root: Path, repeats: int) -> list[Repeat]:
     # its processes first: a fork of one that has decoded already would share its open files
     peers = [epochs(root, workers) for workers in (2, 0)]
     for peer in peers:
         next(peer)
-    source = our_source(root)
+    source = our_samples(root)
     rows = {name: partial(our_epoch, source, augment, iter(range(10**9))) for name, augment in ROWS.items()}
     for epoch in rows.values():
         epoch()
@@ -99,27 +98,25 @@ def epochs(root: Path, workers: int) -> Iterator[float]:
         yield samples / (time.perf_counter() - started)
 
 
-def our_source(root: Path) -> SampleSource:
-    frames = decoded(root)
-    table = {key: values for key, values in Dataset.open(root).columns().items() if values.dtype != object}
+def our_samples(root: Path) -> Samples:
+    dataset = Dataset.open(root)
+    table = {key: values for key, values in dataset.columns().items() if values.dtype != object}
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
-    texts = read_metadata(root).tasks
-    assert texts is not None
-    tasks = tuple(map(str, texts.index))
-    joined = {camera: JoinedFrames([one]) for camera, one in frames.items()}
-    return SampleSource(Windows(table["episode_index"], {}), columns, joined, tasks)
+    pictures = {camera: Pictures.decode([dataset], camera) for camera in dataset.cameras}
+    return Samples(Windows(table["episode_index"], {}), columns, pictures, np.array([*dataset.tasks.values()], object))
 
 
-def our_epoch(source: SampleSource, augment: Augment | None, number: Iterator[int]) -> int:
+def our_epoch(samples: Samples, augment: Augment | None, number: Iterator[int]) -> int:
     """One pass in an order of its own; the number of samples."""
-    count, seed = len(source.windows.episodes), next(number)
+    count, seed = len(samples.windows.episodes), next(number)
     order = np.random.default_rng(seed).permutation(count)
     generator = torch.Generator().manual_seed(seed)
-    for batch in source.batches(np.split(order, range(BATCH, count, BATCH))):
+    for rows in np.split(order, range(BATCH, count, BATCH)):
+        batch = samples.batch(rows)
         if augment is None:
-            pictures_to_float(batch, source.frames)
+            pictures_to_float(batch, samples.pictures)
         else:
-            for key in source.frames:
+            for key in samples.pictures:
                 batch[key] = augment(batch[key], generator)
     return count
 
@@ -131,15 +128,10 @@ def samples_per_s(epoch: Callable[[], int]) -> float:
     return count / (time.perf_counter() - started)
 
 
-def decoded(root: Path) -> dict[str, np.ndarray]:
-    dataset = Dataset.open(root)
-    return {key: dataset.camera(key).decode() for key in dataset.cameras}
-
-
 def build_time(root: Path) -> float:
     """Seconds that decoding all frames takes."""
     started = time.perf_counter()
-    decoded(root)
+    our_samples(root)
     return time.perf_counter() - started
 
 

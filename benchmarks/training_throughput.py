@@ -22,11 +22,10 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 import datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec, features
-from manip_il.learn.columns import learning_rows
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.lerobot_config import LeRobotFit
-from manip_il.learn.limits import threads
 from manip_il.learn.mlp import MLPConfig
+from manip_il.learn.sources import Sources
+from manip_il.learn.threads import threads
 from manip_il.learn.train import Trainer
 
 BATCH = 512
@@ -41,7 +40,7 @@ def main() -> None:
         dataset = LeRobotDataset("manip/benchmark", root=root)
         with threads(1):
             peer_feed, peer_step = lerobot_path(dataset)
-            our_feed, our_step = our_path(dataset)
+            our_feed, our_step = our_path(root, Path(folder) / "run")
             rates = [samples_per_s(step) for step in (peer_feed, our_feed, peer_step, our_step)]
     print(f"{dataset.num_frames} frames, batches of {BATCH}, one thread, samples/s:")
     for what, peer, ours in (("feeding", *rates[:2]), ("optimisation step", *rates[2:])):
@@ -67,24 +66,12 @@ def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callabl
     return lambda: before(next(batches)), step
 
 
-def our_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callable[[], object]]:
-    """A batch from the table in memory; and the same update with it."""
-    table = Dataset.open(dataset.root).columns(LEARNING)
-    names = dataset.meta.features
-    spec = RobotTaskSpec(
-        robot="benchmark",
-        task="benchmark",
-        fps=dataset.fps,
-        joint_names=tuple(names[STATE]["names"]),
-        environment_state_names=tuple(names[ENVIRONMENT_STATE]["names"]),
-        sim_state_size=1,
-        instruction="",
-    )
+def our_path(root: Path, folder: Path) -> tuple[Callable[[], object], Callable[[], object]]:
+    """A batch from the tables in memory, as LeRobot's processors give it; and the same update with it."""
     config = FitConfig(steps=10**9, batch_size=BATCH, log_freq=10**9)
-    trainer = Trainer(learning_rows(table), LeRobotFit(config), spec)
-    updates = trainer.run()
-    counter = iter(range(10**9))
-    return lambda: trainer.batch(next(counter)), lambda: next(updates)
+    trainer = Trainer(Sources((Dataset.open(root),)), config, folder)
+    updates, counter = trainer.run(), iter(range(10**9))
+    return lambda: trainer.preprocessor(trainer.batch(next(counter))), lambda: next(updates)
 
 
 def samples_per_s(step: Callable[[], object]) -> float:

@@ -48,7 +48,6 @@ forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignor
 LONG = (
     "docs/test_commands.py",
     "evaluation/test_certificate.py",
-    "learn/test_fit_policy.py",
     "store/test_kills.py",
     "lerobot_commands/test_policies.py",
     "store/test_push_pull.py",
@@ -58,7 +57,6 @@ LONG = (
     "lerobot_commands/test_datasets.py",
     "collect/test_workers.py",
     "lerobot_commands/test_pictures.py",
-    "learn/test_plugin.py",
     "evaluation/test_runner.py",
     "learn/test_train.py",
 )

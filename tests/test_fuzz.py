@@ -36,8 +36,7 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError
 from manip_il.evaluation.results import EvalResult
-from manip_il.learn.checkpoint import read_meta
-from manip_il.learn.pretrained import read_interface
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mcap.importing import read_frames
 from manip_il.mcap.mapping import load_mapping
 from manip_il.robots.files import ModelFiles, _compile
@@ -158,8 +157,7 @@ def read_mcap(folder: Path) -> None:
 
 
 def read_policy(folder: Path) -> None:
-    read_interface(folder)
-    read_meta(folder)
+    Checkpoint.open(folder)
 
 
 @dataclass(frozen=True)

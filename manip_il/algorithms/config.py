@@ -259,7 +259,7 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
         return 1, 0
     from manip_il.learn.lerobot_config import policy_config
 
-    policy = policy_config(fit.policy, trust=fit.trust)
+    policy = policy_config(fit)
     return len(policy.action_delta_indices or [0]), getattr(policy, "drop_n_last_frames", 0)
 
 
@@ -294,7 +294,8 @@ def check_labels(config: RunConfig) -> None:
             "every episode; give more, or --policy.drop_n_last_frames=0"
         )
     if rule.kind == "likelihood":
-        from manip_il.learn.policy import LIKELIHOODS, NO_LIKELIHOOD
+        from manip_il.learn.losses import LIKELIHOODS
+        from manip_il.learn.policy import NO_LIKELIHOOD
 
         if not fit.is_mlp or fit.policy.get("loss", MLPOptions.loss) not in LIKELIHOODS:
             raise UsageError(NO_LIKELIHOOD)

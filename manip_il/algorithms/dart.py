@@ -41,11 +41,11 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> Noise:
     import numpy as np
 
     from manip_il.data.dataset import Dataset
+    from manip_il.data.lerobot_layout import EPISODE_INDEX
     from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
-    from manip_il.learn.columns import EPISODE_INDEX, LEARNING_COLUMNS
     from manip_il.learn.policy import LearnedPolicy
 
-    table = Dataset.open(root).columns(LEARNING_COLUMNS)
+    table = Dataset.open(root).columns((STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX))
     learner = LearnedPolicy.load(policy, trust=trust)
     errors: list[F64] = []
     for rows in _rows_by_step(table[EPISODE_INDEX].reshape(-1)):  # in the order of time, for a policy with a memory

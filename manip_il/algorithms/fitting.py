@@ -12,69 +12,45 @@ from numpy.typing import NDArray
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
-from manip_il.data.dataset import joined_columns
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import LEROBOT, FitConfig
 from manip_il.seeding import stream_base
 
 F64 = NDArray[np.float64]
 COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)  # what `Sampling.weights` reads
-Table = dict[str, NDArray[Any]]
 OnLog = Callable[[dict[str, Any]], None]
 CHUNK_STEPS = 20_000  # of a round, for LeRobot's policies, where none are given
 
 
 def fit_round(
-    config: RunConfig, roots: Sequence[Path], folder: Path, init_from: Path | None, on_log: OnLog, member: int
+    config: RunConfig,
+    roots: Sequence[Path],
+    folder: Path,
+    init_from: Path | None = None,
+    on_log: OnLog | None = None,
+    member: int = 0,
+    weights: F64 | None = None,
 ) -> Path:
     """Fit, or go on with fitting, a policy to datasets; return the checkpoint's `pretrained_model`.
 
     init_from: start there (see `refit`). on_log: sees the metrics, {} at a step without. member: of the ensemble,
-    each from a seed of its own.
+    each from a seed of its own. weights: how often each frame is drawn, (N,); by default as the run's `sampling` says.
     """
-    fit, weights = round_fit(config, init_from, member), frame_weights(config, roots)
-    if fit.is_mlp:
-        return fit_table(config, joined_columns(roots, LEARNING_COLUMNS), folder, fit, on_log, weights)
-    from manip_il.learn.fit_policy import begin_fit  # torch stays out of what only rolls out
+    from manip_il.learn.sources import Sources
+    from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
 
-    with begin_fit(
-        roots,
-        fit,
+    trainer = Trainer(
+        Sources(tuple(map(Dataset.open, roots))),
+        round_fit(config, init_from, member),
         folder,
         spec=env_spec(config.env, config.cameras),
         fingerprint=env_fingerprint(config.env, config.cameras),
         look=asdict(config.cameras.look) if config.cameras is not None else None,
         resume=True,
-        weights=weights,
-    ) as trainer:
-        return trainer.fit(on_log)
-
-
-def fit_table(
-    config: RunConfig,
-    table: Table,
-    folder: Path,
-    fit: FitConfig | None = None,
-    on_log: OnLog | None = None,
-    weights: F64 | None = None,
-) -> Path:
-    """Fit an mlp to `LEARNING_COLUMNS`, as every round's is fitted; return the checkpoint's `pretrained_model`.
-
-    fit: the round's options, by default those of the first. weights: of the frames, (N,).
-    """
-    from manip_il.learn import train
-
-    return train.fit(
-        table,
-        fit or round_fit(config),
-        folder,
-        spec=env_spec(config.env),
-        fingerprint=env_fingerprint(config.env),
-        on_log=on_log,
-        resume=True,
-        weights=weights,
+        weights=frame_weights(config, roots) if weights is None else weights,
     )
+    return trainer.fit(on_log)
 
 
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:

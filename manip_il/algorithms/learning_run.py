@@ -36,24 +36,22 @@ from manip_il.data.dataset import Dataset
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
-from manip_il.learn.card import learnt_by_reinforcement, write_card
-from manip_il.learn.checkpoint import (
+from manip_il.learn.checkpoint import Origin
+from manip_il.learn.discriminators import Discriminator
+from manip_il.learn.network import MLPNetwork
+from manip_il.learn.policy_files import policy_sha256
+from manip_il.learn.ppo import Learner, lent_generators
+from manip_il.learn.start import save_policy, start_conversion, start_policy
+from manip_il.learn.threads import threads
+from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
     TRAINING_STATE,
-    CheckpointMeta,
     last_checkpoint,
     read_step,
     readable_state,
     unpublished,
     write_own_files,
 )
-from manip_il.learn.discriminators import Discriminator
-from manip_il.learn.limits import threads
-from manip_il.learn.network import MLPNetwork
-from manip_il.learn.policy_files import policy_sha256
-from manip_il.learn.ppo import Learner, lent_generators
-from manip_il.learn.start import start_conversion, start_policy
-from manip_il.learn.train import save_policy
 from manip_il.learn.transitions import Demonstrations, Transitions, read_demonstrations
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
@@ -186,17 +184,14 @@ class LearningRun:
     def finish(self) -> Iteration:
         """Write the iteration, which ends it; validate its policy where that is due."""
         config = self.config
-        meta = CheckpointMeta.of(
-            self._spec, env_fingerprint(config.env), self._options(), action_space=self.conversion.space
-        )
+        fingerprint, space = env_fingerprint(config.env), self.conversion.space
+        origin = Origin.of(self._spec, fingerprint, self._options(), action_space=space)
         step = {"step": self._number, "simulated": self._simulated, "metrics": self._metrics}
-        origin = learnt_by_reinforcement(self._demonstrations, self._simulated, config.seed, clone=bool(config.start))
         with unpublished(self.folder / "checkpoints" / f"{self._number:06d}") as new:
             save_policy(self._policy, self.conversion, new / PRETRAINED_MODEL)
-            write_card(new / PRETRAINED_MODEL, self._policy.config, meta, origin)
             (new / TRAINING_STATE).mkdir()
             self._learner.save(new / TRAINING_STATE, self._modules)
-            write_own_files(new, meta, step | {"validated_at": self._validated_at, "given": self._given})
+            write_own_files(new, origin, step | {"validated_at": self._validated_at, "given": self._given})
         for other in (self.folder / "checkpoints").iterdir():
             if not other.is_symlink() and other.name != f"{self._number:06d}":
                 shutil.rmtree(other, ignore_errors=True)
@@ -269,8 +264,8 @@ class LearningRun:
         config = self.config
         kept = replace(config, datasets=(), start=None)
         values = {name: value for name, value in asdict(kept).items() if name not in ("env", "datasets", "start")}
-        start = None if config.start is None else str(config.start)
-        return {**values, "datasets": [str(root) for root in config.datasets], "init": start}
+        start = None if config.start is None else config.start.resolve().name
+        return {**values, "datasets": [root.resolve().name for root in config.datasets], "init": start}
 
     def _stream(self, number: int, purpose: str) -> int:
         """A seed for one purpose of an iteration."""

@@ -42,7 +42,7 @@ from manip_il.data.journal import Header, list_episodes, read_header
 from manip_il.errors import MismatchError, NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.runner import evaluate
-from manip_il.learn.checkpoint import PRETRAINED_MODEL
+from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL

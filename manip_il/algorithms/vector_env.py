@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from manip_il.collect.environments import make_env
 from manip_il.errors import MismatchError
-from manip_il.learn.action_spaces import Conversion, JointTarget
+from manip_il.learn.action_spaces import Conversion
 from manip_il.mdp import Observation
 from manip_il.sim.config import EnvConfig
 
@@ -128,7 +128,7 @@ class Lockstep(VecEnv):
         self, episodes: Sequence[Simulated], actions: ActionRange, horizon: int, conversion: Conversion | None = None
     ):
         self.episodes: Sequence[Simulated] = list(episodes)
-        self.actions, self.horizon, self._conversion = actions, horizon, conversion or JointTarget()
+        self.actions, self.horizon, self._conversion = actions, horizon, conversion or Conversion()
         self.seeds: Sequence[int] = range(len(episodes))
         self.simulated, self._step, self._given = 0, 0, np.empty((0, 0), np.float32)
         self._seen = np.empty((0, 0), np.float32)

@@ -170,7 +170,7 @@ def round_policy(folder: Path, round_: Round) -> Path:
     """Return the `pretrained_model` folder of a run's round, or of an iteration that was validated."""
     if round_.unit == "iteration":
         from manip_il.algorithms.iterations import validated
-        from manip_il.learn.checkpoint import PRETRAINED_MODEL
+        from manip_il.learn.training_state import PRETRAINED_MODEL
 
         return find_policy(validated(folder, round_.round) / PRETRAINED_MODEL)
     from manip_il.algorithms.run import round_folder
@@ -218,9 +218,9 @@ def _policy_env(
     source: Source, run: EnvConfig | None, group: EnvGroup, robot: str | None, task: MaybeTaskGroup
 ) -> EnvConfig:
     """Return the environment of a policy, whose checkpoint holds robot, task and rate, but no tolerance or horizon."""
-    from manip_il.learn.checkpoint import read_meta
+    from manip_il.learn.checkpoint import read_origin
 
-    meta = read_meta(source.policy or round_policy(source.path, source.history[0]))
+    meta = read_origin(source.policy or round_policy(source.path, source.history[0]))
     if run is not None:
         own = {} if meta is None else {"robot": meta.robot, "task": meta.task, "object": meta.object}
         return run if meta is None else replace(run, control_hz=meta.fps, **own)

@@ -52,10 +52,10 @@ class CertifyOptions:
         """Run the episodes, write `certificate.json`, print the tables."""
         policy = meta = None
         if self.policy.path is not None:
-            from manip_il.learn.checkpoint import read_meta
+            from manip_il.learn.checkpoint import read_origin
 
             policy = find_policy(self.policy.path)
-            meta = read_meta(policy)
+            meta = read_origin(policy)
         env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
         if policy is not None:
             check_policy(policy, meta, env, draw=self.engine == "local", trust=self.trust)

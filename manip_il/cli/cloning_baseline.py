@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.fitting import fit_table, round_fit
+from manip_il.algorithms.fitting import fit_round, round_fit
 from manip_il.algorithms.run import round_folder
 from manip_il.cli.progress import Stages
 from manip_il.collect.job import RolloutJob
@@ -19,7 +19,6 @@ from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
 from manip_il.data.schema import LABEL_VALID
-from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.seeding import stream_seeds
 
 
@@ -33,12 +32,10 @@ def clone_with_labels(
     """
     if not (folder / "dataset").is_dir():
         _demonstrate(config, labels, round_folder(run, 0), folder, engine, stages)
-    table = Dataset.open(folder / "dataset").columns(LEARNING_COLUMNS)
-    so_far = np.cumsum(table[LABEL_VALID])
-    rows = int(np.searchsorted(so_far, labels)) + 1
+    so_far = np.cumsum(Dataset.open(folder / "dataset").columns([LABEL_VALID])[LABEL_VALID])
+    drawn = (so_far <= labels).astype(np.float64)
     stages.start("cloning with as many labels, fit", round_fit(config).total_steps)
-    table = {key: column[:rows] for key, column in table.items()}
-    policy = fit_table(config, table, folder / "policy", on_log=stages.log)
+    policy = fit_round(config, [folder / "dataset"], folder / "policy", on_log=stages.log, weights=drawn)
     stages.close()
     return policy, min(labels, int(so_far[-1]))
 

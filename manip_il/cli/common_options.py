@@ -15,7 +15,7 @@ from manip_il.stock import table as stock
 from manip_il.tasks.reward import Reward
 
 if TYPE_CHECKING:
-    from manip_il.learn.checkpoint import CheckpointMeta
+    from manip_il.learn.checkpoint import Origin
 
 SMALL_SIDE = 96  # of a picture that a policy learns from [pixels]
 _TRUST = (
@@ -119,7 +119,7 @@ class EnvGroup:
         self,
         robot: str | None,
         task: str | None,
-        meta: CheckpointMeta | None = None,
+        meta: Origin | None = None,
         shape: str | None = None,
         reward: str = "",
     ) -> EnvConfig:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from manip_il.sim.config import CameraConfig
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
-FREE = ("workers", "engine", "processes", "output_dir", "trust")  # options that may differ when a run is resumed
+FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ when a run is resumed
 
 _OWN_STEPS = ", ".join(f"{numbers.steps:,} for {kind}" for kind, numbers in DEFAULTS.items())
 _STEPS_HELP = f"gradient steps per round; by default {_OWN_STEPS}, else 20,000"
@@ -94,7 +94,6 @@ class DaggerOptions(common.EnvOptions):
     refit_steps: int | None = option_of(RunConfig, "refit_steps")
     batch_size: int | None = option_of(FitConfig, "batch_size")
     lr: float | None = option_of(FitConfig, "lr")
-    processes: int = option_of(FitConfig, "processes")
     optimizer: Open = option_of(FitConfig, "optimizer")
     scheduler: Open = option_of(FitConfig, "scheduler")
     validation_episodes: int = option_of(RunConfig, "validation_episodes")
@@ -154,7 +153,7 @@ class DaggerOptions(common.EnvOptions):
 
         policy, start = round_policy(self.policy)
         observation, cameras = self._pictures(start)
-        same = ("action_space", "steps", "batch_size", "lr", "processes", "optimizer", "scheduler", "trust")
+        same = ("action_space", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
         env = self.env_config()
         made = {
             "env": env,
@@ -178,10 +177,10 @@ class DaggerOptions(common.EnvOptions):
         cameras = self.image.config(self.cameras or CAMERAS if sees else self.cameras)
         if start is None:
             return self.observation, cameras
+        from manip_il.learn.checkpoint import Checkpoint
         from manip_il.learn.policy_files import policy_cameras
-        from manip_il.learn.pretrained import observation_of, read_interface
 
-        observation = self.observation or observation_of(read_interface(start).columns)
+        observation = self.observation or Checkpoint.open(start).observation
         return observation, cameras or policy_cameras(start)
 
     @classmethod

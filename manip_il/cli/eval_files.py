@@ -143,7 +143,7 @@ class ReplayOptions:
         from manip_il.collect.environments import env_fingerprint
         from manip_il.collect.job import RolloutJob
         from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.learn.checkpoint import read_meta
+        from manip_il.learn.checkpoint import Checkpoint
         from manip_il.learn.policy_files import policy_sha256
 
         env = result.settings.env(result.robot, result.task)
@@ -153,7 +153,7 @@ class ReplayOptions:
             cameras, job = None, replace(job, driver=driver_of(result.policy))
         else:
             path = self._find(result)
-            cameras = check_policy(path, read_meta(path), env, trust=self.trust)
+            cameras = check_policy(Checkpoint.open(path), env, trust=self.trust)
             if result.policy_sha256 not in ("", policy_sha256(path)):
                 warn(f"{path} is not the policy of {self.file}: its files differ")
             job = replace(job, driver=PolicyDriver((path,), trust=self.trust))

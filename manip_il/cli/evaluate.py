@@ -135,14 +135,15 @@ class EvalOptions:
         path = None if self.policy.path is None else find_policy(self.policy.path)
         if episodes > 1:
             engine.warm_up(learned=path is not None)  # while the policy is checked here
-        meta = cameras = None
+        checkpoint = meta = cameras = None
         if path is not None:
-            from manip_il.learn.checkpoint import read_meta
+            from manip_il.learn.checkpoint import Checkpoint
 
-            meta = read_meta(path)
+            checkpoint = Checkpoint.open(path)
+            meta = checkpoint.origin
         env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
-        if path is not None:
-            cameras = check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
+        if path is not None and checkpoint is not None:
+            cameras = check_policy(checkpoint, env, draw=self.engine == "local", trust=self.trust)
             if cameras is not None:
                 say(observation_text(cameras, path))
         conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
@@ -155,9 +156,9 @@ class EvalOptions:
         if self.action_space is None:
             return
         from manip_il.errors import MismatchError
-        from manip_il.learn.pretrained import read_interface
+        from manip_il.learn.checkpoint import Checkpoint
 
-        if (space := read_interface(path).space) != self.action_space:
+        if (space := Checkpoint.open(path).space) != self.action_space:
             raise MismatchError("action space", str(path), space, "--action_space", self.action_space)
 
     def _evaluate(

@@ -60,7 +60,7 @@ class ExportOptions:
         path = find_policy(self.policy)
         if output.resolve().is_relative_to(path.resolve()):
             raise UsageError(f"--output is {output}, inside the policy's own folder {path}; choose another place")
-        from manip_il.learn.pretrained import read_config
+        from manip_il.learn.checkpoint import read_config
 
         kind = read_config(path)["type"]
         if kind not in EXPORTABLE:

@@ -15,7 +15,7 @@ from manip_il.errors import MismatchError, UsageError
 if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.algorithms.config import RunConfig
     from manip_il.data.schema import RobotTaskSpec
-    from manip_il.learn.checkpoint import CheckpointMeta
+    from manip_il.learn.checkpoint import Checkpoint
     from manip_il.mdp import Observation
     from manip_il.sim.config import CameraConfig, EnvConfig
 
@@ -85,15 +85,15 @@ def start_policy(settings: Open) -> Open:
 def round_policy(settings: Open) -> tuple[Open, Path | None]:
     """Return `--policy.*` of a run's later rounds, and the `pretrained_model` folder that it begins with, if any.
 
-    Of an mlp to begin with, the options are spelled out: it has a loop of its own.
+    Of an mlp to begin with, the options are spelled out: those are asked for before LeRobot is imported.
     """
     if "path" not in settings:
         return settings, None
-    from manip_il.learn.pretrained import mlp_options
+    from manip_il.learn.checkpoint import Checkpoint
 
     settings = start_policy(settings)
     start = Path(settings["path"])
-    if (options := mlp_options(start)) is None:
+    if (options := Checkpoint.open(start).mlp_options) is None:
         return settings, start
     if "type" in settings:
         raise UsageError("give one of --policy.path=DIR and --policy.type=...: the type is in the checkpoint")
@@ -107,8 +107,7 @@ def check_given(config: RunConfig) -> None:
     """
     from manip_il.collect.environments import env_spec
     from manip_il.data.dataset import Dataset
-    from manip_il.learn.checkpoint import read_meta
-    from manip_il.learn.pretrained import read_config, require_trust
+    from manip_il.learn.checkpoint import Checkpoint
     from manip_il.learn.sources import check_same_sources
 
     recorded = None if config.redraw else config.cameras
@@ -119,9 +118,9 @@ def check_given(config: RunConfig) -> None:
         check_dataset(root, given.spec, given.fingerprint)
     if config.start is None:
         return
-    require_trust(read_config(config.start), str(config.start), config.fit.trust, config.start)
-    meta = read_meta(config.start)
-    cameras = check_policy(config.start, meta, config.env, draw=False, trust=config.fit.trust)
+    checkpoint = Checkpoint.open(config.start)
+    checkpoint.require_trust(config.fit.trust)
+    cameras = check_policy(checkpoint, config.env, draw=False, trust=config.fit.trust)
     for what in ("names", "height", "width"):
         theirs, ours = (getattr(one, what, None) for one in (cameras, config.cameras))
         if theirs != ours:
@@ -150,7 +149,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
 
 
 def check_policy(
-    path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True, trust: bool = False
+    checkpoint: Checkpoint, env: EnvConfig, *, draw: bool = True, trust: bool = False
 ) -> CameraConfig | None:
     """Return the cameras whose pictures the policy takes, if any; warn where it was trained on something else.
 
@@ -159,18 +158,14 @@ def check_policy(
     `LearnedPolicy.load` raises.
     """
     from manip_il.collect.environments import env_spec
-    from manip_il.learn.checkpoint import check_fits
     from manip_il.learn.policy import LearnedPolicy
     from manip_il.learn.policy_files import policy_cameras
-    from manip_il.learn.pretrained import check_interface, read_interface
 
-    cameras = policy_cameras(path)
+    cameras = policy_cameras(checkpoint.path)
     spec = env_spec(env, cameras)
-    if meta is not None:
-        check_fits(meta, spec)
-    check_interface(read_interface(path), spec)
-    warn(*_differences(path, meta, env, cameras))
-    policy = LearnedPolicy.load(path, task=spec.instruction, trust=trust)
+    checkpoint.check_fits(spec)
+    warn(*_differences(checkpoint, env, cameras))
+    policy = LearnedPolicy.load(checkpoint, task=spec.instruction, trust=trust)
     # One action now finds what else does not fit before a worker does.
     observation = _first_observation(env, cameras, draw)
     images = {camera: picture[None] for camera, picture in observation.images.items()}
@@ -178,10 +173,11 @@ def check_policy(
     return cameras
 
 
-def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:
+def _differences(checkpoint: Checkpoint, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:
     from manip_il.collect.environments import env_fingerprint
     from manip_il.data.fingerprint import compare_fingerprints
 
+    path, meta = checkpoint.path, checkpoint.origin
     if meta is None:
         lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
         return [*lines, f"nor how its pictures were lit: {cameras.look} is assumed"] if cameras else lines
@@ -208,9 +204,9 @@ def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool)
 
 def observation_text(cameras: CameraConfig, path: Path) -> str:
     """Return in words which pictures a policy takes."""
-    from manip_il.learn.pretrained import observation_of, read_interface
+    from manip_il.learn.checkpoint import Checkpoint
 
-    observation = observation_of(read_interface(path).columns)
+    observation = Checkpoint.open(path).observation
     lights = ", ".join(f"{name} {value}" for name, value in asdict(cameras.look).items())
     size = f"{cameras.height} x {cameras.width} pixels"
     return f"observation {observation!r}: the policy uses {', '.join(cameras.names)}, {size}, {lights}"

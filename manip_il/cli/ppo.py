@@ -51,7 +51,7 @@ class PpoOptions(LearningOptions):
 
         assert self.reward is not None
         reward = load_reward(self.reward)
-        meta = reward.meta
+        meta = reward.origin
         if not is_known(meta.robot, meta.task):
             raise UsageError(f"{self.reward} is for {meta.robot} {meta.task}, which cannot be simulated here")
         env = EnvConfig(meta.robot, meta.task, meta.fps, object=meta.object)

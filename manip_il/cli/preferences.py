@@ -208,8 +208,8 @@ class PreferencesFitOptions:
     def _write(self, folder: Path, found: Any, clips: Any) -> None:
         from manip_il.data.dataset import Dataset
         from manip_il.evaluation.results import write_json
-        from manip_il.learn.checkpoint import PRETRAINED_MODEL
         from manip_il.learn.preference.modeling_preference import write_reward
+        from manip_il.learn.training_state import PRETRAINED_MODEL
 
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)

@@ -77,7 +77,7 @@ class ScoreOptions:
         import numpy as np
 
         from manip_il.errors import ManipError
-        from manip_il.learn.pretrained import read_config
+        from manip_il.learn.checkpoint import read_config
         from manip_il.learn.reward import PREFERENCE
 
         if self.reward == PROGRESS:

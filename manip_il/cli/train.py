@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_dataset, require_dataset, start_policy
@@ -16,6 +16,7 @@ from manip_il.cli.outputs import check_same_options, prepare_output, require_out
 from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
 from manip_il.cli.redraw import RedrawOptions
 from manip_il.data.atomic import exclusive
+from manip_il.data.info import read_info
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig, check_weights
 from manip_il.option import option, option_of
@@ -24,16 +25,13 @@ if TYPE_CHECKING:  # the learner takes a second to import
     import numpy as np
     from numpy.typing import NDArray
 
-    from manip_il.data.schema import RobotTaskSpec
+    from manip_il.data.dataset import Dataset
     from manip_il.learn.lerobot_config import LeRobotFit
     from manip_il.learn.sources import Sources
 
 RANK = "RANK"  # the variable by which processes that were started together know their place
 # What may differ when a fit is resumed: nothing of it changes the weights.
-_FREE = (
-    *("threads", "processes", "log_freq", "save_freq", "num_workers"),
-    *("dataset.root", "output_dir", "tensorboard", "wandb", "trust"),
-)
+_FREE = ("threads", "log_freq", "save_freq", "dataset.root", "output_dir", "tensorboard", "wandb", "trust")
 
 
 @dataclass
@@ -73,12 +71,9 @@ class TrainOptions:
     optimizer: Open = option_of(FitConfig, "optimizer")
     scheduler: Open = option_of(FitConfig, "scheduler")
     image_augment: bool | None = option_of(FitConfig, "image_augment")
-    image_cache_gb: float = option_of(FitConfig, "image_cache_gb")
-    num_workers: int = option_of(FitConfig, "num_workers")
     output_dir: Path = option(Path("runs/train"), "folder of the run")
     seed: int = option(0, "seed of weights and batches, 0 to 1000")
     threads: int = option_of(FitConfig, "threads")
-    processes: int = option_of(FitConfig, "processes")
     save_freq: int | None = option_of(FitConfig, "save_freq")
     log_freq: int = option_of(FitConfig, "log_freq")
     tensorboard: bool = option_of(FitConfig, "tensorboard")
@@ -89,10 +84,12 @@ class TrainOptions:
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        self._fit_config()
+        config = self._fit_config()
         check_weights(self.dataset.root, self.dataset.weights)
         for root in self.dataset.root:
             require_dataset(root)
+            if not self.redraw:
+                config.inputs(root, read_info(root))
         self._check_redraw()
         self._check_weights()
         if _is_first_process():
@@ -108,15 +105,14 @@ class TrainOptions:
         lerobot = LeRobotFit(config)  # refuses what LeRobot would, before anything is written
         with contextlib.ExitStack() as held:
             root = self._redrawn(held) if self.redraw else None
-            spec, fingerprint, sources = self._read_sources(lerobot, (root,) if root else tuple(self.dataset.root))
-            weights = self._frame_weights(lerobot, sources.roots[0])
+            sources = self._sources(config, (root,) if root else tuple(self.dataset.root))
+            weights = self._frame_weights(lerobot, sources.datasets[0])
             if root is None:
                 self._prepare(held)
-            fit = self._fit_mlp if config.is_mlp else self._fit_policy
-            path = fit(config, {"spec": spec, "fingerprint": fingerprint, "sources": sources, "weights": weights})
+            path = self._fit(config, sources, weights)
         if _is_first_process():
             say(f"checkpoint: {path}")
-            robot = common.own_robot(spec.robot, suffix=".yaml")
+            robot = common.own_robot(sources.spec.robot, suffix=".yaml")
             say(f"next: manip-il eval --policy.path={path}{robot} --output_dir={self.output_dir}/eval")
 
     def _prepare(self, held: contextlib.ExitStack) -> None:
@@ -145,17 +141,15 @@ class TrainOptions:
         if len(self.dataset.root) > 1 or self.redraw:
             raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
 
-    def _frame_weights(self, lerobot: LeRobotFit, root: Path) -> NDArray[np.float64] | None:
+    def _frame_weights(self, lerobot: LeRobotFit, dataset: Dataset) -> NDArray[np.float64] | None:
         """Return how often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
         if self.weights is None:
             return None
-        from manip_il.data.dataset import Dataset
-        from manip_il.learn.weights import rabc_weights, read_progress
+        from manip_il.learn.weights import rabc_weights
 
-        dataset = Dataset.open(root)
         episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
         ahead = getattr(lerobot.policy, "chunk_size", None) or int(dataset.fps)
-        weights = rabc_weights(read_progress(self.weights, episodes), episodes, ahead)
+        weights = rabc_weights(self.weights, episodes, ahead)
         say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         return weights
 
@@ -179,86 +173,49 @@ class TrainOptions:
         policy, seed = start_policy(self.policy), stream_base("training", self.seed)
         return FitConfig(policy=policy, eval_split=self.dataset.eval_split, seed=seed, **same)
 
-    def _read_sources(
-        self, lerobot: LeRobotFit, roots: tuple[Path, ...]
-    ) -> tuple[RobotTaskSpec, Mapping[str, Any], Sources]:
-        """Return spec and fingerprint of the first dataset, and all of them, which must agree with it."""
+    def _sources(self, config: FitConfig, roots: tuple[Path, ...]) -> Sources:
+        """Return the datasets, which must agree with the first."""
         from manip_il.data.dataset import Dataset
-        from manip_il.learn.pretrained import PLAIN
-        from manip_il.learn.sources import Sources, check_same_sources
+        from manip_il.learn.checkpoint import PLAIN
+        from manip_il.learn.sources import Sources
 
-        opened = [Dataset.open(root) for root in roots]
-        specs = [one.spec for one in opened]
-        pictures, language = lerobot.observation != "state", lerobot.policy.type not in PLAIN
-        check_same_sources(roots, specs, pictures=pictures, language=language)
-        for one in opened:
+        sources = Sources(tuple(map(Dataset.open, roots)), tuple(self.dataset.weights))
+        sources.check_alike(pictures=config.takes_images, language=config.kind not in PLAIN)
+        for one in sources.datasets:
             check_dataset(one.root, one.spec, one.fingerprint)
-            odd = [key for key in one.cameras if pictures and not one.features[key].is_rgb]
+            odd = [key for key in one.cameras if config.takes_images and not one.features[key].is_rgb]
             warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
-        frames = tuple(map(len, opened))
-        return specs[0], opened[0].fingerprint, Sources(roots, frames, tuple(self.dataset.weights))
+        looks = sources.looks if config.takes_images else []
+        for root, look in zip(roots, looks, strict=False):
+            if look != looks[0]:
+                warn(f"light differs: {roots[0]} has {looks[0]}, {root} has {look}; evaluated in the first")
+        return sources
 
-    def _begin(self, config: FitConfig) -> Stages:
-        """Write the options, now that what can be wrong has been found, and return the display."""
-        if _is_first_process():
-            save_options(self.output_dir, self)
-        steps = config.steps_per_checkpoint
-        return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
+    def _fit(self, config: FitConfig, sources: Sources, weights: NDArray[np.float64] | None) -> Path:
+        from manip_il.learn.train import Trainer
 
-    def _fit_mlp(self, config: FitConfig, data: Mapping[str, Any]) -> Path:
-        from manip_il.data.dataset import joined_columns
-        from manip_il.learn.columns import LEARNING_COLUMNS
-        from manip_il.learn.train import fit
-
-        with self._begin(config) as stages:
-            roots = data["sources"].roots
-            table = joined_columns(roots, (*LEARNING_COLUMNS, "frame_index"))
-            stages.start(f"train on {len(table['action']):,} frames", config.total_steps)
-            return fit(
-                table,
-                config,
-                self.output_dir,
-                on_log=stages.log,
-                resume=self.resume,
-                repo_id=f"local/{'_'.join(root.name for root in roots)}",
-                **data,
+        with self._decoding(sources) as on_frames:
+            trainer = Trainer(
+                sources, config, self.output_dir, resume=self.resume, on_frames=on_frames, weights=weights
             )
-
-    def _fit_policy(self, config: FitConfig, data: Mapping[str, Any]) -> Path:
-        from manip_il.learn.fit_policy import begin_fit
-
-        roots = data["sources"].roots
-        with contextlib.ExitStack() as stack:
-            with self._decoding() as on_frames:
-                trainer = stack.enter_context(
-                    begin_fit(
-                        roots,
-                        config,
-                        self.output_dir,
-                        look=_look(roots),
-                        resume=self.resume,
-                        on_frames=on_frames,
-                        **data,
-                    )
-                )
-            stages = stack.enter_context(self._begin(config))
-            kind, samples = trainer.lerobot.policy.type, len(trainer.samples.train)
-            stages.start(f"train {kind} on {samples:,} samples", config.total_steps)
+        if _is_first_process():
+            save_options(self.output_dir, self)  # now that what can be wrong has been found
+        steps = config.steps_per_checkpoint
+        kept = f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)"
+        with Stages(kept) as stages:
+            stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
             return trainer.fit(stages.log)
 
     @contextlib.contextmanager
-    def _decoding(self) -> Iterator[Callable[[int], None]]:
+    def _decoding(self, sources: Sources) -> Iterator[Callable[[int], None]]:
         """Yield a callback for the number of pictures just decoded; a bar is displayed from the first one on."""
-        from manip_il.data.dataset import Dataset
-
         with contextlib.ExitStack() as stack:
             bar = None
 
             def decoded(frames: int) -> None:
                 nonlocal bar
                 if bar is None:
-                    opened = map(Dataset.open, self.dataset.root)
-                    total = sum(len(one) * len(one.cameras) for one in opened)
+                    total = sum(len(one) * len(one.cameras) for one in sources.datasets)
                     bar = stack.enter_context(progress(total, "decode pictures, once"))
                 bar.advance(frames)
 
@@ -268,18 +225,6 @@ class TrainOptions:
     def more_help(cls, words: Sequence[str]) -> str:
         """Return the options of the policy that `--policy.type` names."""
         return common.policy_help(words)
-
-
-def _look(roots: Sequence[Path]) -> dict[str, Any] | None:
-    """The light of the first dataset's pictures, in which the policy is evaluated; warn where others have another."""
-    from manip_il.data.dataset import Dataset
-    from manip_il.learn.checkpoint import recorded_look
-
-    first, *others = [recorded_look(one.provenance, one.fingerprint) for one in map(Dataset.open, roots)]
-    for root, look in zip(roots[1:], others, strict=True):
-        if look != first:
-            warn(f"light of the pictures differs: {roots[0]} has {first}, {root} has {look}; evaluated in the first")
-    return first
 
 
 def _is_first_process() -> bool:

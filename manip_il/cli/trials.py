@@ -131,11 +131,11 @@ class Trial:
     def check_policies(self, policies: dict[str, Path], folder: Path, engine: str) -> None:
         """Raise, before any episode runs, where one of the policies (name -> folder) cannot be measured."""
         from manip_il.cli.inputs import check_policy
-        from manip_il.learn.checkpoint import read_meta
+        from manip_il.learn.checkpoint import read_origin
 
         for name, policy in policies.items():
             if not self.file(folder, policy).is_file():
-                meta = read_meta(policy)
+                meta = read_origin(policy)
                 if meta is not None and meta.task != self.env.task:
                     raise MismatchError("task", name, meta.task, "the comparison", self.env.task)
                 check_policy(policy, meta, self.env, draw=engine == "local", trust=self.trust)

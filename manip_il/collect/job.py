@@ -15,8 +15,8 @@ from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, ga
 from manip_il.collect.rollout import Act, Environment, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.policy_files import policy_cameras
-from manip_il.learn.pretrained import check_interface
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
@@ -138,9 +138,9 @@ def _load(job: RolloutJob, path: Path, env: Environment) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     trust = isinstance(job.driver, PolicyDriver) and job.driver.trust
-    policy = LearnedPolicy.load(path, task=env.task_description, trust=trust)
-    check_interface(policy.interface, env_spec(job.env, observed_cameras(job)))
-    return policy
+    checkpoint = Checkpoint.open(path)
+    checkpoint.check_fits(env_spec(job.env, observed_cameras(job)))
+    return LearnedPolicy.load(checkpoint, task=env.task_description, trust=trust)
 
 
 def _without_pictures(frame: Transition) -> Transition:

@@ -73,8 +73,7 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
         partial.chmod(0o777 & ~umask())
         with writing(root):
             yield partial
-            for path in (*partial.rglob("*"), partial):
-                sync(path)
+            _libc("syncfs", lock)  # in one call, however many files it has
         if replace and root.exists():
             _exchange(partial, root)
             shutil.rmtree(partial, ignore_errors=True)
@@ -175,10 +174,14 @@ def sync(path: Path) -> None:
 def _exchange(left: Path, right: Path) -> None:
     """Swap two names in one step (Linux's renameat2), so that there is no moment without `right`."""
     here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    call = ctypes.CDLL(None, use_errno=True).renameat2
-    if call(here, os.fsencode(left), here, os.fsencode(right), exchange):
+    _libc("renameat2", here, os.fsencode(left), here, os.fsencode(right), exchange)
+
+
+def _libc(name: str, *arguments: int | bytes) -> None:
+    """Call a function of Linux's C library that Python does not have."""
+    if getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments):
         number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number), str(right))
+        raise OSError(number, os.strerror(number))
 
 
 def _refuse_full(root: Path) -> None:

@@ -33,14 +33,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, override
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data.schema import JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
-from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
+from manip_il.learn.checkpoint import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.robots import ROBOTS
 from manip_il.robots.rotations import rotation_vector
 
@@ -52,50 +52,38 @@ _POSITION, _ROTATION, _POSE = slice(0, 3), slice(3, 6), 6
 Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
 
-class Conversion(Protocol):
-    """The way from actions to targets of a space and back, row by row; all (N, n) and of the dtype of the first."""
-
-    @property
-    def space(self) -> str:
-        """The name of the space."""
-        ...
-
-    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return the targets of joint targets and openings (N, n), measured from joint states (N, n)."""
-        ...
-
-    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return joint targets [rad] and openings [m] (N, n) of targets (N, n)."""
-        ...
-
-
 @dataclass(frozen=True)
-class JointTarget:
-    """Targets that are the actions."""
+class Conversion:
+    """The way from actions to targets of a space and back, row by row; this one's targets are the actions.
+
+    All are (N, n) and of the dtype of the first.
+    """
 
     space: str = JOINT_TARGET
 
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return the actions (N, n) as they are."""
+        """Return the targets of joint targets and openings (N, n), measured from joint states (N, n)."""
         return actions
 
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return the targets (N, n) as they are."""
+        """Return joint targets [rad] and openings [m] (N, n) of targets (N, n)."""
         return targets
 
 
 @dataclass(frozen=True)
-class JointDelta:
+class JointDelta(Conversion):
     """Joint targets minus measured joints [rad], and the opening [m]."""
 
     space: str = JOINT_DELTA
 
+    @override
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
         """Return the arm's part of actions (N, n) less the measured joints."""
         targets = actions.copy()
         targets[:, ARM] -= states[:, ARM]
         return targets
 
+    @override
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
         """Return the arm's part of targets (N, n) plus the measured joints."""
         actions = targets.copy()
@@ -104,12 +92,13 @@ class JointDelta:
 
 
 @dataclass(frozen=True)
-class HandDelta:
+class HandDelta(Conversion):
     """Motion of `ee` [m, rad] that a joint target means, and the gripper as it is; robot: a name in `ROBOTS`."""
 
-    robot: str
     space: str = EE_DELTA
+    robot: str = ""
 
+    @override
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
         """Return motions of the hand (N, n) of actions (N, n), by forward kinematics."""
         ik, targets = _arm_ik(self.robot), np.zeros_like(actions)
@@ -120,6 +109,7 @@ class HandDelta:
             target[GRIPPER] = action[GRIPPER]
         return targets
 
+    @override
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
         """Return actions (N, n) whose joints bring the hand to where targets (N, n) say, by inverse kinematics."""
         actions, motions = targets.copy(), targets[:, :_POSE].astype(np.float64)
@@ -138,9 +128,6 @@ class HandDelta:
         return np.radians(joints, dtype=np.float64) if self._in_degrees else np.asarray(joints, np.float64)
 
 
-JOINT_DELTAS = JointDelta()
-
-
 def conversion(space: str, robot: str) -> Conversion:
     """Return the conversion of a space for a robot, which `ee_delta` alone needs.
 
@@ -149,14 +136,14 @@ def conversion(space: str, robot: str) -> Conversion:
     if space not in ACTION_SPACES:
         raise UnknownName("action space", space, ACTION_SPACES)
     if space != EE_DELTA:
-        return JointTarget() if space == JOINT_TARGET else JOINT_DELTAS
+        return Conversion() if space == JOINT_TARGET else JointDelta()
     if robot not in ROBOTS:  # no path either: the name may be a downloaded checkpoint's
         raise UnknownName("robot", robot, ROBOTS, f"{EE_DELTA} needs its kinematics; known: {', '.join(ROBOTS)}")
     from manip_il.robots.robot import get_robot
 
     if (joints := len(get_robot(robot).joints)) < _POSE:
         raise UsageError(f"{EE_DELTA} has {_POSE} numbers, and the arm of {robot} {joints} joints; use {JOINT_DELTA}")
-    return HandDelta(robot)
+    return HandDelta(robot=robot)
 
 
 def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:

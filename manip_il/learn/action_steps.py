@@ -23,8 +23,7 @@ from lerobot.processor import (
 from manip_il.data.schema import STATE
 from manip_il.errors import ManipError
 from manip_il.learn.action_spaces import Conversion, HandDelta, conversion
-from manip_il.learn.fit_config import JOINT_TARGET, OWN_SPACE
-from manip_il.learn.pretrained import DECODER, MEASURED
+from manip_il.learn.checkpoint import DECODER, JOINT_TARGET, MEASURED, OWN_SPACE
 
 Pipeline = PolicyProcessorPipeline[Any, Any]
 _NORMALISER = "normalizer_processor"
@@ -35,7 +34,7 @@ _NORMALISER = "normalizer_processor"
 class MeasuredJointsStep(RelativeActionsProcessorStep):
     """Keeps an observation's joint state (B, n), raw; changes nothing.
 
-    converted: the actions that come with observations are in the space already, as `fit_policy` makes them.
+    converted: the actions that come with observations are in the space already, as the trainer makes them.
     """
 
     converted: bool = False

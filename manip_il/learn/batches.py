@@ -5,23 +5,18 @@ Pictures may be cropped and their colours changed by chance while learning.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-
-from manip_il.errors import MismatchError, UsageError
-
-_AT_ONCE = 16  # pictures: what is made of them on the way stays near the processor
-_GREY = (0.299, 0.587, 0.114)  # of red, green and blue: ITU-R BT.601
+from torchvision.transforms.v2 import functional
 
 
 def generator_of(*key: int) -> torch.Generator:
@@ -99,11 +94,11 @@ def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str
 
 @dataclass(frozen=True)
 class Augment:
-    """Random crops and colour jitter; all zero is `to_float`.
+    """Random crops and colour jitter.
 
     shift: pixels that a crop moves by at most, each way; the border repeats the outermost pixels (DrQ, Kostrikov et
     al. 2020, arXiv:2004.13649). brightness, contrast, saturation: how far the factor of each is from 1 at most, as in
-    torchvision's `ColorJitter`, but in one order (saturation, contrast, brightness) with one clamp at the end.
+    torchvision's `ColorJitter`, but in one order.
     """
 
     shift: int = 4
@@ -111,65 +106,20 @@ class Augment:
     contrast: float = 0.2
     saturation: float = 0.2
 
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value, whole = getattr(self, field.name), field.name == "shift"
-            if not (value >= 0 and (value % 1 == 0 if whole else value <= 1)):
-                expected = "0 pixels or more" if whole else "a number from 0 to 1"
-                raise UsageError(f"augmentation {field.name}={value}; expected {expected}")
-
     def __call__(self, pictures: Tensor, generator: torch.Generator) -> Tensor:
         """Return pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that shape in [0, 1].
 
         One draw a sample, from a generator on the CPU; it is the same for all T.
         """
-        if pictures.dtype != torch.uint8 or pictures.ndim not in (4, 5) or pictures.shape[-3] != 3:
-            given = f"{pictures.dtype} {tuple(pictures.shape)}"
-            raise MismatchError("type of pictures", "the batch", given, "augmentation", "uint8 (B, [T,] 3, H, W)")
-        if self == Augment(0, 0.0, 0.0, 0.0):
-            return to_float(pictures)
-        flat = pictures.flatten(0, -4)
-        changed = torch.empty(flat.shape, dtype=torch.float32, device=flat.device)
-        moves = torch.randint(0, 2 * self.shift + 1, (len(pictures), 2), generator=generator)
+        height, width = pictures.shape[-2:]
+        moves = torch.randint(0, 2 * self.shift + 1, (len(pictures), 2), generator=generator).tolist()
         amounts = torch.tensor([self.saturation, self.contrast, self.brightness])
-        factors = 1 + amounts * (2 * torch.rand(len(pictures), 3, generator=generator) - 1)
-        times = math.prod(pictures.shape[1:-3])
-        drawn = moves.repeat_interleave(times, 0), factors.repeat_interleave(times, 0).to(flat.device)
-        parts = (each.split(_AT_ONCE) for each in (changed, flat, *drawn))
-        for target, source, move, factor in zip(*parts, strict=True):
-            _crop(source, move, self.shift, target)
-            if self.brightness or self.contrast or self.saturation:
-                _jitter(target, factor)
-            else:
-                target.div_(255)
-        return changed.view(pictures.shape)
-
-
-def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
-    """Each picture (B, 3, H, W) out of itself and a border of `shift` pixels, from row and column `moves` (B, 2) on."""
-    if not shift:
-        target.copy_(pictures)
-        return
-    height, width = pictures.shape[-2:]
-    # on bytes, before there are four times as many; not by torch's own padding, which knows no bytes on a GPU
-    left, right = (side.expand(-1, -1, -1, shift) for side in (pictures[..., :1], pictures[..., -1:]))
-    wide = torch.cat([left, pictures, right], dim=3)
-    above, below = (side.expand(-1, -1, shift, -1) for side in (wide[..., :1, :], wide[..., -1:, :]))
-    padded = torch.cat([above, wide, below], dim=2)
-    for one, source, (y, x) in zip(target, padded, moves.tolist(), strict=True):
-        one.copy_(source[:, y : y + height, x : x + width])
-
-
-def _jitter(values: Tensor, factors: Tensor) -> None:
-    """Change levels 0 to 255 (B, 3, H, W) by factors (B, 3) of saturation, contrast and brightness, to [0, 1].
-
-    Saturation mixes with the grey picture, contrast with its mean, brightness with black: together
-    `own * picture + shared * grey + level`, without a product of matrices, whose precision torch may lower.
-    """
-    saturation, contrast, brightness = factors.view(-1, 3, 1, 1).unbind(1)
-    grey = values[:, 0] * _GREY[0]
-    grey.add_(values[:, 1], alpha=_GREY[1]).add_(values[:, 2], alpha=_GREY[2])
-    level = (1 - contrast) * brightness / 255 * grey.mean((1, 2), keepdim=True)
-    grey.mul_((1 - saturation) * contrast * brightness / 255).add_(level)
-    own = saturation * contrast * brightness / 255
-    values.mul_(own[:, None]).add_(grey[:, None]).clamp_(0, 1)
+        factors = (1 + amounts * (2 * torch.rand(len(pictures), 3, generator=generator) - 1)).tolist()
+        changed = []
+        for picture, (down, across), (saturation, contrast, brightness) in zip(pictures, moves, factors, strict=True):
+            wide = functional.pad(picture, [self.shift], padding_mode="edge")
+            moved = to_float(wide[..., down : down + height, across : across + width])
+            moved = functional.adjust_saturation(moved, saturation)
+            moved = functional.adjust_contrast(moved, contrast)
+            changed.append(functional.adjust_brightness(moved, brightness))
+        return torch.stack(changed)

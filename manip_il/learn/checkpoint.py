@@ -1,46 +1,41 @@
-"""Checkpoints in LeRobot's layout, with what a policy was trained for beside the weights.
+"""A `pretrained_model` folder, opened once and checked before anything in it is loaded: it is data from anywhere.
 
-    OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors policy_*processor*.json|safetensors
-                                                  manip_il.json; but for the mlp train_config.json README.md
-                             /training_state/     optimizer_*.safetensors|json, training_step.json; but for the mlp
-                                                  scheduler and random state
-    OUTPUT/checkpoints/last -> 004000
-
-A checkpoint is written under a temporary name and `last` is switched over in one rename, so that a kill leaves the one
-before. All but the mlp's go on with
-`lerobot-train --config_path=OUTPUT/checkpoints/last/pretrained_model/train_config.json --resume=true`, too.
-
-What is written beside data and policies, for whom: `spec` (names, sizes and rate that a dataset, an environment and a
-policy must share, a `RobotTaskSpec`); `fingerprint` (versions and hashes of the program and the scene that made
-something, compared in warnings); `provenance` (how a dataset was recorded, rendered or merged, kept with it);
-`CheckpointMeta` (the spec's names, the fingerprint and the options of the fit, in `manip_il.json`); `options` or
-settings (what a user asked for, by name).
+LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
+`trust_remote_code`, which runs Python from the named repository. Policies that are built from their own configuration
+and weights alone are listed in `PLAIN`, the steps of their processors in `_STEPS`; all others need `--trust=true`.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.data.atomic import umask, writing
-from manip_il.data.schema import OWN_OBJECT, RobotTaskSpec
-from manip_il.errors import FolderExistsError, ManipError, MismatchError
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, OWN_OBJECT, STATE, RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError, UnknownName
 
-META_FILE = "manip_il.json"
-PRETRAINED_MODEL = "pretrained_model"
-TRAINING_STATE = "training_state"
-_LAST = "last"
-_LARGEST_META = 1024 * 1024  # [bytes]
-_LARGEST_STEP = 10**12
-_FASTEST, _MOST_NAMES, _LONGEST_WORDS, _LONGEST_SIDE = 10_000, 1_000, 1_000, 100_000
-STEP_FILE = "training_step.json"
+CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
+MLP, CNN = OWN_SPACE = ("mlp", "cnn")  # policies that know their action space: joint_delta unless told otherwise
+OBSERVATIONS = ("state", "images", "both")  # besides the joints: the true poses, pictures, or both
+PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load nothing by name
+MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that carry an action space
+
+_PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
+_LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
+_MOST_STEPS, _LONGEST_SIDE, _MOST_NAMES = 100, 100_000, 1_000
+_PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
+_STEPS = (  # of LeRobot's default processors, and ours: they load nothing
+    *("rename_observations_processor", "to_batch_processor", "device_processor"),
+    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
+)
+_NAMING = ("model", "tokenizer", "encoder_name", "vlm", "path")  # in the names of options that name what is loaded
+_MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp")
 _MUST_AGREE = {
     "robot": "robot",
     "fps": "control rate [1/s]",
@@ -52,13 +47,12 @@ _MUST_AGREE = {
 
 
 @dataclass(frozen=True)
-class CheckpointMeta:
+class Origin:
     """Robot, task and data that a policy was trained for, and the options of its fit; `manip_il.json`.
 
-    observation: one of `learn.pretrained.OBSERVATIONS`. cameras, image_size: of the pictures that it was
-    trained on, where it sees any; look: their light, as arguments of `sim.look.Look`, None where that is not known.
-    datasets: folder, frames and weight of each, as `Sources.to_json` has them.
-    action_space: in which it learnt, None in a checkpoint from before there was a choice.
+    observation: one of `OBSERVATIONS`. cameras, image_size: of the pictures that it was trained on, where it sees any;
+    look: their light, as arguments of `sim.look.Look`, None where that is not known. datasets: name, frames and weight
+    of each. action_space: in which it learnt, None in a checkpoint from before there was a choice.
     """
 
     robot: str
@@ -80,24 +74,16 @@ class CheckpointMeta:
     def __post_init__(self) -> None:
         for name in ("robot", "task"):
             checks.name(name, getattr(self, name))
-        checks.whole("fps", self.fps, 1, _FASTEST)
-        checks.text("action_meaning", self.action_meaning, _LONGEST_WORDS)
-        checks.text("object", self.object, _LONGEST_WORDS)
-        checks.text("observation", self.observation, checks.LONGEST_NAME)
-        if self.action_space is not None:
-            checks.text("action_space", self.action_space, checks.LONGEST_NAME)
+        checks.whole("fps", self.fps, 1, 10_000)
+        for name in ("action_meaning", "object", "observation"):
+            checks.text(name, getattr(self, name))
         for name in ("joint_names", "environment_state_names", "cameras"):
-            for word in checks.array(name, getattr(self, name), _MOST_NAMES):
-                checks.text(f"one of {name}", word, _LONGEST_WORDS)
-        if len(size := checks.array("image_size", self.image_size, 2)) != 2:
-            raise ManipError(f"image_size is {size}; expected height and width")
-        for side in size:
-            checks.whole("a side of image_size", side, 0, _LONGEST_SIDE)
-        for one in checks.array("datasets", self.datasets, _MOST_NAMES):
-            checks.mapping("one of datasets", one)
-        for name in ("fingerprint", "options") if self.look is None else ("fingerprint", "options", "look"):
-            if len(checks.mapping(name, getattr(self, name))) > _MOST_NAMES:
-                raise ManipError(f"{name} has {len(getattr(self, name))} entries; expected at most {_MOST_NAMES}")
+            names = tuple(checks.text(f"one of {name}", one) for one in checks.array(name, getattr(self, name)))
+            object.__setattr__(self, name, names)
+        size = tuple(checks.whole("a side of image_size", one, 0, _LONGEST_SIDE) for one in self.image_size)
+        object.__setattr__(self, "image_size", size)
+        for name in ("fingerprint", "options", *(("look",) if self.look is not None else ())):
+            checks.mapping(name, getattr(self, name))
 
     @classmethod
     def of(
@@ -109,158 +95,277 @@ class CheckpointMeta:
         look: Mapping[str, Any] | None = None,
         datasets: Sequence[Mapping[str, Any]] = (),
         action_space: str | None = None,
-    ) -> CheckpointMeta:
-        """Return the meta of a policy trained on data of `spec`.
-
-        look: `recorded_look` of the dataset. datasets: `Sources.to_json`.
-        """
-        meta = cls(
+    ) -> Origin:
+        """Return the origin of a policy trained on data of `spec`. datasets: `Sources.to_json`."""
+        pictured = observation != "state"
+        return cls(
             **{name: getattr(spec, name) for name in ("task", *_MUST_AGREE)},
             fingerprint=dict(fingerprint or {}),
             options=dict(options or {}),
             observation=observation,
+            cameras=spec.cameras if pictured else (),
+            image_size=spec.image_size if pictured else (0, 0),
+            look=None if look is None or not pictured else dict(look),
             datasets=[dict(one) for one in datasets],
             action_space=action_space,
         )
-        if observation == "state":
-            return meta
-        return replace(
-            meta, cameras=spec.cameras, image_size=spec.image_size, look=None if look is None else dict(look)
-        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of `manip_il.json`."""
+        return {name: value for name, value in asdict(self).items() if value or name != "object"}
+
+    def check_fits(self, spec: RobotTaskSpec) -> None:
+        """Raise `MismatchError` naming both sides unless the policy's numbers mean what `spec`'s do."""
+        for name, what in _MUST_AGREE.items():
+            if name == "environment_state_names" and self.observation == "images":
+                continue  # it does not look at it
+            ours, theirs = getattr(self, name), getattr(spec, name)
+            if name == "object":
+                ours, theirs = ours or OWN_OBJECT, theirs or OWN_OBJECT
+            if name == "environment_state_names" and ours != theirs and self.task != spec.task:
+                raise MismatchError("task", "the policy", self.task, "the environment", spec.task)
+            if ours != theirs:
+                raise MismatchError(what, "the policy", ours, f"{spec.robot}/{spec.task}", theirs)
 
 
-def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
-    """Return the checkpoint's meta, or None where another tool (lerobot-train) wrote the checkpoint.
+def read_origin(path: Path) -> Origin | None:
+    """Return the origin in a `pretrained_model` folder, or None where another tool (lerobot-train) wrote it.
 
     Raises `ManipError` for a file that is not ours or not whole.
     """
-    path = Path(pretrained_model) / META_FILE
-    if not path.is_file():
+    file = Path(path) / META_FILE
+    if not file.is_file():
         return None
     try:
-        values = checks.read_json(path, "what a policy was trained for", _LARGEST_META)
-        for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
-            if name in values:  # a checkpoint from before there were pictures has no cameras
-                values[name] = tuple(checks.array(name, values[name], _MOST_NAMES))
-        known = {one.name: one for one in fields(CheckpointMeta)}
-        for name in values:
-            if name not in known:
-                raise ManipError(f"unexpected {checks.shorten(name)}")
-        for name, one in known.items():
-            if name not in values and one.default is one.default_factory is MISSING:
-                raise ManipError(f"no {name}")
-        return CheckpointMeta(**values)
-    except ManipError as error:
-        raise ManipError(f"{path} cannot be read ({error}); train again, or restore the file") from error
+        return Origin(**checks.read_json(file, "what a policy was trained for", _LARGEST_JSON))
+    except (ManipError, TypeError) as error:
+        line = checks.one_line(error)
+        raise ManipError(f"{file} cannot be read ({line}); train again, or restore the file") from error
 
 
-def check_fits(meta: CheckpointMeta, spec: RobotTaskSpec) -> None:
-    """Raise `MismatchError` naming both sides unless the policy's numbers mean what `spec`'s do."""
-    for name, what in _MUST_AGREE.items():
-        if name == "environment_state_names" and meta.observation == "images":
-            continue  # it does not look at it
-        ours, theirs = getattr(meta, name), getattr(spec, name)
-        if name == "object":
-            ours, theirs = ours or OWN_OBJECT, theirs or OWN_OBJECT
-        if name == "environment_state_names" and ours != theirs and meta.task != spec.task:
-            raise MismatchError("task", "the policy", meta.task, "the environment", spec.task)
-        if ours != theirs:
-            raise MismatchError(what, "the policy", ours, f"{spec.robot}/{spec.task}", theirs)
+@dataclass(frozen=True)
+class Checkpoint:
+    """A policy on disk. path: its `pretrained_model` folder. config: the `config.json` there.
 
-
-def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the light in which a dataset's pictures were made, as arguments of `sim.look.Look`; {} is the default.
-
-    None where that is not known: another program's dataset, or one without pictures.
+    numbers: column -> how many; pictures: camera -> (height, width) [pixels]; action: how many numbers. space: the
+    action space it has learnt in; robot: whose hand moves, for `ee_delta` alone. origin: None where another program
+    wrote it. processors: steps by file, each `registry_name`, `config` and perhaps `state_file`.
     """
-    if "cameras_sha256" not in fingerprint:
-        return None
-    rendered = provenance.get("rendered", {}).get("cameras", {})  # `record` has the default light alone
-    return dict(rendered.get("look", {}))
+
+    path: Path
+    config: Mapping[str, Any]
+    numbers: Mapping[str, int]
+    pictures: Mapping[str, tuple[int, int]]
+    action: int
+    space: str
+    robot: str
+    origin: Origin | None
+    processors: Mapping[str, Sequence[Mapping[str, Any]]]
+
+    @classmethod
+    def open(cls, path: Path) -> Checkpoint:
+        """Read and check a folder's files, but for its weights.
+
+        Raises `ManipError` for a folder that is not whole, holds a pickle, or asks to import code by its path.
+        """
+        path = Path(path)
+        config, origin = read_config(path), read_origin(path)
+        processors = {name: _processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
+        try:
+            inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
+            if ACTION not in outputs:
+                raise ManipError(f"no {ACTION} among the outputs ({', '.join(outputs)})")
+            pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
+            if any(len(shape) != 3 for shape in pictures.values()):
+                raise ManipError(f"pictures of shapes {checks.shorten(list(pictures.values()))}; expected (3, H, W)")
+            space, robot = _space(config, processors.get(PROCESSORS[1], []))
+        except ManipError as error:
+            raise ManipError(f"{path / CONFIG} has features that cannot be read: {checks.one_line(error)}") from error
+        if origin is not None and origin.action_space not in (None, space):
+            raise MismatchError("action space", str(path / META_FILE), origin.action_space, CONFIG, space)
+        return cls(
+            path,
+            config,
+            numbers={key: math.prod(shape) for key, (kind, shape) in inputs.items() if kind in ("STATE", "ENV")},
+            pictures={
+                name: (shape[1], shape[2]) for name, shape in pictures.items() if not name.startswith(_PLACEHOLDER)
+            },
+            action=math.prod(outputs[ACTION][1]),
+            space=space,
+            robot=robot,
+            origin=origin,
+            processors=processors,
+        )
+
+    @property
+    def kind(self) -> str:
+        """LeRobot's name for the policy."""
+        return self.config["type"]
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """All inputs by LeRobot's names."""
+        return (*self.numbers, *(IMAGES + camera for camera in self.pictures))
+
+    @property
+    def observation(self) -> str:
+        """Which of `OBSERVATIONS` the policy takes."""
+        return observation_of(self.columns)
+
+    @property
+    def mlp_options(self) -> dict[str, Any] | None:
+        """The options of another mlp of this architecture; None for another kind of policy."""
+        if self.kind != MLP:
+            return None
+        kept = {name: self.config[name] for name in _MLP_SHAPE if name in self.config}
+        return {"type": MLP, **kept, "sigma": self.config.get("sigma", 0.0)}
+
+    def check_fits(self, spec: RobotTaskSpec) -> None:
+        """Raise `MismatchError` naming both unless an environment of `spec` has every input and takes the action."""
+        if self.origin is not None:
+            self.origin.check_fits(spec)
+        environment = f"{spec.robot}/{spec.task}"
+        have = {STATE: len(spec.joint_names), ENVIRONMENT_STATE: len(spec.environment_state_names)}
+        known = [*have, *spec.image_keys]
+        if any(key not in known for key in self.columns):
+            raise MismatchError("inputs", "the policy", ", ".join(self.columns), environment, ", ".join(known))
+        for key, width in self.numbers.items():
+            if width != have[key]:
+                raise MismatchError(f"width of {key}", "the policy", width, environment, have[key])
+        if self.robot not in ("", spec.robot):
+            raise MismatchError("robot, whose hand moves,", "the policy", self.robot, environment, spec.robot)
+        if self.action != have[STATE]:
+            raise MismatchError("width of the action", "the policy", self.action, environment, have[STATE])
+        for camera, size in self.pictures.items():
+            if size != spec.image_size:
+                what = f"size of the pictures of {camera}"
+                raise MismatchError(what, "the policy", size, environment, spec.image_size)
+
+    def require_trust(self, trust: bool) -> None:
+        """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
+        others = [
+            _list_options(f"the step {checks.shorten(step['registry_name'])} of {name}", step["config"])
+            for name, steps in self.processors.items()
+            for step in steps
+            if step["registry_name"] not in _STEPS
+        ]
+        require_trust(self.config, str(self.path), trust, others)
+
+    def require_processors(self) -> None:
+        """Raise `ManipError` unless both processors are there."""
+        for name in PROCESSORS:
+            if name not in self.processors:
+                hint = "LeRobot's migrate_policy_normalization adds it to an old checkpoint"
+                raise ManipError(f"no {self.path / name}; {hint}")
 
 
-def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
-    """Return the folder `checkpoints/last` to go on from, or None where there is none.
+def observation_of(input_features: Iterable[str]) -> str:
+    """Return which of `OBSERVATIONS` a policy takes, from the names of its inputs."""
+    keys = set(input_features)
+    if not any(key.startswith(IMAGES) for key in keys):
+        return "state"
+    return "both" if ENVIRONMENT_STATE in keys else "images"
 
-    Raises `FolderExistsError` where there is one, unless `resume`.
+
+def require_trust(settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[str] = ()) -> None:
+    """Raise `ManipError` unless a policy loads nothing by name, or `trust` is given; says what would be loaded.
+
+    settings: its options with `type`, as `config.json` has them. source: of them, for the message. steps: of its
+    processors that load something, in words.
     """
-    last = output_dir / "checkpoints" / _LAST
-    if not (last / PRETRAINED_MODEL).is_dir():
-        return None
-    if not resume:
-        raise FolderExistsError(output_dir)
-    return last
-
-
-def read_step(checkpoint: Path) -> dict[str, Any]:
-    """Return the step and the resume key of a checkpoint folder. Raises `ManipError` where it has none."""
-    path = checkpoint / TRAINING_STATE / STEP_FILE
-    if not path.is_file():
-        raise ManipError(f"no {path}: this checkpoint cannot be resumed; use it as init_from instead")
-    values = checks.read_json(path, "the step of a run", _LARGEST_META)
-    checks.whole(f"{path}: step", values.get("step"), 0, _LARGEST_STEP)
-    return values
-
-
-def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) -> None:
-    """Raise `MismatchError` unless the checkpoint's run learnt from the same data with the same options."""
-    saved = read_step(checkpoint)
-    if saved.get("data") != digest:
-        raise MismatchError("training data", f"checkpoint {checkpoint}", saved.get("data"), "this run", digest)
-    before = checks.mapping(f"{checkpoint}: options", saved.get("options", {}))
-    for name, ours in options.items():
-        if before.get(name) != ours:
-            what = f"training option {name}"
-            raise MismatchError(what, f"checkpoint {checkpoint}", before.get(name), "this run", ours)
-
-
-@contextmanager
-def readable_state(checkpoint: Path) -> Iterator[None]:
-    """Turn what LeRobot, torch and safetensors raise for files that are not whole into `ManipError`."""
-    try:
-        yield
-    except ManipError:
-        raise
-    except Exception as error:  # of every kind: files of tensors and JSON, read by others' code
-        line = checks.shorten(" ".join(str(error).split()))
+    kind = settings["type"]
+    named = {
+        name: value
+        for name, value in settings.items()
+        if isinstance(value, str) and any(word in name for word in _NAMING) and name != "pretrained_path"
+    }
+    wanted = list(steps)
+    if kind not in PLAIN or "vision_encoder_name" in named:
+        wanted.insert(0, _list_options(f"models that LeRobot's {kind!r} names", named))
+    if wanted and not trust:
         raise ManipError(
-            f"{checkpoint} cannot be resumed ({type(error).__name__}: {line}); start again with --overwrite=true"
-        ) from error
+            f"{source} is a policy of type {kind!r} that would load {'; '.join(wanted)}: this fetches files and may "
+            "run code that comes with them; if you trust its source, add --trust=true"
+        )
 
 
-@contextmanager
-def unpublished(final: Path) -> Generator[Path]:
-    """Give an empty folder to write a checkpoint into; on leaving, it gets its name and is `last`.
-
-    An exception removes it. Raises `WriteError` where the disk is full or read-only.
-    """
-    temporary = final.parent / f".{final.name}.tmp"
+def read_config(path: Path) -> dict[str, Any]:
+    """Return the `config.json` of a folder that is whole and holds no pickle; else raise `ManipError`."""
+    if not (path / CONFIG).is_file():
+        raise ManipError(f"no {CONFIG} in {path}; expected LeRobot's pretrained_model folder")
+    for file in sorted(path.rglob("*")):
+        if file.suffix.lower() in _PICKLES:
+            raise ManipError(
+                f"{file} is a pickle, which may run any code when it is read: convert it to safetensors and remove it"
+            )
+    if not (path / WEIGHTS).is_file():
+        adapter = (path / "adapter_model.safetensors").is_file()
+        hint = "it is an adapter: merge it into its base policy first" if adapter else "the weights are missing"
+        raise ManipError(f"no {WEIGHTS} in {path}; {hint}")
+    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json", _LARGEST_JSON)
     try:
-        with writing(final):
-            final.parent.mkdir(parents=True, exist_ok=True)
-            for stale in (temporary, final):  # of a run that was killed before it could switch `last` over
-                shutil.rmtree(stale, ignore_errors=True)
-            temporary.mkdir()
-            yield temporary
-            publish(temporary, final)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        checks.text("type", config.get("type"), checks.LONGEST_NAME)
+        for features in ("input_features", "output_features"):
+            checks.mapping(features, config.get(features))
+    except ManipError as error:
+        raise ManipError(f"{path / CONFIG} is not a LeRobot policy's: {error}") from error
+    return config
 
 
-def publish(temporary: Path, final: Path) -> None:
-    """Give a checkpoint that is whole its name, and make it `last`."""
-    for path in temporary.rglob("*"):
-        if path.is_file():  # safetensors hides its files from other users, a container's among them
-            path.chmod(0o666 & ~umask())
-    temporary.rename(final)
-    link = final.parent / ".last.tmp"
-    link.unlink(missing_ok=True)
-    link.symlink_to(final.name)
-    os.replace(link, final.parent / _LAST)  # in one rename
+def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Name -> kind and shape of a policy's inputs or outputs."""
+    found: dict[str, tuple[str, tuple[int, ...]]] = {}
+    for key, value in features.items():
+        feature = checks.mapping(key, value)
+        shape = checks.array(f"shape of {key}", feature.get("shape"), 4)
+        sizes = tuple(checks.whole(f"a side of {key}", side, 1, _LONGEST_SIDE) for side in shape)
+        found[key] = checks.text(f"type of {key}", feature.get("type"), checks.LONGEST_NAME), sizes
+    return found
 
 
-def write_own_files(checkpoint: Path, meta: CheckpointMeta, step: Mapping[str, Any]) -> None:
-    """Write what LeRobot's checkpoints have not: the meta, and the step with the resume key."""
-    words = {name: value for name, value in asdict(meta).items() if value or name != "object"}
-    for path, values in ((f"{PRETRAINED_MODEL}/{META_FILE}", words), (f"{TRAINING_STATE}/{STEP_FILE}", step)):
-        (checkpoint / path).write_text(json.dumps(values, indent=2) + "\n")
+def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    """Action space and robot: the mlp's and cnn's by their configuration, all others' by the postprocessor's step."""
+    options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
+    converted, robot = options.get("action_space", JOINT_TARGET), checks.text("robot", options.get("robot", ""))
+    own = config["type"] in OWN_SPACE
+    space = config.get("action_space", JOINT_DELTA) if own else converted
+    if space not in ACTION_SPACES:
+        raise UnknownName("action space", checks.shorten(space), ACTION_SPACES)
+    if own and converted != (in_step := EE_DELTA if space == EE_DELTA else JOINT_TARGET):
+        raise MismatchError(f"action space, for {space},", PROCESSORS[1], converted, CONFIG, in_step)
+    return space, robot
+
+
+def _processor_steps(path: Path) -> list[dict[str, Any]]:
+    """The steps that a processor's file names.
+
+    Refuses a step by import path, as LeRobot would import and call whatever a downloaded file names, and a state
+    outside of the folder.
+    """
+    values = checks.read_json(path, "a processor of LeRobot's", _LARGEST_JSON)
+    try:
+        steps = [checks.mapping("a step", step) for step in checks.array("steps", values.get("steps"), _MOST_STEPS)]
+        return [_step(path, step) for step in steps]
+    except ManipError as error:
+        raise ManipError(f"{path} cannot be read: {error}") from error
+
+
+def _step(path: Path, step: dict[str, Any]) -> dict[str, Any]:
+    if "registry_name" not in step:
+        raise ManipError(f"it asks to run {checks.shorten(step.get('class'))}; only registered steps are loaded")
+    known = {
+        "registry_name": checks.text("registry_name", step["registry_name"], checks.LONGEST_NAME),
+        "config": checks.mapping("config", step.get("config", {})),
+    }
+    if "state_file" in step:
+        known["state_file"] = checks.name("state_file", step["state_file"])
+        if not (path.parent / known["state_file"]).is_file():
+            raise ManipError(f"no {known['state_file']} beside it")
+    return known
+
+
+def _list_options(what: str, options: Mapping[str, Any]) -> str:
+    """`what` with the three options that say most, the names of models first."""
+    first = sorted(options.items(), key=lambda item: not isinstance(item[1], str))[:3]
+    text = ", ".join(f"{checks.shorten(key)[1:-1]}={checks.shorten(value)}" for key, value in first)
+    return f"{what}: {text}" if text else what

@@ -25,11 +25,9 @@ from manip_il.checks import mapping, shorten
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
-from manip_il.learn.checkpoint import META_FILE
-from manip_il.learn.fit_config import EE_DELTA, JOINT_DELTA
+from manip_il.learn.checkpoint import CONFIG, EE_DELTA, JOINT_DELTA, META_FILE
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.pretrained import CONFIG, read_config
 
 EXTRA_FILE = "manip_il.json"  # in a TorchScript file: its metadata
 TOLERANCE = 1e-5  # [rad] or [m], between the file's actions and the checkpoint's
@@ -60,7 +58,7 @@ class PolicyFunction(nn.Module):
     def __init__(self, policy: LearnedPolicy) -> None:
         super().__init__()
         module = policy.module
-        self.numbers = [key for key in (STATE, ENVIRONMENT_STATE) if key in policy.interface.numbers]
+        self.numbers = [key for key in (STATE, ENVIRONMENT_STATE) if key in policy.checkpoint.numbers]
         if isinstance(module, MLPNetwork):
             self.network, self.cameras, self.encoders = module, list[str](), nn.ModuleList()
         else:
@@ -118,7 +116,7 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
             dynamo=False,
         )
     model = onnx.load_model_from_string(content.getvalue())
-    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = policy.interface.action
+    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = policy.checkpoint.action
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
     onnx.helper.set_model_props(model, texts)
     onnx.checker.check_model(model, full_check=True)
@@ -161,7 +159,7 @@ def file_metadata(
     """Return a file's metadata: the policy, its robot and task, inputs and outputs; unknown entries are left out."""
     shared = ("robot", "robot"), ("task", "task"), ("control_rate_hz", "fps"), ("action_meaning", "action_meaning")
     entries: dict[str, Any] = {
-        **{key: getattr(policy.meta, name, None) for key, name in shared},
+        **{key: getattr(policy.checkpoint.origin, name, None) for key, name in shared},
         "inputs": [_entry(policy, key) for key in inputs],
         "outputs": [_entry(policy, ACTION)],
         "policy_type": config["type"],
@@ -173,11 +171,11 @@ def file_metadata(
 
 def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
     """The name, type and shape of an input or output, and what its numbers mean, where that is known."""
-    interface, meta = policy.interface, policy.meta
+    checkpoint, meta = policy.checkpoint, policy.checkpoint.origin
     if key.startswith(IMAGES):
-        shape = ["batch", *interface.pictures[key.removeprefix(IMAGES)], 3]
+        shape = ["batch", *checkpoint.pictures[key.removeprefix(IMAGES)], 3]
         return {"name": key, "dtype": "uint8", "shape": shape, "names": ["red", "green", "blue"], "units": "0 to 255"}
-    size = interface.action if key == ACTION else interface.numbers[key]
+    size = checkpoint.action if key == ACTION else checkpoint.numbers[key]
     names: list[str] = []
     if meta:
         names = list(meta.environment_state_names if key == ENVIRONMENT_STATE else meta.joint_names)
@@ -191,12 +189,12 @@ def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
 
 
 def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction, dict[str, Any]]:
-    config = read_config(path)
+    policy = LearnedPolicy.load(path)
+    config = policy.checkpoint.config
     modes = config.get("normalization_mapping", {})
     if any(mode != "IDENTITY" for mode in mapping(f"{path / CONFIG}: normalization_mapping", modes).values()):
         raise ManipError(f"{path / CONFIG}: normalization_mapping is {shorten(modes)}; expected IDENTITY for all")
-    policy = LearnedPolicy.load(path)
-    if policy.interface.space == EE_DELTA:
+    if policy.checkpoint.space == EE_DELTA:
         raise ManipError(f"{path} has learnt {EE_DELTA}, and a file holds no inverse kinematics; use {JOINT_DELTA}")
     function = PolicyFunction(policy)
     return policy, function, file_metadata(policy, config, function.inputs, policy_sha256)
@@ -205,13 +203,13 @@ def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction
 def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) -> Arrays:
     """Random observations, spread as the training data were."""
     rng = np.random.default_rng(0)
-    widths = [policy.interface.numbers[key] for key in function.numbers]
+    widths = [policy.checkpoint.numbers[key] for key in function.numbers]
     network, size = function.network, sum(widths)
     mean, scale = network.input_mean[:size].numpy(), network.input_scale[:size].numpy()
     deviation = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
     numbers = (mean + deviation * rng.normal(size=(rows, size))).astype(np.float32)
     parts = np.split(numbers, np.cumsum(widths)[:-1], axis=1)
-    sizes = {key: policy.interface.pictures[key.removeprefix(IMAGES)] for key in function.cameras}
+    sizes = {key: policy.checkpoint.pictures[key.removeprefix(IMAGES)] for key in function.cameras}
     pictures = {key: rng.integers(256, size=(rows, *size, 3), dtype=np.uint8) for key, size in sizes.items()}
     return dict(zip(function.numbers, parts, strict=True)) | pictures
 

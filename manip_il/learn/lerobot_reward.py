@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
-from manip_il.learn.columns import EPISODE_INDEX
-from manip_il.learn.limits import threads
-from manip_il.learn.samples import SampleSource, Windows, read_later
+from manip_il.learn.samples import Pictures, Samples, Windows
+from manip_il.learn.threads import threads
 
 _BATCH = 32
 
@@ -43,17 +43,18 @@ def score_by_lerobot(
         raise ManipError(f"{root} lacks {', '.join(missing)}, which the reward model in {folder} sees")
     deltas = config.observation_delta_indices
     ahead = {} if deltas is None else {key: np.asarray(deltas, np.int64) for key in features}
-    table = Dataset.open(root).columns([key for key, feature in meta.features.items() if feature["dtype"] in NUMBERS])
-    source = SampleSource(
+    dataset = Dataset.open(root)
+    table = dataset.columns([key for key, feature in meta.features.items() if feature["dtype"] in NUMBERS])
+    samples = Samples(
         Windows(table[EPISODE_INDEX].reshape(-1), ahead),
         {key: torch.from_numpy(column.copy()) for key, column in table.items()},
-        read_later([root], [key for key in meta.camera_keys if key not in meta.depth_keys]),
-        tuple(map(str, meta.tasks.index)),
+        {key: Pictures.decode([dataset], key) for key in meta.camera_keys if key not in meta.depth_keys},
+        np.array([*map(str, meta.tasks.index)], object),
     )
-    samples = np.arange(meta.total_frames)
     found: list[torch.Tensor] = []
     with threads(1), torch.inference_mode():
-        for batch in source.batches(np.split(samples, range(_BATCH, len(samples), _BATCH))):
+        for start in range(0, meta.total_frames, _BATCH):
+            batch = samples.batch(np.arange(start, min(start + _BATCH, meta.total_frames)))
             pictured = {key: to_float(one) for key, one in batch.items() if _is_picture(one)}
             rewards = model.compute_reward(preprocessor(batch | pictured)).reshape(-1).cpu()
             found.append(rewards)

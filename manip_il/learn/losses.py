@@ -5,8 +5,7 @@ fit(D) = argmin over policies of the mean over D of -log pi(a* | s): empirical r
 Ross, Gordon and Bagnell, AISTATS 2011, section 2). A head says what family pi(. | s) is taken
 from. The network gives `params` (B, size) for a row; targets (B, n) are in normalised units.
 
-Acting is deterministic: one action for a state. A head whose spread is learnt can be drawn from, too (`Distribution`);
-`mse` and `l1` say nothing about spread.
+Acting is deterministic: one action for a state. `mse` and `l1` say nothing about spread.
 """
 
 from __future__ import annotations
@@ -15,16 +14,14 @@ import math
 from abc import ABC, abstractmethod
 from typing import override
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from manip_il.errors import UnknownName
 
 LOSSES = ("mse", "l1", "gaussian", "mixture", "categorical")
-DISTRIBUTIONS = ("gaussian", "mixture", "categorical")  # whose spread is learnt
+LIKELIHOODS = ("mixture", "categorical")  # whose spread depends on the state
 
 # A deterministic expert lets the likelihood grow without bound as the deviation goes to zero. The
 # floor, 2 % of a target's own standard deviation, keeps the gradients finite.
@@ -46,18 +43,6 @@ class Head(ABC):
     @abstractmethod
     def action(self, params: Tensor) -> Tensor:
         """Return the action of each row, (B, n)."""
-
-
-class Distribution(Head):
-    """A head whose spread is learnt. A draw is a function of `params` and numbers that do not depend on them."""
-
-    @abstractmethod
-    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Draw what one sample is made from, (m,): uniform numbers in [0, 1) and standard normal ones."""
-
-    @abstractmethod
-    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
-        """Return one sample a row, (B, n), from params (B, size) and `draw` of each row (B, m)."""
 
     def log_prob(self, params: Tensor, target: Tensor) -> Tensor:
         """Return log-density of each row's target (B, n), of `categorical` log-probability [nats], (B,)."""
@@ -87,7 +72,7 @@ class L1Head(MSEHead):
         return (params - target).abs().mean(-1)
 
 
-class GaussianHead(Distribution, nn.Module):
+class GaussianHead(Head, nn.Module):
     """Diagonal Gaussian: the network gives the mean; one learned log-deviation a dimension. Acts with the mean.
 
     The deviation does not depend on the state: where it does, easy states outweigh hard ones by
@@ -109,16 +94,8 @@ class GaussianHead(Distribution, nn.Module):
     def action(self, params: Tensor) -> Tensor:
         return params
 
-    @override
-    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        return rng.standard_normal(self.n)
 
-    @override
-    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
-        return params + floored_log_std(self.raw_log_std).exp() * draws.to(params.dtype)
-
-
-class MixtureHead(Distribution):
+class MixtureHead(Head):
     """Mixture of `components` diagonal Gaussians (Bishop, Mixture density networks, 1994).
 
     Acts with the mean of the heaviest component: the mixture's own mean may lie between two ways
@@ -144,24 +121,11 @@ class MixtureHead(Distribution):
     @override
     def action(self, params: Tensor) -> Tensor:
         log_weights, means, _ = self.split(params)
-        return self._of(means, log_weights.argmax(-1, keepdim=True))
-
-    @override
-    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        return np.append(rng.random(), rng.standard_normal(self.n))
-
-    @override
-    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
-        log_weights, means, log_std = self.split(params)
-        component = _inverse_cdf(log_weights, draws[:, :1])
-        return self._of(means, component) + self._of(log_std, component).exp() * draws[:, 1:].to(params.dtype)
-
-    def _of(self, values: Tensor, component: Tensor) -> Tensor:
-        """The component's (B, 1) part of values (B, K, n), (B, n)."""
-        return values.gather(-2, component.unsqueeze(-1).expand(*values.shape[:-2], 1, self.n)).squeeze(-2)
+        heaviest = log_weights.argmax(-1)[..., None, None]
+        return means.gather(-2, heaviest.expand(*means.shape[:-2], 1, self.n)).squeeze(-2)
 
 
-class CategoricalHead(Distribution):
+class CategoricalHead(Head):
     """Each dimension in `bins` equal bins over [-1, 1], the range of the data; cross-entropy.
 
     A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother et al., Stop
@@ -172,7 +136,7 @@ class CategoricalHead(Distribution):
 
     Acts with the expectation over the likeliest bin and those that its target was smeared over (at least its two
     neighbours): exact within a bin, unlike the argmax, and never between two modes that are apart, unlike the
-    expectation over all bins. A sample is a bin's centre.
+    expectation over all bins.
     """
 
     def __init__(self, n: int, bins: int, sigma: float = 0.0) -> None:
@@ -214,15 +178,6 @@ class CategoricalHead(Distribution):
         weights = logits.gather(-1, near).masked_fill(~inside, -torch.inf).softmax(-1)
         return (weights * self._centres(near, params)).sum(-1)
 
-    @override
-    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        return rng.random(self.n)
-
-    @override
-    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
-        drawn = _inverse_cdf(self._logits(params).log_softmax(-1), draws.unsqueeze(-1))
-        return self._centres(drawn, params).squeeze(-1)
-
     def _place(self, target: Tensor) -> Tensor:
         """Targets, taken as the edge where they lie outside, in bins from the first centre."""
         return (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1)) + self.pad
@@ -251,12 +206,6 @@ def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float = 0
 def floored_log_std(raw: Tensor) -> Tensor:
     """Return log-deviations of the shape of `raw`, (B, n), that go smoothly to `MIN_LOG_STD` from above."""
     return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
-
-
-def _inverse_cdf(log_weights: Tensor, uniform: Tensor) -> Tensor:
-    """The option (..., 1) of those weighed by exp(log_weights) (..., K) that a number (..., 1) in [0, 1) falls on."""
-    cdf = log_weights.double().exp().cumsum(-1)
-    return torch.searchsorted(cdf, uniform * cdf[..., -1:], right=True).clamp(max=log_weights.shape[-1] - 1)
 
 
 def _normal_log_prob(value: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

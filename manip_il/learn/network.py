@@ -6,9 +6,10 @@ importing LeRobot.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,19 +19,16 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from manip_il import checks
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.learn.action_spaces import ARM, GRIPPER
-from manip_il.learn.fit_config import ACTION_SPACES, JOINT_DELTA
-from manip_il.learn.losses import DISTRIBUTIONS, LOSSES, Distribution, make_head
+from manip_il.learn.checkpoint import ACTION_SPACES, JOINT_DELTA, WEIGHTS
+from manip_il.learn.losses import LOSSES, make_head
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always
 # multiplies this many, filled up with zeros.
 ROWS = 64
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
 ACTIVATIONS = tuple(_ACTIVATIONS)
-BOUNDS = {"width": (1, 16_384), "depth": (1, 100), "components": (1, 1_000), "bins": (2, 10_000)}
-LARGEST_CLAMP = 1e6  # [standard deviations]
-LARGEST_SIGMA = 100.0  # [bins]
 # [rad] or [m]. An input that moves less than this in all of the data is noise that division by its
 # deviation would blow up: it is multiplied by zero instead, so the network never sees it.
 CONSTANT_INPUT = 1e-4
@@ -41,7 +39,7 @@ CONSTANT_TARGET = 1e-6
 class Shape:
     """Sizes and kinds that a network is built from; the names are those of `MLPConfig`, which says what they mean.
 
-    Raises `ManipError` for a value out of bounds or of another type, `UnknownName` for a loss or activation.
+    Raises `ManipError` for a value out of range or of another type, `UnknownName` for a loss or activation.
     """
 
     width: int
@@ -56,48 +54,35 @@ class Shape:
 
     def __post_init__(self) -> None:
         for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS), ("action_space", ACTION_SPACES)):
-            value = checks.text(name, getattr(self, name), checks.LONGEST_NAME)
-            if value not in known:
-                raise UnknownName(name, value, known)
-        for name, (least, most) in BOUNDS.items():
-            checks.whole(name, getattr(self, name), least, most)
-        if not checks.number("clamp", self.clamp, 0.0, LARGEST_CLAMP) > 0:
+            if (value := getattr(self, name)) not in known:
+                raise UnknownName(name, str(value), known)
+        for name, least in (("width", 1), ("depth", 1), ("components", 1), ("bins", 2)):
+            checks.whole(name, getattr(self, name), least, 100_000)
+        if not checks.number("clamp", self.clamp, 0.0) > 0:
             raise ManipError(f"clamp is {self.clamp}; expected more than 0")
-        checks.number("sigma", self.sigma, 0.0, LARGEST_SIGMA)
+        checks.number("sigma", self.sigma, 0.0)
+
+    @classmethod
+    def read(cls, config: Mapping[str, Any]) -> Shape:
+        """Return the shape in an mlp's `config.json`. Raises `ManipError` for one that is no mlp's."""
+        needed = [one.name for one in fields(cls) if one.default is MISSING or one.name in config]
+        if missing := [name for name in needed if name not in config]:
+            raise ManipError(f"no {missing[0]}; it is not an mlp's")
+        return cls(**{name: config[name] for name in needed})
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Float32 vectors over inputs (d,) and targets (n,), in raw units ([rad], [m]).
+Statistics = Mapping[str, Tensor]  # by the names of `MLPNetwork`'s buffers
+
+
+def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str) -> Statistics:
+    """Return statistics of inputs (N, d) and targets (N, n), in raw units ([rad], [m]), as float32 vectors.
 
     x = (input - input_mean) * input_scale; target = target_mean + target_scale * y, clamped to
     [target_low, target_high], the range of the data.
-    """
-
-    input_mean: Tensor
-    input_scale: Tensor
-    target_mean: Tensor
-    target_scale: Tensor
-    target_low: Tensor
-    target_high: Tensor
-
-    @classmethod
-    def identity(cls, inputs: int, targets: int) -> Statistics:
-        """Return statistics that change nothing, of d inputs and n targets."""
-        everything, zeros, ones = torch.full((targets,), torch.inf), torch.zeros, torch.ones
-        return cls(zeros(inputs), ones(inputs), zeros(targets), ones(targets), -everything, everything)
-
-
-def fit_statistics(
-    inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str, rows: NDArray[np.int64] | None = None
-) -> Statistics:
-    """Return statistics of inputs (N, d) and targets (N, n), of all rows or of some, (S,).
 
     Targets are scaled by mean and deviation, for `categorical` by the middle and half-width of
     their range, which puts them in [-1, 1]. A constant target has scale 0: it is its mean.
     """
-    if rows is not None:
-        inputs, targets = inputs[rows], targets[rows]
     low, high = targets.min(0).astype(np.float64), targets.max(0).astype(np.float64)
     if loss == "categorical":
         target_mean, target_scale = (low + high) / 2, (high - low) / 2
@@ -106,8 +91,9 @@ def fit_statistics(
     target_scale = np.where(target_scale < CONSTANT_TARGET, 0.0, target_scale)
     input_mean, deviation = _mean_and_deviation(inputs)
     input_scale = np.where(deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT))
-    values = (input_mean, input_scale, target_mean, target_scale, low, high)
-    return Statistics(*(torch.from_numpy(value.astype(np.float32)) for value in values))
+    found = {"input_mean": input_mean, "input_scale": input_scale, "target_mean": target_mean}
+    found |= {"target_scale": target_scale, "target_low": low, "target_high": high}
+    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in found.items()}
 
 
 def _mean_and_deviation(values: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -140,12 +126,15 @@ class MLPNetwork(nn.Module):
         for width in (inputs, *[shape.width] * (shape.depth - 1)):
             layers += [nn.Linear(width, shape.width), _ACTIVATIONS[shape.activation]()]
         self.layers = nn.Sequential(*layers, nn.Linear(shape.width, self.head.size))
-        for name, tensor in vars(Statistics.identity(inputs, n)).items():
-            self.register_buffer(name, tensor)
+        for name, size in (("input", inputs), ("target", n)):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_scale", torch.ones(size))
+        self.register_buffer("target_low", torch.full((n,), -torch.inf))
+        self.register_buffer("target_high", torch.full((n,), torch.inf))
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Take the units of the data, saved with the weights. Inputs beyond those of `statistics` have none."""
-        for name, tensor in vars(statistics).items():
+        for name, tensor in statistics.items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
     def encode(self, inputs: Tensor) -> Tensor:
@@ -172,32 +161,13 @@ class MLPNetwork(nn.Module):
         """Return actions, (B, n), each the same bits whatever the other rows are."""
         return _in_blocks(self.actions, inputs)
 
-    def distribution(self) -> Distribution:  # no property: TorchScript would compile it
-        """Return the head. Raises `UsageError` for one whose spread is not learnt."""
-        if not isinstance(self.head, Distribution):
-            raise UsageError(f"loss {self.loss!r} learns no spread of actions; expected {', '.join(DISTRIBUTIONS)}")
-        return self.head
-
-    @torch.no_grad()
-    def sample(self, inputs: Tensor, draws: Tensor) -> Tensor:
-        """Return actions, (B, n), from what the distribution's `draw` gave for each row (B, m).
-
-        Bits as in `act`.
-        """
-
-        def samples(inputs: Tensor, draws: Tensor) -> Tensor:
-            drawn = self.distribution().sample(self.layers(self.encode(inputs)), draws)
-            return self._absolute(inputs, drawn * self.target_scale + self.target_mean)
-
-        return _in_blocks(samples, inputs, draws)
-
     @torch.no_grad()
     def log_prob(self, inputs: Tensor, actions: Tensor) -> Tensor:
         """Return the log-density of actions (B, n) in normalised units [nats], (B,); bits as in `act`."""
 
         def log_probs(inputs: Tensor, actions: Tensor) -> Tensor:
             targets = self.encode_targets(self.relative(actions, inputs))
-            return self.distribution().log_prob(self.layers(self.encode(inputs)), targets)
+            return self.head.log_prob(self.layers(self.encode(inputs)), targets)
 
         return _in_blocks(log_probs, inputs, actions)
 
@@ -223,21 +193,25 @@ def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
     return torch.cat([function(*blocks) for blocks in zip(*(one.split(ROWS) for one in padded), strict=True)])[:rows]
 
 
+def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
+    """Return the network's tensors in a `pretrained_model` folder. Raises `ManipError` if they cannot be read."""
+    path = Path(pretrained_model) / WEIGHTS
+    try:
+        return {name.removeprefix("model."): tensor for name, tensor in load_file(path).items()}
+    except (SafetensorError, OSError) as error:
+        raise ManipError(f"{path} cannot be read: {checks.one_line(error)}") from error
+
+
 @torch.no_grad()
 def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
-    """Copy the weights from `pretrained_model`; `network` then acts as that one did, within rounding.
+    """Copy the weights from a `pretrained_model` folder; `network` then acts as that one did, within rounding.
 
     The input statistics stay those of the new data: the first layer takes up the difference. (An
     input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
     The range of the targets is that of the new data too; their mean and scale are taken over, being
     only the unit of the outputs. Raises `MismatchError` for other shapes, `ManipError` for a file that cannot be read.
     """
-    path = Path(pretrained_model) / "model.safetensors"
-    try:
-        saved = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise ManipError(f"cannot read {path} to start from its weights: {' '.join(str(error).split())}") from error
-    saved = {name.removeprefix("model."): tensor for name, tensor in saved.items()}
+    saved = read_weights(pretrained_model)
     kept = {name: getattr(network, name).clone() for name in ("input_mean", "input_scale", "target_low", "target_high")}
     for name, ours in network.state_dict().items():
         theirs = saved[name].shape if name in saved else None

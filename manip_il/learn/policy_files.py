@@ -6,8 +6,7 @@ import hashlib
 from pathlib import Path
 
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import META_FILE, read_meta
-from manip_il.learn.pretrained import read_interface
+from manip_il.learn.checkpoint import META_FILE, Checkpoint
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 
 _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
@@ -28,7 +27,8 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
     The light is the default where the checkpoint does not say. Raises `MismatchError` for cameras that environments do
     not have or whose pictures differ in size, `ManipError` for a folder or a size that cannot be.
     """
-    pictures, meta = read_interface(policy).pictures, read_meta(policy)
+    checkpoint = Checkpoint.open(policy)
+    pictures, meta = checkpoint.pictures, checkpoint.origin
     if not pictures:
         return None
     if not set(pictures) <= set(CAMERAS):

@@ -9,21 +9,18 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.learn.checkpoint import CheckpointMeta, check_fits, read_meta
-from manip_il.learn.limits import Budget, threads
-from manip_il.learn.preference.network import MOST_INPUTS, MOST_WAYS, RewardNetwork, RewardShape
-from manip_il.learn.pretrained import CONFIG, WEIGHTS, read_config
+from manip_il.learn.checkpoint import CONFIG, Origin, read_config, read_origin
+from manip_il.learn.network import read_weights
+from manip_il.learn.preference.network import RewardNetwork, RewardShape
+from manip_il.learn.threads import threads
 
 F32 = NDArray[np.float32]
 PREFERENCE = "preference"  # its type, in LeRobot's config.json
 INPUTS = (STATE, ENVIRONMENT_STATE, ACTION)
-_PREFIX = "model."  # of the network's tensors
 _ROWS = 16_384  # evaluated at once
 
 
@@ -36,14 +33,14 @@ class Reward(Protocol):
 
 
 class LearnedReward:
-    """A reward that was learnt from preferences. meta: robot, task and columns that it is for.
+    """A reward that was learnt from preferences. origin: robot, task and columns that it is for.
 
     About 0 at the poorest and 1 at the best of the states it was learnt on.
     """
 
-    def __init__(self, network: RewardNetwork, meta: CheckpointMeta) -> None:
-        self.network, self.meta = network.eval(), meta
-        self._widths = len(meta.joint_names), len(meta.environment_state_names), len(meta.joint_names)
+    def __init__(self, network: RewardNetwork, origin: Origin) -> None:
+        self.network, self.origin = network.eval(), origin
+        self._widths = len(origin.joint_names), len(origin.environment_state_names), len(origin.joint_names)
 
     @classmethod
     def load(cls, path: Path) -> LearnedReward:
@@ -54,20 +51,20 @@ class LearnedReward:
         config = read_config(path)
         if config["type"] != PREFERENCE:
             raise ManipError(f"{path} is of type {checks.shorten(config['type'])}; expected a reward, {PREFERENCE!r}")
-        meta = read_meta(path)
-        if meta is None:
+        origin = read_origin(path)
+        if origin is None:
             raise ManipError(f"{path} does not say for which robot and task it is: manip_il.json is missing")
         width = sum(_width(path, config, key) for key in INPUTS)
-        reward = cls(_read_network(path, config, width), meta)
+        reward = cls(_read_network(path, config, width), origin)
         if width != sum(reward._widths):
             raise MismatchError("width of the inputs", str(path / CONFIG), width, "manip_il.json", sum(reward._widths))
         return reward
 
     def check_fits(self, name: str, spec: RobotTaskSpec) -> None:
         """Raise `MismatchError` unless a dataset's columns, and its task, are those of this reward. name: of it."""
-        if self.meta.task != spec.task:
-            raise MismatchError("task", "the reward", self.meta.task, name, spec.task)
-        check_fits(self.meta, spec)
+        if self.origin.task != spec.task:
+            raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
+        self.origin.check_fits(spec)
 
     def __call__(self, states: F32, environment_states: F32, actions: F32) -> F32:
         """Return the reward of every row, (B,); see `Reward`. Raises `MismatchError` for other widths."""
@@ -104,15 +101,11 @@ def _width(path: Path, config: dict[str, Any], key: str) -> int:
 
 def _read_network(path: Path, config: dict[str, Any], width: int) -> RewardNetwork:
     try:
-        ways = tuple(map(tuple, checks.array("ways", config.get("ways"), MOST_WAYS)))
-        unread = tuple(checks.array("unread", config.get("unread", []), MOST_INPUTS))
+        lists: dict[str, Any] = {name: tuple(checks.array(name, config.get(name, []))) for name in ("ways", "unread")}
         sizes: dict[str, Any] = {name: config.get(name) for name in ("members", "width", "depth")}
-        shape = RewardShape(**sizes, ways=ways, unread=unread, logarithms=config.get("logarithms", False))
-        with Budget(path / WEIGHTS):
-            network = RewardNetwork(width, shape)
-        tensors = load_file(path / WEIGHTS)
-        network.load_state_dict({name.removeprefix(_PREFIX): value for name, value in tensors.items()})
-    except (ManipError, SafetensorError, OSError, RuntimeError, TypeError) as error:
-        line = " ".join(str(error).split())
-        raise ManipError(f"{path} cannot be read: {line[:300]}") from error
+        shape = RewardShape(**sizes, **lists, logarithms=bool(config.get("logarithms", False)))
+        network = RewardNetwork(width, shape)
+        network.load_state_dict(read_weights(path))
+    except (ManipError, RuntimeError) as error:
+        raise ManipError(f"{path} cannot be read: {checks.one_line(error)}") from error
     return network

@@ -1,4 +1,4 @@
-"""Samples of datasets: numbers in memory, pictures decoded before, or when they are drawn.
+"""The samples of a fit in memory: numbers as tables, pictures decoded once.
 
 LeRobot's policies say by `*_delta_indices` which frames around a sample's own they want: its window. A frame outside of
 the episode is the nearest one inside, and `<column>_is_pad` says so.
@@ -7,8 +7,7 @@ the episode is the nearest one inside, and `<column>_is_pad` says so.
 from __future__ import annotations
 
 import hashlib
-import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,19 +17,17 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
-from manip_il.data.camera import Camera
 from manip_il.data.dataset import Dataset, joined_columns
-from manip_il.data.lerobot_layout import STATS
-from manip_il.data.schema import ACTION, LABEL_VALID
-from manip_il.errors import ManipError, UsageError
-from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, require_finite, split_by_episode, valid_frames
-from manip_il.learn.fit_config import FitConfig
+from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, STATS, TASK_INDEX, TIMESTAMP
+from manip_il.data.lerobot_library import learn_actions
+from manip_il.data.schema import ACTION, LABEL_VALID, STATE
+from manip_il.errors import ManipError, NotFiniteError, UsageError
 
-_LOG = logging.getLogger(__name__)
 I64 = NDArray[np.int64]
+Table = Mapping[str, NDArray[Any]]
 Batch = dict[str, Any]  # as LeRobot's DataLoader gives it: tensors, and `task` as a list of text
-TASK, TASK_INDEX = "task", "task_index"
-_ALWAYS = (EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, "timestamp")  # LeRobot's own columns
+TASK = "task"
+_ALWAYS = (EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP)  # LeRobot's own columns
 _MAX_HELD_OUT = 1_024  # samples that a validation looks at
 
 
@@ -52,18 +49,16 @@ class Windows:
         object.__setattr__(self, "_first", np.repeat(starts, ends - starts))
         object.__setattr__(self, "_last", np.repeat(ends - 1, ends - starts))
 
-    def rows(self, samples: I64, key: str) -> tuple[I64, NDArray[np.bool_]]:
-        """Return row numbers (B, K) of one column's frames, and which are padding beyond the episode (B, K)."""
-        wanted = samples[:, None] + self.deltas[key]
-        inside = np.clip(wanted, self._first[samples, None], self._last[samples, None])
-        return inside, inside != wanted
+    def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
+        """Return the rows of one column's frames (B, K), and by LeRobot's name which are padding (B, K).
 
-    def padded_rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
-        """Return `rows` with the padding by LeRobot's name; without a window the samples (B,), and no padding."""
+        Without a window the samples themselves (B,), and no padding.
+        """
         if key not in self.deltas:
             return samples, {}
-        rows, padded = self.rows(samples, key)
-        return rows, {f"{key}_is_pad": torch.from_numpy(padded)}
+        wanted = samples[:, None] + self.deltas[key]
+        inside = np.clip(wanted, self._first[samples, None], self._last[samples, None])
+        return inside, {f"{key}_is_pad": torch.from_numpy(inside != wanted)}
 
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
         """Return the samples to learn from (S,): every label in the window is sound, `drop_last` frames left out.
@@ -72,11 +67,8 @@ class Windows:
         `ManipError` where nothing is left.
         """
         samples = np.flatnonzero(np.arange(len(valid)) + drop_last <= self._last)
-        if ACTION in self.deltas:
-            rows, _ = self.rows(samples, ACTION)
-            samples = samples[valid[rows].all(axis=1)]
-        else:
-            samples = samples[valid[samples]]
+        sound = valid[self.rows(samples, ACTION)[0]]
+        samples = samples[sound if sound.ndim == 1 else sound.all(axis=1)]
         if len(samples) == 0:
             raise ManipError(f"none of {len(valid)} frames has valid labels in its whole window: nothing to learn from")
         return samples
@@ -99,12 +91,19 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
     return Windows(episodes, deltas)
 
 
-class JoinedFrames:
-    """The pictures of several datasets as one array (N, 3, H, W) of which rows are read, without copying the rest."""
+class Pictures:
+    """The decoded pictures of several datasets as one array (N, 3, H, W) of which rows are read."""
 
-    def __init__(self, pieces: Sequence[NDArray[np.uint8] | Camera]):
+    def __init__(self, pieces: Sequence[NDArray[np.uint8]]):
         self._pieces = pieces
         self._ends = np.cumsum([len(piece) for piece in pieces])
+
+    @classmethod
+    def decode(
+        cls, datasets: Sequence[Dataset], camera: str, on_frames: Callable[[int], None] | None = None
+    ) -> Pictures:
+        """Decode one camera of datasets. on_frames: sees how many frames more have been decoded."""
+        return cls([dataset.camera(camera).decode(on_frames) for dataset in datasets])
 
     def __getitem__(self, rows: I64) -> NDArray[np.uint8]:
         if len(self._pieces) == 1:
@@ -119,131 +118,92 @@ class JoinedFrames:
 
 
 @dataclass(frozen=True)
-class SampleSource:
+class Samples:
     """A batch is one gather a column.
 
-    columns: numbers, (N, d) or (N,), by LeRobot's names. frames: camera column -> uint8 (N, 3, H, W). tasks: LeRobot's
-    text of every `task_index`. workers: processes that read the pictures ahead; None reads them here, out of memory.
+    columns: numbers, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8 (N, 3, H, W). tasks: text of
+    every `task_index`, (M,).
     """
 
     windows: Windows
     columns: Mapping[str, torch.Tensor]
-    frames: Mapping[str, JoinedFrames]
-    tasks: tuple[str, ...]
-    workers: int | None = None
-
-    def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
-        """Return one batch for every array of sample numbers, (B,), in that order; pictures are uint8."""
-        if self.workers is None or not self.frames:
-            return (self.batch(one) for one in samples)
-        loader = torch.utils.data.DataLoader(
-            _Pictures(self.windows, self.frames),
-            batch_size=None,
-            sampler=samples,
-            num_workers=self.workers,
-            multiprocessing_context="spawn" if self.workers else None,  # decoders do not survive a fork
-            generator=torch.Generator(),  # else it draws from the global one, and a resumed run would differ
-        )
-        return (self._numbers(one.numpy()) | pictures for one, pictures in loader)
+    pictures: Mapping[str, Pictures]
+    tasks: NDArray[np.object_]
 
     def batch(self, samples: I64) -> Batch:
-        """Return the batch of these samples, (B,)."""
-        return self._numbers(samples) | _Pictures(self.windows, self.frames)[samples][1]
-
-    def _numbers(self, samples: I64) -> Batch:
+        """Return the batch of these samples, (B,); pictures are uint8."""
         batch: Batch = {}
         for key, values in self.columns.items():
-            rows, padded = self.windows.padded_rows(samples, key)
+            rows, padded = self.windows.rows(samples, key)
             batch[key] = values[torch.from_numpy(rows)]
             batch |= padded
-        batch[TASK] = [self.tasks[int(i)] for i in batch[TASK_INDEX]]
+        for key, pictures in self.pictures.items():
+            rows, padded = self.windows.rows(samples, key)
+            batch[key] = torch.from_numpy(pictures[rows])
+            batch |= padded
+        batch[TASK] = self.tasks[batch[TASK_INDEX].numpy()].tolist()
         return batch
 
 
 @dataclass(frozen=True)
-class _Pictures(torch.utils.data.Dataset[tuple[I64, Batch]]):
-    """The samples (B,) with their pictures, for `DataLoader`."""
+class TrainingData:
+    """The data of one fit. train, held_out: samples; table: columns that are learnt from; digest: of all of it."""
 
-    windows: Windows
-    frames: Mapping[str, JoinedFrames]
-
-    def __getitem__(self, samples: I64) -> tuple[I64, Batch]:
-        batch: Batch = {}
-        for key, values in self.frames.items():
-            rows, padded = self.windows.padded_rows(samples, key)
-            batch[key] = torch.from_numpy(values[rows])
-            batch |= padded
-        return samples, batch
-
-
-@dataclass(frozen=True)
-class Samples:
-    """The data of one fit. train, held_out: sample numbers; digest: of everything that is learnt from."""
-
-    source: SampleSource
+    samples: Samples
     train: I64
     held_out: I64
-    cameras: tuple[str, ...]
+    table: Table
     digest: str
 
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The columns that are pictures."""
+        return tuple(self.samples.pictures)
 
-def load_samples(
+
+def load_data(
     roots: Sequence[Path],
     policy: PreTrainedConfig,
-    config: FitConfig,
     meta: Any,
+    *,
+    eval_split: float,
+    seed: int,
+    encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]] | None = None,
     on_frames: Callable[[int], None] | None = None,
-) -> Samples:
+) -> TrainingData:
     """Return the samples of datasets, taken as one, for a policy that has its features.
 
-    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'.
-    on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and what `windows_of` and
-    `Windows.usable` raise.
+    meta: LeRobot's metadata of the datasets. encode: of actions (N, n) and states (N, n), where others are learnt than
+    the datasets'. on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and what `windows_of`
+    and `Windows.usable` raise.
     """
     features = [*(policy.input_features or {}), ACTION]
-    cameras = tuple(key for key in features if key in meta.camera_keys)
+    cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
     table = joined_columns(roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
-    if meta.learnt_actions is not None:
-        table[ACTION] = meta.learnt_actions
     require_finite(table, numbers)
-    episodes = table[EPISODE_INDEX].astype(np.int64).reshape(-1)
+    if encode is not None:
+        learn_actions(meta, encode(table[ACTION].astype(np.float32), table[STATE]))
+        table[ACTION] = meta.learnt_actions
+    episodes = table[EPISODE_INDEX].astype(np.int64)
     windows = windows_of(policy, features, episodes)
     usable = windows.usable(valid_frames(table), getattr(policy, "drop_n_last_frames", 0))
-    train, held_out = split_by_episode(episodes[usable], config.eval_split, config.seed)
-    limit = int(config.image_cache_gb * 1e9)
-    frames = _frames(roots, cameras, limit, on_frames)
-    workers = None
-    if frames is None:
-        names, workers = ", ".join(map(str, roots)), config.num_workers
-        _LOG.warning("the pictures of %s take more than %g GB: they are decoded on the fly", names, limit / 1e9)
-        frames = read_later(roots, cameras)
-    columns = {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)}
-    source = SampleSource(windows, columns, frames, tuple(map(str, meta.tasks.index)), workers)
+    train, held_out = split_by_episode(episodes[usable], eval_split, seed)
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
-    return Samples(source, usable[train], usable[held_out], cameras, _digest(roots, table))
-
-
-def _frames(
-    roots: Sequence[Path], cameras: Sequence[str], limit: int, on_frames: Callable[[int], None] | None
-) -> dict[str, JoinedFrames] | None:
-    """The decoded pictures of every camera in all datasets; None where they would take more than `limit` bytes."""
     opened = [Dataset.open(root) for root in roots]
-    found = {key: [dataset.camera(key) for dataset in opened] for key in cameras}
-    if sum(one.nbytes for each in found.values() for one in each) > limit:
-        return None
-    return {key: JoinedFrames([one.decode(on_frames) for one in each]) for key, each in found.items()}
+    samples = Samples(
+        windows,
+        {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)},
+        {key: Pictures.decode(opened, key, on_frames) for key in cameras},
+        np.array([*map(str, meta.tasks.index)], object),
+    )
+    return TrainingData(samples, usable[train], usable[held_out], table, _digest(roots, table))
 
 
-def read_later(roots: Sequence[Path], cameras: Sequence[str]) -> dict[str, JoinedFrames]:
-    """Return the pictures of every camera in all datasets, which are decoded when they are read."""
-    return {camera: JoinedFrames([Dataset.open(root).camera(camera) for root in roots]) for camera in cameras}
-
-
-def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:
+def _digest(roots: Sequence[Path], table: Table) -> str:
     """SHA-256 of the columns and of the datasets' statistics, which stand for the pictures."""
     digest = hashlib.sha256()
     for root in roots:
@@ -253,3 +213,39 @@ def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:
         digest.update(key.encode())
         digest.update(np.ascontiguousarray(column))
     return digest.hexdigest()
+
+
+def require_finite(table: Table, keys: Sequence[str]) -> None:
+    """Raise `NotFiniteError` naming column, row, episode and frame unless all values of these columns are finite."""
+    for key in keys:
+        values = np.asarray(table[key])
+        rows = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+        if len(rows) == 0:
+            continue
+        row = int(rows[0])
+        place = [f"row {row}"]
+        for name, column in (("episode", EPISODE_INDEX), ("frame", FRAME_INDEX)):
+            if column in table:
+                place.append(f"{name} {int(np.asarray(table[column]).reshape(-1)[row])}")
+        raise NotFiniteError(f"column {key}, {', '.join(place)}: {values[row]} is not finite")
+
+
+def valid_frames(table: Table) -> NDArray[np.bool_]:
+    """Return whether each frame takes part in the loss, (N,): all do where no column says otherwise."""
+    if LABEL_VALID not in table:
+        return np.ones(len(table[ACTION]), dtype=bool)
+    return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
+
+
+def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
+    """Return the rows (of N) to train on and to hold out: about `fraction` of the episodes (N,), whole ones.
+
+    Nothing is held out where that would be less than half an episode or all of them.
+    """
+    names = np.unique(episodes)
+    count = round(fraction * len(names))
+    if not 0 < count < len(names):
+        return np.arange(len(episodes)), np.arange(0)
+    held_out = np.random.default_rng([seed, 1]).permutation(names)[:count]
+    mask = np.isin(episodes, held_out)
+    return np.flatnonzero(~mask), np.flatnonzero(mask)

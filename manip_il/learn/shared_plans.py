@@ -1,4 +1,4 @@
-"""Plans of diffusion policies for many episodes in one call of the network: an eighth of the time a plan.
+"""Plans of a diffusion policy for many episodes in one call of the network: an eighth of the time a plan.
 
 In its last bits a row's plan depends on how many rows there are and which of them it is, not on what the others hold.
 So every call has `ROWS` rows, and an episode's number says which is its own: its plan is the same bits whatever runs
@@ -10,94 +10,66 @@ from __future__ import annotations
 import contextlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.policies.utils import populate_queues
+from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
 
 ROWS = 25  # of the episodes that run in lockstep, whose numbers follow each other: each has a row to itself
 
 
-@dataclass
-class Turn:
-    """One episode's step: its number, a generator of its own, its memory, and what it observes (1, ...)."""
-
-    episode: int
-    generator: torch.Generator
-    memory: Any
-    observation: Mapping[str, Any]
-
-
-class _Asked(Exception):
-    def __init__(self, batch: dict[str, Tensor]):
-        self.batch = batch
-
-
-class _Desk:
-    """Stands for an episode's network: hands out the plan that was made for it, else raises what it was asked."""
-
-    plan: Tensor | None = None
-
-    def __call__(self, batch: dict[str, Tensor], noise: Tensor | None = None) -> Tensor:
-        if self.plan is None:
-            raise _Asked(batch)
-        plan, self.plan = self.plan, None
-        return plan
-
-
 class SharedPlans:
-    """Makes the plans of episodes whose memories are copies of one policy."""
+    """The actions of LeRobot's `DiffusionPolicy` in many episodes: as its `select_action` has them, row by row."""
 
     def __init__(self, policy: PreTrainedPolicy):
-        self._policy: Any = policy  # LeRobot's DiffusionPolicy
+        self._policy: Any = policy
+        self._queues: dict[int, dict[str, Any]] = {}  # of every episode: past observations, and planned actions
 
-    def serve(self, memory: Any) -> None:
-        """Have an episode's memory, a copy of the policy, take its plans from here."""
-        memory.diffusion.generate_actions = _Desk()
+    def forget(self, episode: int) -> None:
+        """Drop the memory of an episode."""
+        self._queues.pop(episode, None)
 
-    def make(self, turns: Sequence[Turn]) -> None:
-        """Make a plan for every episode that has come to the end of its last one."""
-        waiting: dict[int, list[tuple[Turn, dict[str, Tensor]]]] = defaultdict(list)
-        for turn in turns:
-            if not turn.memory._queues[ACTION]:
-                waiting[turn.episode % ROWS].append((turn, _question(turn)))
+    def select(
+        self, observed: Mapping[str, Any], episodes: Sequence[int], generators: Sequence[torch.Generator]
+    ) -> Tensor:
+        """Return an action a row (B, n), not yet in the data's units. generators: of each row, for what is drawn."""
+        batch = {key: value for key, value in observed.items() if isinstance(value, Tensor)}
+        if images := self._policy.config.image_features:
+            batch[OBS_IMAGES] = torch.stack([batch[key] for key in images], dim=-4)
+        waiting: dict[int, list[tuple[int, torch.Generator]]] = defaultdict(list)
+        for i, episode in enumerate(episodes):
+            if episode not in self._queues:
+                self._policy.reset()
+                self._queues[episode] = self._policy._queues
+            queues = populate_queues(self._queues[episode], {key: value[i : i + 1] for key, value in batch.items()})
+            if not queues[ACTION]:
+                waiting[episode % ROWS].append((episode, generators[i]))
         while waiting:
-            block = {row: asked.pop(0) for row, asked in waiting.items()}
+            self._plan({row: asked.pop(0) for row, asked in waiting.items()})
             waiting = defaultdict(list, {row: asked for row, asked in waiting.items() if asked})
-            self._plan(block)
+        return torch.cat([self._queues[episode][ACTION].popleft() for episode in episodes])
 
-    def _plan(self, block: Mapping[int, tuple[Turn, dict[str, Tensor]]]) -> None:
+    def _plan(self, block: Mapping[int, tuple[int, torch.Generator]]) -> None:
+        """Make the plans of the episodes in these rows, each with its generator."""
         model, config = self._policy.diffusion, self._policy.config
-        _, first = next(iter(block.values()))
-        batch = {key: value.new_zeros((ROWS, *value.shape[1:])) for key, value in first.items()}
-        device = next(model.parameters()).device
-        generators = [torch.Generator(device) for _ in range(ROWS)]
-        for row, (turn, asked) in block.items():
-            generators[row] = turn.generator
-            for key, value in asked.items():
-                batch[key][row] = value[0]
-        shape, dtype = (config.horizon, *config.action_feature.shape), next(model.parameters()).dtype
-        noise = [torch.randn(shape, generator=one, device=device, dtype=dtype) for one in generators]
+        weight = next(model.parameters())
+        generators = [torch.Generator(weight.device) for _ in range(ROWS)]
+        batch: dict[str, Tensor] = {}
+        for row, (episode, generator) in block.items():
+            generators[row] = generator
+            for key, past in self._queues[episode].items():
+                if key != ACTION:
+                    asked = torch.stack(list(past), dim=1)
+                    batch.setdefault(key, asked.new_zeros((ROWS, *asked.shape[1:])))[row] = asked[0]
+        shape = (config.horizon, *config.action_feature.shape)
+        noise = [torch.randn(shape, generator=one, device=weight.device, dtype=weight.dtype) for one in generators]
         with _drawing_from(model.noise_scheduler, generators):
             plans = model.generate_actions(batch, noise=torch.stack(noise))
-        for row, (turn, _) in block.items():
-            turn.memory.diffusion.generate_actions.plan = plans[row : row + 1]
-
-
-def _question(turn: Turn) -> dict[str, Tensor]:
-    """Return what an episode's network would be asked now; its memory stays as it is."""
-    policy = turn.memory
-    queues = {key: queue.copy() for key, queue in policy._queues.items()}
-    try:
-        policy.select_action(dict(turn.observation))
-    except _Asked as asked:
-        return asked.batch
-    finally:
-        policy._queues = queues
-    raise AssertionError("a policy with nothing planned asked for no plan")
+        for row, (episode, _) in block.items():
+            self._queues[episode][ACTION].extend(plans[row : row + 1].transpose(0, 1))
 
 
 @contextlib.contextmanager

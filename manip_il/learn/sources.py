@@ -6,15 +6,16 @@ weights are then free to change without changing the units in which a policy see
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.dataset import UNKNOWN_TASK
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.schema import RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.fit_config import check_weights
@@ -26,18 +27,30 @@ F64, I64 = NDArray[np.float64], NDArray[np.int64]
 class Sources:
     """Datasets in the order in which their frames are numbered.
 
-    frames: of each. weights: the share of the samples drawn from each, relative to the others; none where every frame
-    is drawn alike. Raises `UsageError` for what `check_weights` refuses.
+    weights: the share of the samples drawn from each, relative to the others; none where every frame is drawn alike.
+    Raises `UsageError` for what `check_weights` refuses.
     """
 
-    roots: tuple[Path, ...]
-    frames: tuple[int, ...]
+    datasets: tuple[Dataset, ...]
     weights: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         check_weights(self.roots, self.weights)
-        if len(self.frames) != len(self.roots):
-            raise MismatchError("datasets", "their folders", len(self.roots), "their frames", len(self.frames))
+
+    @cached_property
+    def roots(self) -> tuple[Path, ...]:
+        """The datasets' folders."""
+        return tuple(dataset.root for dataset in self.datasets)
+
+    @property
+    def spec(self) -> RobotTaskSpec:
+        """The first dataset's spec, with which the others agree."""
+        return self.datasets[0].spec
+
+    @property
+    def looks(self) -> list[dict[str, Any] | None]:
+        """The light of each dataset's pictures, see `recorded_look`."""
+        return [recorded_look(one.provenance, one.fingerprint) for one in self.datasets]
 
     def row_weights(self, rows: I64) -> F64 | None:
         """Return how often each of the rows (S,) that are drawn from is drawn, relative to the others, (S,).
@@ -47,18 +60,25 @@ class Sources:
         """
         if not self.weights:
             return None
-        which = np.searchsorted(np.cumsum(self.frames), rows, side="right")
-        counts = np.bincount(which, minlength=len(self.roots))
+        which = np.searchsorted(np.cumsum([*map(len, self.datasets)]), rows, side="right")
+        counts = np.bincount(which, minlength=len(self.datasets))
         if (counts == 0).any():
             empty = self.roots[int(np.argmin(counts))]
             raise ManipError(f"{empty} has no sample to learn from, but a weight; leave it out, or hold out less of it")
         return (np.asarray(self.weights) / counts)[which]
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return folder, frames and weight (None: by frames) of every dataset."""
-        weights = self.weights or (None,) * len(self.roots)
-        columns = zip(self.roots, self.frames, weights, strict=True)
-        return [{"root": str(root), "frames": frames, "weight": weight} for root, frames, weight in columns]
+        """Return name, frames and weight (None: by frames) of every dataset."""
+        weights = self.weights or (None,) * len(self.datasets)
+        return [
+            {"name": one.root.resolve().name, "frames": len(one), "weight": weight}
+            for one, weight in zip(self.datasets, weights, strict=True)
+        ]
+
+    def check_alike(self, *, pictures: bool, language: bool) -> None:
+        """Raise `MismatchError` unless the datasets can be learnt from as one; see `check_same_sources`."""
+        specs = [dataset.spec for dataset in self.datasets]
+        check_same_sources(self.roots, specs, pictures=pictures, language=language)
 
 
 def check_same_sources(
@@ -76,3 +96,14 @@ def check_same_sources(
             left, right = getattr(specs[0], name), getattr(spec, name)
             if left != right and UNKNOWN_TASK not in (left, right):
                 raise MismatchError(name, str(roots[0]), left, str(root), right)
+
+
+def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the light in which a dataset's pictures were made, as arguments of `sim.look.Look`; {} is the default.
+
+    None where that is not known: another program's dataset, or one without pictures.
+    """
+    if "cameras_sha256" not in fingerprint:
+        return None
+    rendered = provenance.get("rendered", {}).get("cameras", {})  # `record` has the default light alone
+    return dict(rendered.get("look", {}))

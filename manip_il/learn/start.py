@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors.torch import load_file
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import make_pre_post_processors
 
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for
-from manip_il.learn.checkpoint import check_fits, read_meta
-from manip_il.learn.fit_config import EE_DELTA, MLP, FitConfig
+from manip_il.learn.action_steps import add_steps, is_in_processors
+from manip_il.learn.checkpoint import EE_DELTA, MLP, Checkpoint
+from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
-from manip_il.learn.network import fit_statistics
-from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.pretrained import WEIGHTS, check_interface, mlp_options, read_config, read_interface
-from manip_il.learn.train import new_policy
+from manip_il.learn.network import fit_statistics, read_weights
 from manip_il.learn.transitions import F32
 
 _GAUSSIAN = "gaussian"
@@ -31,19 +31,17 @@ def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec)
     """
     if start is None:
         return conversion_for(space or EE_DELTA, spec)
-    kind = read_config(start)["type"]
-    if kind != MLP:
-        raise UsageError(f"{start} is a policy of type {kind!r}; expected an mlp, whose actions have a density")
-    loss = (mlp_options(start) or {})["loss"]
-    if loss not in _CENTRED:
+    checkpoint = Checkpoint.open(start)
+    if checkpoint.kind != MLP:
+        raise UsageError(
+            f"{start} is a policy of type {checkpoint.kind!r}; expected an mlp, whose actions have a density"
+        )
+    if (loss := checkpoint.config["loss"]) not in _CENTRED:
         raise UsageError(f"{start} was trained with loss {loss!r}; expected one of {', '.join(_CENTRED)}")
-    if (meta := read_meta(start)) is not None:
-        check_fits(meta, spec)
-    interface = read_interface(start)
-    check_interface(interface, spec)
-    if space not in (None, interface.space):
-        raise MismatchError("action space", str(start), interface.space, "--action_space", space)
-    return conversion_for(interface.space, spec)
+    checkpoint.check_fits(spec)
+    if space not in (None, checkpoint.space):
+        raise MismatchError("action space", str(start), checkpoint.space, "--action_space", space)
+    return conversion_for(checkpoint.space, spec)
 
 
 def start_policy(
@@ -53,16 +51,37 @@ def start_policy(
 
     A clone keeps its own units, and acts as it did.
     """
-    options = {"type": MLP} if start is None else dict(mlp_options(start) or {})
-    fit = FitConfig(policy={**options, "loss": _GAUSSIAN}, action_space=space, seed=seed)
-    policy = new_policy(LeRobotFit(fit, spec.action_meaning), spec)
-    if start is None:
-        if rows is None:
-            raise UsageError("no demonstrations and no policy to begin with; give --dataset.root=DIR or --init=RUN")
+    options = None if start is None else Checkpoint.open(start).mlp_options
+    fit = FitConfig(policy={**(options or {"type": MLP}), "loss": _GAUSSIAN}, action_space=space, seed=seed)
+    policy = _new_policy(LeRobotFit(fit, spec.action_meaning), spec)
+    if start is not None:
+        policy.model.load_state_dict({**policy.model.state_dict(), **read_weights(start)})
+    elif rows is not None:
         policy.model.set_statistics(fit_statistics(*rows, _GAUSSIAN))
-        return policy
-    LearnedPolicy.load(start)  # which refuses what is not whole
-    saved = {name.removeprefix("model."): tensor for name, tensor in load_file(start / WEIGHTS).items()}
-    ours = policy.model.state_dict()
-    policy.model.load_state_dict({**{name: ours[name] for name in ours if name not in saved}, **saved})
+    else:
+        raise UsageError("no demonstrations and no policy to begin with; give --dataset.root=DIR or --init=RUN")
     return policy
+
+
+def _new_policy(lerobot: LeRobotFit, spec: RobotTaskSpec) -> MLPPolicy:
+    """An mlp for data of `spec`, with weights drawn from the fit's seed."""
+    n, k = len(spec.joint_names), len(spec.environment_state_names)
+    config = lerobot.policy
+    config.input_features = {STATE: PolicyFeature(type=FeatureType.STATE, shape=(n,))}
+    if k:
+        config.input_features[ENVIRONMENT_STATE] = PolicyFeature(type=FeatureType.ENV, shape=(k,))
+    config.output_features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n,))}
+    with torch.random.fork_rng(devices=[]):  # torch initialises layers from its global generator: lend it one
+        torch.manual_seed(lerobot.config.seed)
+        return MLPPolicy(config)  # pyright: ignore[reportArgumentType]
+
+
+def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:
+    """Write configuration, weights and processors of an mlp to a new folder, as LeRobot has them."""
+    folder.mkdir()
+    policy.save_pretrained(folder)
+    processors = make_pre_post_processors(policy.config)
+    if is_in_processors(policy.config.type, conversion):
+        add_steps(*processors, conversion)
+    for processor in processors:
+        processor.save_pretrained(folder)

@@ -1,40 +1,45 @@
-"""Training of the mlp: the whole table is a tensor, in memory or mapped into it, a batch is one `index_select`.
+"""Behaviour cloning with any policy of LeRobot's or ours: its optimiser and schedule, its processors, its checkpoints.
 
-A loop of its own beside `fit_policy`'s: with LeRobot's processors, prefetching and accelerator around each step the mlp
-takes a quarter fewer samples a second (32,000 for 42,000 in batches of 512, one busy core), and initialisation, order
-of updates and schedule are others, so that runs begun here would not resume to the same bits.
+The data are in memory, so that a batch is one gather a column; a batch is a function of seed and step alone.
 """
 
 from __future__ import annotations
 
-import copy
+import contextlib
 import hashlib
-import json
 import math
-import shutil
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
-from lerobot.policies.factory import make_pre_post_processors
+from accelerate import Accelerator
+from accelerate.state import AcceleratorState
+from accelerate.utils import DistributedDataParallelKwargs
+from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
+from lerobot.configs import PreTrainedConfig
+from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
-from safetensors.torch import load_file
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
-from manip_il.errors import NotFiniteError
-from manip_il.learn.action_spaces import ARM, GRIPPER, JOINT_DELTAS, Conversion, conversion_for
-from manip_il.learn.action_steps import add_steps, is_in_processors
-from manip_il.learn.batches import order_of
-from manip_il.learn.checkpoint import (
+from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.learn.action_spaces import conversion_for
+from manip_il.learn.action_steps import is_in_processors
+from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
+from manip_il.learn.checkpoint import JOINT_TARGET, OWN_SPACE, Origin
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_config import LeRobotFit, without_places
+from manip_il.learn.lerobot_policy import build_policy, build_processors
+from manip_il.learn.metrics import Writer, metric_writers
+from manip_il.learn.samples import I64, Batch, load_data
+from manip_il.learn.sources import Sources
+from manip_il.learn.threads import threads
+from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
-    TRAINING_STATE,
-    CheckpointMeta,
     check_same_run,
     last_checkpoint,
     read_step,
@@ -42,252 +47,254 @@ from manip_il.learn.checkpoint import (
     unpublished,
     write_own_files,
 )
-from manip_il.learn.columns import Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
-from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.lerobot_config import LeRobotFit
-from manip_il.learn.limits import threads
-from manip_il.learn.metrics import metric_writers
-from manip_il.learn.mlp.configuration_mlp import MLPConfig
-from manip_il.learn.mlp.modeling_mlp import MLPPolicy
-from manip_il.learn.network import fit_statistics, warm_start
-from manip_il.learn.sources import Sources
 
-WARMUP_STEPS, WEIGHT_DECAY, GRAD_CLIP_NORM = 100, 1e-4, 10.0
-# Do not change the weights that come out at the end (threads: only in the last bits).
-_FREE_ON_RESUME = ("threads", "log_freq", "save_freq", "init_from")
-
-
-def fit(
-    table: Table,
-    config: FitConfig,
-    output_dir: Path,
-    *,
-    spec: RobotTaskSpec,
-    fingerprint: Mapping[str, Any] | None = None,
-    on_log: Callable[[dict[str, Any]], None] | None = None,
-    resume: bool = False,
-    weights: NDArray[np.float64] | None = None,
-    sources: Sources | None = None,
-    repo_id: str = "local/table",
-) -> Path:
-    """Clone the labels of `table` and return `output_dir/checkpoints/last/pretrained_model`.
-
-    table: the schema's `observation.state`, `observation.environment_state`, `action` and, where
-    there, `label_valid`, `episode_index`, `frame_index`. weights: how often each frame is drawn, relative
-    to the others, (N,); by default each once an epoch, or as `sources`, the datasets of the table, have it.
-    Statistics are those of all frames learnt from, each counted once. repo_id: what Weights & Biases calls the
-    data. The same table, config and number of threads give the same bits, resumed or not. Metrics go
-    to `on_log`, `metrics.jsonl`, and where the config says.
-    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data or a loss that
-    is not finite, `MismatchError` for a table that does not fit `spec` or a run that is resumed on other data or
-    options, and what `conversion_for` raises.
-    """
-    output_dir = Path(output_dir)
-    checkpoint = last_checkpoint(output_dir, resume=resume)
-    check_table(table, spec)
-    lerobot = LeRobotFit(config, spec.action_meaning)
-    conversion = conversion_for(lerobot.action_space, spec)
-    rows = learning_rows(table, conversion)
-    drawn = weights[valid_frames(table)] if weights is not None else _drawn(table, rows, config, sources)
-    options = _options(lerobot)
-    data = sources.to_json() if sources else ()
-    meta = CheckpointMeta.of(spec, fingerprint, options, datasets=data, action_space=conversion.space)
-    digest = _digest(rows, drawn)
-    key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
-    with threads(config.threads):
-        if checkpoint is not None:
-            check_same_run(checkpoint, digest, json.loads(json.dumps(key["options"])))
-        trainer = Trainer(rows, lerobot, spec, checkpoint, drawn, conversion)
-        pipeline = lerobot.pipeline(repo_id, None, output_dir)
-        with metric_writers(output_dir, trainer.step, config.tensorboard, pipeline) as writers:
-            for record in trainer.run():
-                for write in writers if record else []:
-                    write(record)
-                if record and on_log is not None:
-                    on_log(record)
-                if trainer.step % config.steps_per_checkpoint == 0 or trainer.step == config.total_steps:
-                    trainer.save(output_dir, meta, key)
-    return output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
+_HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
 class Trainer:
-    """Policy, optimiser and encoded data of one run; `run()` yields once a step."""
+    """Policy, processors, optimiser and data of one run that clones the labels of datasets.
+
+    spec, fingerprint, look: see `Origin.of`; by default those of the first dataset. weights: how often each frame is
+    drawn, relative to the others, (N,); by default each once an epoch, or as `sources` has it. on_frames: sees how many
+    pictures more have been decoded. On one CPU the same data, config and threads give the same bits, resumed or not.
+    Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step.
+
+    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is resumed
+    on other data or options, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.
+    """
 
     def __init__(
         self,
-        rows: Rows,
-        lerobot: LeRobotFit,
-        spec: RobotTaskSpec,
-        checkpoint: Path | None = None,
+        sources: Sources,
+        config: FitConfig,
+        output_dir: Path,
+        *,
+        spec: RobotTaskSpec | None = None,
+        fingerprint: Mapping[str, Any] | None = None,
+        look: Mapping[str, Any] | None = None,
+        resume: bool = False,
+        on_frames: Callable[[int], None] | None = None,
         weights: NDArray[np.float64] | None = None,
-        conversion: Conversion = JOINT_DELTAS,
-    ) -> None:
-        config, self.conversion = lerobot.config, conversion
-        self.steps, self.batch_size, self.log_freq = config.total_steps, config.samples_per_step, config.log_freq
-        self.peak_lr = lerobot.optimizer().lr
-        self.step = 0
-        train, held_out = split_by_episode(rows.episodes, config.eval_split, config.seed)
-        self.policy = new_policy(lerobot, spec)
-        network = self.policy.model
-        network.set_statistics(fit_statistics(rows.inputs, rows.targets, network.loss, train))
-        self.policy.to(self.policy.config.device)
-        self.optimizer = torch.optim.AdamW(
-            self.policy.parameters(), lr=self.peak_lr, weight_decay=WEIGHT_DECAY, fused=True
+    ):
+        first, spec = sources.datasets[0], spec or sources.spec
+        self.config, self.output_dir, self.lerobot = config, output_dir, LeRobotFit(config, spec.action_meaning)
+        conversion = conversion_for(self.lerobot.action_space, spec)
+        self.conversion = conversion if is_in_processors(self.lerobot.policy.type, conversion) else None
+        self.accelerator = _accelerator(self.lerobot.policy)
+        self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
+        checkpoint = last_checkpoint(output_dir, resume=resume)
+        self.meta: Any = read_metadata(*sources.roots)
+        self.lerobot.set_features(self.meta.features, config.inputs(first.root, first.info))
+        self._check_widths()
+        self.data = load_data(
+            sources.roots,
+            self.lerobot.policy,
+            self.meta,
+            eval_split=config.eval_split,
+            seed=config.seed,
+            encode=self.conversion.encode if self.conversion else None,
+            on_frames=on_frames,
         )
+        self.meta.table = self.data.table
+        drawn = weights[self.data.train] if weights is not None else sources.row_weights(self.data.train)
+        self.digest = self.data.digest
+        if drawn is not None:
+            self.digest = hashlib.sha256(self.digest.encode() + drawn.tobytes()).hexdigest()
+        self.options = self.lerobot.resume_options()
         if checkpoint is not None:
-            with readable_state(checkpoint):
-                self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
-                load_optimizer_state(self.optimizer, checkpoint / TRAINING_STATE)
-            self.step = read_step(checkpoint)["step"]
-        elif config.init_from is not None:
-            warm_start(network, config.init_from)
-        self.width = rows.inputs.shape[1]
-        # One tensor [x | y], so that a batch is one gather of whole rows.
-        self.data, self.held_out = (self._encoded(rows, part) for part in (train, held_out))
-        device = self.policy.config.device
-        self.held_out_inputs = torch.from_numpy(rows.inputs[held_out]).to(device)
-        self.held_out_targets = torch.from_numpy(rows.targets[held_out]).to(device)
-        drawn = weights[train] if weights is not None else None
-        self.order = order_of(len(train), drawn, self.batch_size, config.seed)
+            check_same_run(checkpoint, self.digest, self.options)
+        self.origin = Origin.of(
+            spec,
+            first.fingerprint if fingerprint is None else fingerprint,
+            self.options,
+            config.observes,
+            sources.looks[0] if look is None else look,
+            sources.to_json(),
+            conversion.space,
+        )
+        self.pipeline = self.lerobot.pipeline(self.meta.repo_id, sources.roots[-1], output_dir)
+        self.steps, self.batch_size, self.step = config.total_steps, config.samples_per_step, 0
+        with threads(config.threads):
+            self._build(checkpoint)
+        world = self.accelerator.num_processes
+        self._order = order_of(len(self.data.train), drawn, self.batch_size * world, config.seed)
 
-    def _encoded(self, rows: Rows, wanted: NDArray[np.int64]) -> torch.Tensor:
-        """Encoded inputs and targets of some rows, (S, n + k + n)."""
-        network, device = self.policy.model, self.policy.config.device
-        inputs, targets = (torch.from_numpy(one[wanted]).to(device) for one in (rows.inputs, rows.targets))
-        return torch.cat([network.encode(inputs), network.encode_targets(targets)], dim=1)
+    def _check_widths(self) -> None:
+        """Raise `MismatchError` unless an action has a measured joint for each number, which a delta needs."""
+        space, policy = self.lerobot.action_space, self.lerobot.policy
+        action, state = ((policy.output_features or {})[ACTION], (policy.input_features or {})[STATE])
+        if space != JOINT_TARGET and action.shape != state.shape:
+            raise MismatchError(f"width, for {space},", ACTION, action.shape, STATE, state.shape)
+
+    def _build(self, checkpoint: Path | None) -> None:
+        config = self.lerobot.policy
+        set_seed(self.config.seed)
+        before = checkpoint / PRETRAINED_MODEL if checkpoint is not None else None
+        policy = build_policy(config, self.meta, before)
+        self.preprocessor, self.postprocessor = build_processors(
+            config, self.meta, before, trust=self.config.trust, conversion=self.conversion
+        )
+        preset = self.lerobot.optimizer()
+        self._clip = preset.grad_clip_norm if preset.grad_clip_norm > 0 else math.inf
+        optimizer = preset.build(policy.get_optim_params())
+        if not isinstance(optimizer, torch.optim.Optimizer):
+            raise UsageError(f"--policy.type={config.type} needs several optimisers; train it with lerobot-train")
+        schedule = self.lerobot.scheduler()
+        scheduler = schedule.build(optimizer, self.steps) if schedule is not None else None
+        if checkpoint is not None:
+            read_step(checkpoint)
+            with readable_state(checkpoint):
+                self.step, optimizer, scheduler = load_training_state(checkpoint, optimizer, scheduler)
+        self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
+        self.unwrapped = self.accelerator.unwrap_model(self.policy)  # of the processes that share a batch
+
+    def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
+        """Take the steps that are left, with metrics and checkpoints; return the last one's `pretrained_model`.
+
+        on_step: called after every step, with the metrics where there are some, else with {}; an exception from it ends
+        the fit, `KeyboardInterrupt` after a checkpoint. Raises `NotFiniteError` for a loss that is not finite.
+        """
+        main = self.accelerator.is_main_process
+        metrics = metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
+        with threads(self.config.threads), metrics if main else contextlib.nullcontext(list[Writer]()) as writers:
+            for record in self.run():
+                for write in writers if record else []:
+                    write(record)
+                saved = self.step % self.config.steps_per_checkpoint == 0 or self.step == self.steps
+                if saved:
+                    self.save()
+                try:
+                    if on_step is not None:
+                        on_step(record)
+                except KeyboardInterrupt:  # by the user, between two steps: nothing is lost
+                    if not saved:
+                        self.save()
+                    raise
+        self.accelerator.end_training()
+        return self.output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
+        samples_per_step = self.batch_size * self.accelerator.num_processes
+        since, started, waited, sums = self.step, time.perf_counter(), 0.0, defaultdict[str, float](float)
+        batches = (self.batch(step) for step in range(self.step, self.steps))
         self.policy.train()
-        since, started, total = self.step, time.perf_counter(), 0.0
-        while self.step < self.steps:
-            total += self._update()
-            self.step += 1
-            if self.step % self.log_freq and self.step != self.steps:
-                yield {}
-                continue
-            steps, seconds = self.step - since, time.perf_counter() - started
-            record = {"step": self.step, "loss": total / steps, "lr": self.optimizer.param_groups[0]["lr"]}
-            record["samples_per_s"] = round(steps * self.batch_size / max(seconds, 1e-9))
-            yield record | self.validate()
-            since, started, total = self.step, time.perf_counter(), 0.0
+        # ahead only where there are pictures: a thread costs more than a gather of numbers
+        with prefetched(batches) if self.data.cameras else contextlib.nullcontext(batches) as ready:
+            while self.step < self.steps:
+                asked = time.perf_counter()
+                batch = next(ready)
+                waited += time.perf_counter() - asked
+                for name, value in self._update(batch).items():
+                    sums[name] += value
+                self.step += 1
+                if self.step % self.config.log_freq and self.step != self.steps:
+                    yield {}
+                    continue
+                steps, seconds = self.step - since, max(time.perf_counter() - started, 1e-9)
+                record = {
+                    "step": self.step,
+                    **{name: total / steps for name, total in sums.items()},
+                    "samples_per_s": round(steps * samples_per_step / seconds, 1),
+                    "data_share": round(waited / seconds, 4),
+                    "lr": self._lr(),
+                }
+                since, started, waited, sums = self.step, time.perf_counter(), 0.0, defaultdict[str, float](float)
+                yield record | self.validate()
 
-    def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return encoded inputs (B, n + k) and targets (B, n) of one step."""
-        rows = self.data.index_select(0, self.order.batch(step).to(self.data.device))
-        return rows[:, : self.width], rows[:, self.width :]
+    def batch(self, step: int) -> Batch:
+        """Return the samples of this process at a step, as they are stored."""
+        size, place = self.batch_size, self.accelerator.process_index
+        rows = self._order.batch(step).numpy()[place * size : (place + 1) * size]
+        return self.data.samples.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:
-        """Return loss on the held-out episodes, and the mean absolute errors of acting: arm [rad], gripper [m]."""
-        if len(self.held_out) == 0:
-            return {}
-        network = self.policy.model
-        with torch.no_grad():
-            loss = network.row_losses(self.held_out[:, : self.width], self.held_out[:, self.width :]).mean()
-            relative = network.relative(network.act(self.held_out_inputs), self.held_out_inputs)
-            error = (relative - self.held_out_targets).abs().mean(0)
-        return {
-            "val_loss": loss.item(),
-            "val_arm_error": error[ARM].mean().item(),
-            "val_gripper_error": error[GRIPPER].item(),
-        }
+        """Return mean loss on samples of the held-out episodes, without touching the training's random state.
 
-    def save(self, output_dir: Path, meta: CheckpointMeta, resume_key: Mapping[str, Any]) -> None:
-        """Write a checkpoint of this step, make it the last one and remove those before.
-
-        resume_key: what a resumed run must share with this one (JSON values).
+        Beside `val_loss`, the numbers that the policy gives with it. Every process looks at all of them.
         """
-        final = output_dir / "checkpoints" / f"{self.step:06d}"
-        with unpublished(final) as new:
-            state = new / TRAINING_STATE
-            save_policy(self.policy, self.conversion, new / PRETRAINED_MODEL)
-            state.mkdir()
-            save_optimizer_state(self.optimizer, state)
-            write_own_files(new, meta, {"step": self.step, **resume_key})
-        for other in final.parent.iterdir():
-            if not other.is_symlink() and other.name != final.name:
-                shutil.rmtree(other, ignore_errors=True)
+        held_out, size = self.data.held_out, self.config.samples_per_step
+        if len(held_out) == 0:
+            return {}
+        policy = self.unwrapped
+        policy.eval()
+        sums = defaultdict[str, float](float)
+        with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
+            torch.manual_seed(self.config.seed)  # a policy that draws (diffusion) draws the same every time
+            for start in range(0, len(held_out), size):
+                rows: I64 = held_out[start : start + size]
+                batch = pictures_to_float(self.data.samples.batch(rows), self.data.cameras)
+                loss, outputs = policy.forward(self.preprocessor(batch))
+                for name, value in (_numbers(outputs) | {"loss": loss.item()}).items():
+                    sums[f"val_{name}"] += value * len(rows) / len(held_out)
+        policy.train()
+        return dict(sums)
 
-    def _update(self) -> float:
-        x, y = self.batch(self.step)
-        loss = self.policy.model.row_losses(x, y).mean()
+    def save(self) -> None:
+        """Write a checkpoint of this step and make it the last one."""
+        if self.accelerator.is_main_process:
+            own = {"data": self.digest, "options": self.options, "batch_size": self.batch_size}
+            with unpublished(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
+                state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
+                save_checkpoint(new, self.step, without_places(self.pipeline), self.unwrapped, *state, *processors)
+                write_own_files(new, self.origin, read_step(new) | own)
+        self.accelerator.wait_for_everyone()
+
+    def _update(self, batch: Batch) -> dict[str, float]:
+        batch = self.preprocessor(self._augmented(batch))
+        with self.accelerator.autocast():
+            loss, outputs = self.policy.forward(batch)
         value = loss.item()
         if not math.isfinite(value):
-            raise NotFiniteError(f"the loss is {value} at step {self.step}; lower lr (now {self.peak_lr})")
-        self.optimizer.param_groups[0]["lr"] = lr_at(self.step, self.steps, self.peak_lr)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), GRAD_CLIP_NORM)
+            raise NotFiniteError(f"the loss is {value} at step {self.step}; lower the learning rate ({self._lr():g})")
+        self.accelerator.backward(loss)
+        norm = self.accelerator.clip_grad_norm_(self.policy.parameters(), self._clip)
         self.optimizer.step()
-        return value
+        self.optimizer.zero_grad()
+        if self.scheduler is not None:
+            self.scheduler.step()
+        if callable(update := getattr(self.unwrapped, "update", None)):
+            update()  # averages of weights and the like, as lerobot-train calls it
+        return _numbers(outputs) | {"loss": value, "grad_norm": math.nan if norm is None else float(norm)}
+
+    def _augmented(self, batch: Batch) -> Batch:
+        """Put pictures on the device, shifted and recoloured by draws that depend on seed, step and process alone."""
+        cameras, augment = self.data.cameras, self.lerobot.augment
+        batch = batch | {key: batch[key].to(self.accelerator.device, non_blocking=True) for key in cameras}
+        if augment is None:
+            return pictures_to_float(batch, cameras)
+        generator = generator_of(self.config.seed, self.step, self.accelerator.process_index)
+        return batch | {camera: augment(batch[camera], generator) for camera in cameras}
+
+    def _lr(self) -> float:
+        return float(self.optimizer.param_groups[0]["lr"])
 
 
-def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:
-    """Write configuration, weights and processors of an mlp to a new folder, as LeRobot has them."""
-    folder.mkdir()
-    policy.save_pretrained(folder)
-    processors = make_pre_post_processors(policy.config)
-    if is_in_processors(policy.config.type, conversion):
-        add_steps(*processors, conversion)
-    for processor in processors:
-        processor.save_pretrained(folder)
+def fit(sources: Sources, config: FitConfig, output_dir: Path, **settings: Any) -> Path:
+    """Fit a policy to datasets and return its `pretrained_model` folder; arguments and errors are `Trainer`'s."""
+    return Trainer(sources, config, output_dir, **settings).fit()
 
 
-def lr_at(step: int, steps: int, peak: float) -> float:
-    """Return the learning rate of an update, from 0 to `steps` - 1: linear warm-up, then a cosine down to zero."""
-    warmup = min(WARMUP_STEPS, steps // 10)
-    if step < warmup:
-        return peak * (step + 1) / (warmup + 1)
-    return peak * 0.5 * (1.0 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+def _numbers(outputs: Mapping[str, Any] | None) -> dict[str, float]:
+    return {name: float(value) for name, value in (outputs or {}).items() if isinstance(value, int | float)}
 
 
-def _drawn(table: Table, rows: Rows, config: FitConfig, sources: Sources | None) -> NDArray[np.float64] | None:
-    """Weights of the R rows, (R,), where the datasets have weights; 0 for rows that are held out."""
-    if sources is None or not sources.weights:
-        return None
-    train, _ = split_by_episode(rows.episodes, config.eval_split, config.seed)
-    drawn = np.zeros(len(rows.episodes))
-    drawn[train] = sources.row_weights(np.flatnonzero(valid_frames(table))[train])
-    return drawn
+def _on_this_cpu() -> str:
+    """Half precision where the processor has it, else single."""
+    return "bf16" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "no"  # pyright: ignore[reportPrivateUsage]
 
 
-def new_policy(lerobot: LeRobotFit, spec: RobotTaskSpec) -> MLPPolicy:
-    """Return an mlp for data of `spec`, with weights drawn from the fit's seed."""
-    n, k = len(spec.joint_names), len(spec.environment_state_names)
-    policy_config = copy.deepcopy(lerobot.policy)
-    assert isinstance(policy_config, MLPConfig)
-    policy_config.input_features = {STATE: PolicyFeature(type=FeatureType.STATE, shape=(n,))}
-    if k:
-        policy_config.input_features[ENVIRONMENT_STATE] = PolicyFeature(type=FeatureType.ENV, shape=(k,))
-    policy_config.output_features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n,))}
-    # torch initialises layers from its global generator: lend it one of our own.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(lerobot.config.seed)
-        return MLPPolicy(policy_config)
-
-
-def _options(lerobot: LeRobotFit) -> dict[str, Any]:
-    """The options that a checkpoint names, as JSON knows them."""
-    config = lerobot.config
-    return {
-        "steps": config.total_steps,
-        "batch_size": config.samples_per_step,
-        "lr": config.peak_lr,
-        "warmup_steps": WARMUP_STEPS,
-        "weight_decay": WEIGHT_DECAY,
-        "grad_clip_norm": GRAD_CLIP_NORM,
-        "val_fraction": config.eval_split,
-        "seed": config.seed,
-        "threads": config.threads,
-        "log_freq": config.log_freq,
-        "save_freq": config.steps_per_checkpoint,
-        "init_from": str(config.init_from) if config.init_from else None,
-        "policy": draccus.encode(lerobot.policy),
-    }
-
-
-def _digest(rows: Rows, weights: NDArray[np.float64] | None) -> str:
-    digest = hashlib.sha256()
-    for column in (rows.inputs, rows.targets, rows.episodes, *([weights] if weights is not None else [])):
-        digest.update(np.ascontiguousarray(column))
-    return digest.hexdigest()
+def _accelerator(policy: PreTrainedConfig) -> Accelerator:
+    """As lerobot-train makes it: half precision by the policy's `dtype`, else by its `use_amp`."""
+    precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
+    if not hasattr(policy, "dtype") and policy.use_amp:
+        precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
+    if not torch.distributed.is_initialized():  # accelerate keeps the precision of a process's first fit
+        AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
+    ours = policy.type in OWN_SPACE  # their buffers are units of the data, which do not change
+    return Accelerator(
+        step_scheduler_with_optimizer=False,
+        mixed_precision=precision,
+        cpu=policy.device == "cpu",
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=not ours, broadcast_buffers=not ours)],
+    )

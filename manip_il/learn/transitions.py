@@ -25,9 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
 from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
-from manip_il.learn.columns import EPISODE_INDEX, Table, require_finite
+from manip_il.learn.samples import Table, require_finite
 from manip_il.mdp import Actor
 
 F32 = NDArray[np.float32]

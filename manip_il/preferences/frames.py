@@ -15,7 +15,7 @@ from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.columns import require_finite
+from manip_il.learn.samples import require_finite
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 _ROUNDS = "round_*/dataset"  # of a run

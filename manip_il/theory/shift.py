@@ -24,9 +24,9 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.dataset import joined_columns
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
-from manip_il.learn.columns import EPISODE_INDEX
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds

@@ -85,8 +85,8 @@ def test_a_run_leaves_policies_that_act_and_the_best_of_them(config, tmp_path):
     best = tmp_path / "best" / "pretrained_model"
     assert (results[best_validation(found) - 1].number) == best_validation(found)
     policy = LearnedPolicy.load(best)
-    assert policy.interface.space == "ee_delta"
-    k = policy.interface.numbers["observation.environment_state"]
+    assert policy.checkpoint.space == "ee_delta"
+    k = policy.checkpoint.numbers["observation.environment_state"]
     assert policy.act(np.zeros((1, 8), np.float32), np.zeros((1, k), np.float32)).shape == (1, 8)
     assert results[-1].steps >= config.steps
     card = (tmp_path / "checkpoints" / "last" / "pretrained_model" / "README.md").read_text()
@@ -107,7 +107,7 @@ def test_until_the_warm_up_is_over_a_clone_acts_as_it_did(config, cloned, tmp_pa
     second, third = run(config, tmp_path / "warm", count=2)[-1], run(config, tmp_path / "moved", count=3)[-1]
     assert second.policy != third.policy
     rng = np.random.default_rng(0)
-    k = LearnedPolicy.load(cloned).interface.numbers["observation.environment_state"]
+    k = LearnedPolicy.load(cloned).checkpoint.numbers["observation.environment_state"]
     seen = rng.normal(size=(5, 8)).astype(np.float32), rng.normal(size=(5, k)).astype(np.float32)
     before, warm, moved = (LearnedPolicy.load(one).act(*seen) for one in (cloned, second.policy, third.policy))
     assert np.array_equal(before, warm)

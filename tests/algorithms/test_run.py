@@ -21,7 +21,6 @@ from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.errors import MismatchError
 from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
@@ -75,7 +74,7 @@ def test_the_numbers_of_a_round_are_those_of_its_data(run):
     assert [result.beta for result in results] == [1.0, 0.5]
     assert [result.episodes for result in results] == [4, 6]
     for result in results:
-        table = joined_columns(datasets(folder, result.round), LEARNING_COLUMNS)
+        table = joined_columns(datasets(folder, result.round), ("observation.state", "action", "label_valid"))
         assert result.labels == table["label_valid"].sum()
         record = result.to_json()
         assert record["validation_success"] == result.validation.success.rate
@@ -111,7 +110,9 @@ def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
     table = Dataset.open(folder / "dataset").columns(("action", "executed_action", "actor", "round", "episode_index"))
     round_, actor = table["round"].ravel(), table["actor"].ravel()
     assert len(np.unique(table["episode_index"])) == 6
-    np.testing.assert_array_equal(table["action"], joined_columns(datasets(folder, 1), LEARNING_COLUMNS)["action"])
+    np.testing.assert_array_equal(
+        table["action"], joined_columns(datasets(folder, 1), ("observation.state", "action", "label_valid"))["action"]
+    )
     assert set(actor[round_ == 0]) == {Actor.EXPERT}
     np.testing.assert_array_equal(table["action"][round_ == 0], table["executed_action"][round_ == 0])
     assert {Actor.LEARNER} < set(actor[round_ == 1])
@@ -199,13 +200,14 @@ def test_a_run_goes_on_with_the_same_datasets_only(run, tmp_path):
 def test_a_run_begins_with_a_policy_and_goes_on_from_its_weights(run, tmp_path, monkeypatch, with_data: bool):
     folder, before, _ = run
     begun: list[Path | None] = []
-    plain = fitting.fit_table
+    plain = fitting.round_fit
 
-    def watch(config, table, into, fit, *rest):
+    def watch(config, *rest):
+        fit = plain(config, *rest)
         begun.append(fit.init_from)
-        return plain(config, table, into, fit, *rest)
+        return fit
 
-    monkeypatch.setattr(fitting, "fit_table", watch)
+    monkeypatch.setattr(fitting, "round_fit", watch)
     start = before[1].policy
     config = replace(CONFIG, start=start, datasets=tuple(datasets(folder, 0)) if with_data else (), beta=ALONE)
     results = list(run_algorithm(config, tmp_path, Engine()))

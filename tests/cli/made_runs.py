@@ -16,7 +16,7 @@ from manip_il.data import schema
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
-from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
 
@@ -49,7 +49,7 @@ def make_episode(spec: RobotTaskSpec, seed: int, length: int) -> Episode:
 def make_policy(folder: Path, env: EnvConfig = ENV) -> Path:
     """A policy that acts, badly."""
     spec = env_spec(env)
-    return write_checkpoint(folder, "act", spec, meta=CheckpointMeta.of(spec, env_fingerprint(env)))
+    return write_checkpoint(folder, "act", spec, origin=Origin.of(spec, env_fingerprint(env)))
 
 
 def mark(policy: Path, words: str) -> Path:

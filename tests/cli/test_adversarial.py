@@ -10,7 +10,7 @@ import pytest
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
 from manip_il.data.dataset import Dataset
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.sim.env import EnvConfig
 
 from ..learn.tiny_policies import write_checkpoint
@@ -50,7 +50,7 @@ def test_a_policy_that_cannot_be_gone_on_from_is_refused(kind, robot, says, here
     own = Dataset.open(SAMPLE).spec
     env = EnvConfig("fetch" if (robot == "same") == (own.robot == "fetch") else "panda", own.task)
     spec = env_spec(env)
-    write_checkpoint(here / "policy", kind, spec, meta=CheckpointMeta.of(spec, {}))
+    write_checkpoint(here / "policy", kind, spec, origin=Origin.of(spec, {}))
     assert main(["gail", f"--dataset.root={SAMPLE}", "--init=policy", "--quiet"]) != 0
     assert says in error()
 

@@ -11,7 +11,7 @@ from manip_il.cli.main import main
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data.schema import STATE
 from manip_il.evaluation.results import EvalResult
-from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig, ManipEnv
 
@@ -37,8 +37,8 @@ def act(tmp_path) -> Path:
 def seeing(tmp_path) -> Path:
     """A policy of the front camera in dim light."""
     spec = env_spec(ENV, DIM)
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV, DIM), observation="images", look=asdict(DIM.look))
-    return write_checkpoint(tmp_path / "policy", "act", spec, "images", meta=meta)
+    meta = Origin.of(spec, env_fingerprint(ENV, DIM), observation="images", look=asdict(DIM.look))
+    return write_checkpoint(tmp_path / "policy", "act", spec, "images", origin=meta)
 
 
 def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, capsys):

@@ -14,7 +14,7 @@ import pytest
 import manip_il.cli.export as command
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.policy_files import policy_sha256
 from manip_il.sim.env import EnvConfig
@@ -31,9 +31,9 @@ WITHOUT = "import sys; sys.modules |= dict.fromkeys({names})\n"
 def write_run(folder: Path, kind: str = "mlp", observation: str = "state") -> Path:
     """A run with a policy where `train` leaves it; returns that policy's folder."""
     spec = SPEC if observation == "state" else replace(SPEC, cameras=("front",), image_size=(32, 48))
-    meta = CheckpointMeta.of(spec, observation=observation)
+    meta = Origin.of(spec, observation=observation)
     place = folder / "checkpoints" / "last" / "pretrained_model"
-    return write_checkpoint(place, kind, spec, observation, meta=meta)
+    return write_checkpoint(place, kind, spec, observation, origin=meta)
 
 
 @pytest.mark.parametrize(("format_", "name"), [("onnx", "policy.onnx"), ("torchscript", "policy.pt")])

@@ -19,7 +19,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.errors import MismatchError
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig, ManipEnv
@@ -40,8 +40,8 @@ def act(tmp_path_factory) -> Path:
 def seeing(tmp_path_factory) -> Path:
     """A policy of the front camera, in dim light."""
     spec = env_spec(ENV, DIM)
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV, DIM), observation="images", look={"brightness": 0.5})
-    return write_checkpoint(tmp_path_factory.mktemp("seeing"), "act", spec, "images", meta=meta)
+    meta = Origin.of(spec, env_fingerprint(ENV, DIM), observation="images", look={"brightness": 0.5})
+    return write_checkpoint(tmp_path_factory.mktemp("seeing"), "act", spec, "images", origin=meta)
 
 
 def lerobots_rollout(checkpoint: Path, seed: int, cameras: CameraConfig | None = None) -> np.ndarray:

@@ -77,23 +77,6 @@ def test_no_room_for_decoded_pictures_is_one_line(roots, monkeypatch):
         Dataset.open(roots["image"]).camera(FRONT).decode()
 
 
-def test_processes_of_their_own_read_the_same(roots):
-    import torch
-
-    from manip_il.learn.samples import SampleSource, Windows, read_later
-
-    root = roots["video"]
-    whole = Dataset.open(root).camera(WRIST).decode()
-    rows = np.arange(len(whole))
-    numbers = {"task_index": torch.zeros(len(rows), dtype=torch.int64)}
-    windows = Windows(np.zeros(len(rows), np.int64), {WRIST: np.array([-1, 0])})
-    source = SampleSource(windows, numbers, read_later([root], [WRIST]), ("a",), workers=1)
-    batches = list(source.batches(np.array_split(rows, 4)))
-    pictures = torch.cat([batch[WRIST] for batch in batches]).numpy()
-    np.testing.assert_array_equal(pictures, whole[np.stack([np.maximum(rows - 1, 0), rows], axis=1)])
-    assert batches[0][f"{WRIST}_is_pad"][:2].tolist() == [[True, False], [False, False]]
-
-
 def test_what_is_not_there_is_one_line(roots, tmp_path, two):
     import shutil
 

@@ -17,7 +17,7 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled, summary_lines
 from manip_il.evaluation.certify import certify, count_episodes, draw_moment
 from manip_il.evaluation.intervals import wilson_interval
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.events import NOTICEABLE, Perturbation
@@ -173,8 +173,8 @@ def test_an_expert_that_is_given_no_time_is_told_so():
 def policy(tmp_path_factory) -> Path:
     """An untrained one, which solves nothing."""
     env = EnvConfig("fetch", "reach", horizon=60)
-    meta = CheckpointMeta.of(env_spec(env), env_fingerprint(env))
-    return write_checkpoint(tmp_path_factory.mktemp("policy"), "act", env_spec(env), meta=meta)
+    meta = Origin.of(env_spec(env), env_fingerprint(env))
+    return write_checkpoint(tmp_path_factory.mktemp("policy"), "act", env_spec(env), origin=meta)
 
 
 def test_the_expert_goes_on_from_where_a_learner_left_it(policy: Path):

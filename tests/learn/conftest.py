@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -8,12 +9,16 @@ import numpy as np
 import pytest
 import torch
 
+from manip_il.data.dataset import Dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec, features
-from manip_il.learn.checkpoint import CheckpointMeta
-from manip_il.learn.columns import LEARNING_COLUMNS
-from manip_il.learn.limits import threads
+from manip_il.learn.checkpoint import Origin
+from manip_il.learn.sources import Sources
+from manip_il.learn.threads import threads
+from manip_il.mdp import Episode
 
 N, K, EPISODES, LENGTH = 4, 6, 12, 20
+Table = dict[str, np.ndarray]
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +40,12 @@ def spec() -> RobotTaskSpec:
     )
 
 
-def make_table(seed: int = 0) -> dict[str, np.ndarray]:
+@pytest.fixture
+def pictured(spec) -> RobotTaskSpec:
+    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48), video=False)
+
+
+def make_table(seed: int = 0) -> Table:
     """A smooth expert over random states; `e2` never moves."""
     rng = np.random.default_rng(seed)
     rows = EPISODES * LENGTH
@@ -50,41 +60,52 @@ def make_table(seed: int = 0) -> dict[str, np.ndarray]:
         "action": action.astype(np.float32),
         "label_valid": np.ones((rows, 1), np.int64),
         "episode_index": np.repeat(np.arange(EPISODES), LENGTH),
-        "frame_index": np.tile(np.arange(LENGTH), EPISODES),
     }
 
 
 @pytest.fixture
-def table() -> dict[str, np.ndarray]:
+def table() -> Table:
     return make_table()
 
 
-def make_gapped() -> dict[str, np.ndarray]:
-    table = make_table()
+@pytest.fixture
+def gapped(table) -> Table:
+    """The table with a tenth of its labels invalid."""
     table["label_valid"][::10] = 0
     return table
 
 
+def write_table(table: Mapping[str, np.ndarray], root: Path, spec: RobotTaskSpec) -> Sources:
+    """A dataset on disk, what the table lacks being zeros, pictures noise."""
+    rng = np.random.default_rng(0)
+    episodes = []
+    for number in np.unique(table["episode_index"]):
+        rows = table["episode_index"] == number
+        columns: dict[str, Any] = {}
+        for key, feature in features(spec).items():
+            shape = (int(rows.sum()), *feature["shape"])
+            if feature["dtype"] in ("image", "video"):
+                columns[key] = rng.integers(256, size=shape, dtype=np.uint8)
+            else:
+                values = table[key][rows] if key in table else np.zeros(shape)
+                columns[key] = values.reshape(shape).astype(feature["dtype"])
+        episodes.append(Episode(int(number), columns, success=True, success_at_end=True))
+    write_dataset(episodes, root, spec, repo_id=f"local/{root.name}", fingerprint={"mujoco": "3.11"})
+    return Sources((Dataset.open(root),))
+
+
 @pytest.fixture
-def gapped() -> dict[str, np.ndarray]:
-    """The table with a tenth of its labels invalid."""
-    return make_gapped()
+def write(tmp_path, spec):
+    """Writes a table as a dataset, by a name."""
+    return lambda table, name="data", spec=spec: write_table(table, tmp_path / name, spec)
 
 
 @pytest.fixture(scope="session")
-def dataset(spec, tmp_path_factory):
-    """A LeRobot dataset of the learning columns of the table with a tenth of its labels invalid."""
-    from lerobot.datasets import LeRobotDataset
-
-    table, root = make_gapped(), tmp_path_factory.mktemp("lerobot") / "dataset"
-    columns = {key: value for key, value in features(spec).items() if key in LEARNING_COLUMNS}
-    made = LeRobotDataset.create("manip/test", spec.fps, columns, root=root, use_videos=False)
-    for row in range(EPISODES * LENGTH):
-        made.add_frame({key: table[key][row] for key in columns} | {"task": spec.instruction})
-        if row % LENGTH == LENGTH - 1:
-            made.save_episode()
-    made.finalize()
-    return LeRobotDataset("manip/test", root=root)
+def dataset(spec, tmp_path_factory) -> Sources:
+    """The table with a tenth of its labels invalid, on disk."""
+    table = make_table()
+    table["label_valid"][::10] = 0
+    return write_table(table, tmp_path_factory.mktemp("lerobot") / "dataset", spec)
 
 
 @pytest.fixture
@@ -92,12 +113,7 @@ def act(spec, tmp_path) -> Path:
     """A checkpoint of LeRobot's `act`."""
     from .tiny_policies import write_checkpoint
 
-    return write_checkpoint(tmp_path / "policy", "act", spec, meta=CheckpointMeta.of(spec))
-
-
-@pytest.fixture
-def pictured(spec) -> RobotTaskSpec:
-    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
+    return write_checkpoint(tmp_path / "policy", "act", spec, origin=Origin.of(spec))
 
 
 class Curves:
@@ -124,12 +140,14 @@ def curves(tmp_path, monkeypatch) -> Curves:
     return Curves()
 
 
-@pytest.fixture
-def weights():
+def read(path: Path) -> dict[str, torch.Tensor]:
     """The tensors of a `pretrained_model` folder."""
     from safetensors.torch import load_file
 
-    def read(path) -> dict[str, torch.Tensor]:
-        return load_file(path / "model.safetensors")
+    return load_file(path / "model.safetensors")
 
+
+@pytest.fixture
+def weights():
+    """The tensors of a `pretrained_model` folder."""
     return read

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from manip_il.algorithms.vector_env import ActionRange, Lockstep
 from manip_il.learn.adversarial_config import PPOConfig
-from manip_il.learn.network import MLPNetwork, Shape, Statistics
+from manip_il.learn.network import MLPNetwork, Shape
 from manip_il.learn.ppo import Learner, lent_generators
 
 STEPS, EPISODES = 10, 8
@@ -39,10 +40,8 @@ class Point:
 
 def network() -> MLPNetwork:
     made = MLPNetwork(3, 2, Shape(32, 2, "silu", "gaussian", 1, 2, 10.0, action_space="joint_target"))
-    statistics = vars(Statistics.identity(3, 2))
-    for name in ("mean", "scale", "low", "high"):
-        statistics[f"target_{name}"].copy_(_tensor(getattr(ACTIONS, name)))
-    made.set_statistics(Statistics(**statistics))
+    names = ("mean", "scale", "low", "high")
+    made.set_statistics({f"target_{name}": torch.from_numpy(getattr(ACTIONS, name)) for name in names})
     return made
 
 
@@ -52,9 +51,3 @@ def learner(seed: int = 0, ends: bool = True, **options: float) -> tuple[Learner
         env = Lockstep([Point(ends) for _ in range(EPISODES)], ACTIONS, STEPS)
         config = PPOConfig(**{"minibatches": 4, **options})
         return Learner(network(), config, env, STEPS, log_std=-0.5), env
-
-
-def _tensor(values: np.ndarray):
-    import torch
-
-    return torch.from_numpy(values)

@@ -14,22 +14,22 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.schema import ACTION, STATE, RobotTaskSpec, features
+from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.action_spaces import JointTarget, conversion, conversion_for, same_width
-from manip_il.learn.checkpoint import META_FILE
-from manip_il.learn.columns import LEARNING_COLUMNS
+from manip_il.learn.action_spaces import Conversion, conversion, conversion_for
+from manip_il.learn.checkpoint import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, META_FILE
 from manip_il.learn.export import export_torchscript
-from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, FitConfig
-from manip_il.learn.fit_policy import PolicyTrainer
+from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.train import fit
+from manip_il.learn.sources import Sources
+from manip_il.learn.train import Trainer, fit
 from manip_il.robots import robot as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import get_robot
 from manip_il.robots.servos import LeRobotConfig
 
 from ..tables import every_large_robot, every_robot
+from .conftest import write_table
 from .tiny_policies import ACT, DIFFUSION, edit_config
 
 every_space = pytest.mark.parametrize("space", ACTION_SPACES)
@@ -68,28 +68,17 @@ def table() -> dict[str, np.ndarray]:
         ACTION: actions.astype(np.float32),
         "label_valid": np.ones((rows, 1), np.int64),
         "episode_index": np.repeat(np.arange(EPISODES), LENGTH),
-        "frame_index": np.tile(np.arange(LENGTH), EPISODES),
     }
 
 
 @pytest.fixture(scope="module")
-def root(panda, table, tmp_path_factory) -> Path:
-    from lerobot.datasets import LeRobotDataset
-
-    folder = tmp_path_factory.mktemp("spaces") / "dataset"
-    columns = {key: value for key, value in features(panda).items() if key in LEARNING_COLUMNS}
-    made = LeRobotDataset.create("local/dataset", panda.fps, columns, root=folder, use_videos=False)
-    for row in range(EPISODES * LENGTH):
-        made.add_frame({key: table[key][row] for key in columns} | {"task": panda.instruction})
-        if row % LENGTH == LENGTH - 1:
-            made.save_episode()
-    made.finalize()
-    return folder
+def sources(panda, table, tmp_path_factory) -> Sources:
+    return write_table(table, tmp_path_factory.mktemp("spaces") / "dataset", panda)
 
 
-def fit_plan(root: Path, folder: Path, spec: RobotTaskSpec, settings: Any, space: str | None, **more: Any):
+def trainer_of(sources: Sources, folder: Path, settings: Any, space: str | None, **more: Any) -> Trainer:
     config = FitConfig(settings, action_space=space, eval_split=0.0, **SMALL, **more)
-    return PolicyTrainer(root, config, folder, spec=spec, resume=folder.is_dir())
+    return Trainer(sources, config, folder, resume=folder.is_dir())
 
 
 @every_robot
@@ -129,11 +118,11 @@ def test_a_hand_motion_is_in_the_worlds_axes_and_a_far_one_is_approached(robot):
 
 
 @every_space
-def test_the_mlp_learns_each_space_from_the_same_table_and_gives_joint_targets(panda, table, tmp_path, space):
+def test_the_mlp_learns_each_space_from_the_same_table_and_gives_joint_targets(table, sources, tmp_path, space):
     config = FitConfig({"width": 64, "depth": 2}, action_space=space, steps=600, batch_size=36, eval_split=0.0)
-    path = fit(table, config, tmp_path, spec=panda)
+    path = fit(sources, config, tmp_path)
     policy = LearnedPolicy.load(path)
-    assert (policy.interface.space, policy.meta and policy.meta.action_space) == (space, space)
+    assert (policy.checkpoint.space, policy.checkpoint.origin.action_space) == (space, space)
     actions = policy.act(table[STATE], table["observation.environment_state"])
     wanted, states = table[ACTION].astype(np.float64), table[STATE].astype(np.float64)
     reached, needed = poses("panda", actions) - poses("panda", wanted), poses("panda", wanted) - poses("panda", states)
@@ -142,10 +131,10 @@ def test_the_mlp_learns_each_space_from_the_same_table_and_gives_joint_targets(p
 
 @every_space
 @pytest.mark.parametrize("settings", [ACT, DIFFUSION], ids=["act", "diffusion"])
-def test_lerobots_own_code_carries_each_space(panda, table, root, tmp_path, space, settings):
-    path = fit_plan(root, tmp_path / "run", panda, settings, space).fit()
+def test_lerobots_own_code_carries_each_space(table, sources, tmp_path, space, settings):
+    path = trainer_of(sources, tmp_path / "run", settings, space).fit()
     policy = LearnedPolicy.load(path)
-    assert (policy.interface.space, policy.meta and policy.meta.action_space) == (space, space)
+    assert (policy.checkpoint.space, policy.checkpoint.origin.action_space) == (space, space)
     config = PreTrainedConfig.from_pretrained(path)
     before, after = make_pre_post_processors(config, str(path))  # as lerobot-eval loads them
     states = torch.from_numpy(table[STATE][:5])
@@ -162,32 +151,32 @@ def test_lerobots_own_code_carries_each_space(panda, table, root, tmp_path, spac
 
 
 @pytest.mark.parametrize("space", [JOINT_DELTA, EE_DELTA])
-def test_every_action_of_a_plan_is_measured_from_its_own_frame(panda, table, root, tmp_path, space):
-    trainer = fit_plan(root, tmp_path / "run", panda, ACT, space)
+def test_every_action_of_a_plan_is_measured_from_its_own_frame(table, sources, tmp_path, space):
+    trainer = trainer_of(sources, tmp_path / "run", ACT, space)
     targets = conversion(space, "panda").encode(table[ACTION], table[STATE])
-    [batch] = trainer.samples.source.batches([np.array([3, 10])])
+    batch = trainer.data.samples.batch(np.array([3, 10]))
     np.testing.assert_array_equal(batch[ACTION][0], targets[3:7])
     np.testing.assert_array_equal(batch[ACTION][1], targets[[10, 11, 11, 11]])  # the episode ends
 
 
-def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_train(panda, root, tmp_path, weights):
+def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_train(sources, tmp_path, weights):
     more = {"observation": "state"}
-    whole = fit_plan(root, tmp_path / "whole", panda, ACT, JOINT_DELTA, **more).fit()
+    whole = trainer_of(sources, tmp_path / "whole", ACT, JOINT_DELTA, **more).fit()
 
     def stop(_record: Any) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_plan(root, tmp_path / "halves", panda, ACT, JOINT_DELTA, **more).fit(stop)
-    halves = fit_plan(root, tmp_path / "halves", panda, ACT, JOINT_DELTA, **more).fit()
+        trainer_of(sources, tmp_path / "halves", ACT, JOINT_DELTA, **more).fit(stop)
+    halves = trainer_of(sources, tmp_path / "halves", ACT, JOINT_DELTA, **more).fit()
     assert all(torch.equal(value, weights(halves)[name]) for name, value in weights(whole).items())
     before, _ = make_pre_post_processors(PreTrainedConfig.from_pretrained(whole), str(whole))
     with pytest.raises(ManipError, match="go on with manip-il train --resume=true"):
         before({STATE: torch.zeros(2, 8), ACTION: torch.zeros(2, 4, 8)})
 
 
-def test_an_action_without_its_steps_joints_is_refused(panda, root, tmp_path):
-    path = fit_plan(root, tmp_path / "run", panda, ACT, JOINT_DELTA).fit()
+def test_an_action_without_its_steps_joints_is_refused(sources, tmp_path):
+    path = trainer_of(sources, tmp_path / "run", ACT, JOINT_DELTA).fit()
     before, after = make_pre_post_processors(PreTrainedConfig.from_pretrained(path), str(path))
     with pytest.raises(ManipError, match=r"joint_delta: .* not \(2, 8\) of None"):
         after(torch.zeros(2, 8))
@@ -196,13 +185,13 @@ def test_an_action_without_its_steps_joints_is_refused(panda, root, tmp_path):
         after(torch.zeros(2, 4, 8))  # a whole plan
 
 
-def test_a_checkpoint_goes_on_in_its_own_space_alone(panda, table, root, tmp_path):
-    path = fit(table, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee", spec=panda)
-    more = LearnedPolicy.load(fit_plan(root, tmp_path / "more", panda, {"path": str(path)}, None).fit())
-    assert (more.interface.space, more.interface.robot) == (EE_DELTA, "panda")
+def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
+    path = fit(sources, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee")
+    more = LearnedPolicy.load(trainer_of(sources, tmp_path / "more", {"path": str(path)}, None).fit())
+    assert (more.checkpoint.space, more.checkpoint.robot) == (EE_DELTA, "panda")
     assert np.isfinite(more.act(table[STATE], table["observation.environment_state"])).all()
     with pytest.raises(MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"):
-        fit_plan(root, tmp_path / "other", panda, {"path": str(path)}, JOINT_DELTA)
+        trainer_of(sources, tmp_path / "other", {"path": str(path)}, JOINT_DELTA)
     with pytest.raises(ManipError, match="holds no inverse kinematics; use joint_delta"):
         export_torchscript(path, "")
     meta = path / META_FILE
@@ -214,8 +203,8 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(panda, table, root, tmp_pat
         LearnedPolicy.load(path)
 
 
-def test_a_checkpoint_from_before_there_was_a_choice_acts_as_it_did(panda, table, tmp_path):
-    path = fit(table, FitConfig({"width": 8}, **SMALL), tmp_path, spec=panda)
+def test_a_checkpoint_from_before_there_was_a_choice_acts_as_it_did(table, sources, tmp_path):
+    path = fit(sources, FitConfig({"width": 8}, **SMALL), tmp_path)
     observed = table[STATE], table["observation.environment_state"]
     acted = LearnedPolicy.load(path).act(*observed)
     for name in ("config.json", META_FILE):
@@ -236,13 +225,11 @@ def test_what_cannot_be_is_refused_in_one_line(panda):
         conversion_for(EE_DELTA, replace(panda, joint_names=("a", "gripper")))
     with pytest.raises(MismatchError, match="meaning of the action differs: the dataset has torques, joint_delta has"):
         conversion_for(JOINT_DELTA, replace(panda, action_meaning="torques"))
-    assert conversion_for(JOINT_TARGET, replace(panda, action_meaning="torques")) == JointTarget()
-    with pytest.raises(MismatchError, match=r"action has \(8,\), observation.state has \(7,\)"):
-        same_width(np.zeros((2, 8)), np.zeros((2, 7)), JOINT_DELTA)
+    assert conversion_for(JOINT_TARGET, replace(panda, action_meaning="torques")) == Conversion()
 
 
-def test_lerobots_own_training_has_no_kinematics(table, root):
-    meta: Any = read_metadata(root)
+def test_lerobots_own_training_has_no_kinematics(table, sources):
+    meta: Any = read_metadata(*sources.roots)
     with pytest.raises(ManipError, match="train with manip-il train"):
         make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
     policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)

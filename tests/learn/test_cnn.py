@@ -21,6 +21,12 @@ from manip_il.learn.losses import LOSSES
 from manip_il.learn.mlp import modeling_mlp
 
 SIDE = 32
+PICTURES = ["observation.images.front", "observation.images.wrist"]
+INPUTS = {
+    "state": ["observation.state", "observation.environment_state"],
+    "images": ["observation.state", *PICTURES],
+    "both": ["observation.state", "observation.environment_state", *PICTURES],
+}
 SMALL = {"channels": (4, 4), "keypoints": 3, "width": 16, "depth": 1, "device": "cpu"}
 
 
@@ -33,13 +39,13 @@ def table(gapped):
 def meta(dataset, spec):
     """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid; it has no videos."""
     pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
-    return SimpleNamespace(features=features(pictured), root=dataset.root, stats={})
+    return SimpleNamespace(features=features(pictured), root=dataset.roots[0], stats={})
 
 
 def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:
     """As LeRobot makes it from a dataset."""
     config = make_policy_config("cnn", **SMALL | options)
-    config.input_features, config.output_features = policy_features(meta.features, observation)
+    config.input_features, config.output_features = policy_features(meta.features, INPUTS[observation])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         policy = make_policy(config, ds_meta=meta)
@@ -223,7 +229,7 @@ def test_features_that_do_not_fit_are_refused_in_one_line(meta):
     with pytest.raises(UsageError, match=r"needs pictures \(observation\.images\.\*\); the inputs are observation"):
         new_policy(meta, observation="state")
     config = CNNConfig(**SMALL)
-    config.input_features, config.output_features = policy_features(meta.features, "images")
+    config.input_features, config.output_features = policy_features(meta.features, INPUTS["images"])
     del config.input_features["observation.state"]
     with pytest.raises(UsageError, match=r"cnn policy needs observation\.state and action"):
         CNNPolicy(config)

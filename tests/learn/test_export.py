@@ -23,11 +23,12 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn import export
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.learn.export import EXTRA_FILE, TOLERANCE, Exported, export_onnx, export_torchscript
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.sources import Sources
 from manip_il.learn.train import fit
 
 from .tiny_policies import edit_config, write_checkpoint
@@ -47,15 +48,14 @@ def sample() -> tuple[RobotTaskSpec, dict[str, NDArray[Any]]]:
 @pytest.fixture(params=LOSSES)
 def mlp(request, tmp_path) -> Path:
     """A few steps of training, so that units, ranges and weights are those of real data."""
-    spec, table = sample()
     config = FitConfig({"loss": request.param, "width": 64}, steps=20, batch_size=32)
-    return fit(table, config, tmp_path / "run", spec=spec)
+    return fit(Sources((Dataset.open(SAMPLE),)), config, tmp_path / "run")
 
 
 def write_cnn(folder: Path, spec: RobotTaskSpec, observation: str = "images", **options: Any) -> Path:
     pictured = replace(spec, cameras=("wrist", "front"), image_size=SIDES)
     return write_checkpoint(
-        folder, "cnn", pictured, observation, meta=CheckpointMeta.of(pictured, observation=observation), **options
+        folder, "cnn", pictured, observation, origin=Origin.of(pictured, observation=observation), **options
     )
 
 
@@ -192,9 +192,9 @@ def test_normalisation_outside_the_network_is_refused(spec, tmp_path):
 
 
 def test_names_that_are_too_few_are_refused(spec, tmp_path):
-    meta = replace(CheckpointMeta.of(spec), joint_names=("a", "b"))
+    origin = replace(Origin.of(spec), joint_names=("a", "b"))
     with pytest.raises(MismatchError, match=r"manip_il.json has 2, config.json has 4"):
-        export_torchscript(write_checkpoint(tmp_path / "mlp", "mlp", spec, meta=meta), "")
+        export_torchscript(write_checkpoint(tmp_path / "mlp", "mlp", spec, origin=origin), "")
 
 
 @pytest.mark.parametrize("kind", WRITERS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from pathlib import Path
 
 import draccus
 import numpy as np
@@ -13,13 +14,13 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
-from manip_il.learn.limits import threads
-from manip_il.learn.losses import DISTRIBUTIONS, LOSSES
+from manip_il.learn.losses import LIKELIHOODS, LOSSES
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.pretrained import CONFIG, Interface
+from manip_il.learn.threads import threads
 from manip_il.learn.train import fit
 
 from ..damage import edit_json
@@ -27,19 +28,18 @@ from .tiny_policies import observations
 
 
 @pytest.fixture
-def checkpoint(table, spec, tmp_path):
-    return make_checkpoint(table, spec, tmp_path)
+def checkpoint(dataset, tmp_path):
+    return make_checkpoint(dataset, tmp_path)
 
 
-def make_checkpoint(table, spec, folder, loss="mse"):
-    config = FitConfig({"loss": loss}, steps=3, batch_size=32)
-    return fit(table, config, folder / loss, spec=spec)
+def make_checkpoint(dataset, folder, loss="mse"):
+    return fit(dataset, FitConfig({"loss": loss}, steps=3, batch_size=32), folder / loss)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_row_does_not_depend_on_the_others(loss, count, table, spec, tmp_path):
-    path = make_checkpoint(table, spec, tmp_path, loss)
+def test_a_row_does_not_depend_on_the_others(loss, count, dataset, tmp_path):
+    path = make_checkpoint(dataset, tmp_path, loss)
     assert LearnedPolicy.load(path).act(*observations(0)).shape == (0, 4)
     policy = MLPPolicy.from_pretrained(path)
     inputs = torch.from_numpy(np.concatenate(observations(130), axis=1))
@@ -64,9 +64,9 @@ def test_acting_is_the_same_through_lerobots_processors(checkpoint):
         assert np.array_equal(action.numpy().astype(np.float64), fast)
 
 
-def test_a_categorical_checkpoint_from_before_targets_were_smeared_acts_as_it_did(table, spec, tmp_path):
+def test_a_categorical_checkpoint_from_before_targets_were_smeared_acts_as_it_did(dataset, tmp_path):
     config = FitConfig({"loss": "categorical", "sigma": 0.0}, steps=3, batch_size=32)
-    path = fit(table, config, tmp_path / "run", spec=spec)
+    path = fit(dataset, config, tmp_path / "run")
     states, environments = observations(9)
     before = LearnedPolicy.load(path).act(states, environments)
     edit_json(path / CONFIG, lambda settings: settings.pop("sigma"))
@@ -74,8 +74,8 @@ def test_a_categorical_checkpoint_from_before_targets_were_smeared_acts_as_it_di
     policy = MLPPolicy.from_pretrained(path)  # as LeRobot's tools load it
     actions = policy.model.act(torch.from_numpy(np.concatenate([states, environments], axis=1)))
     assert np.array_equal(actions.numpy().astype(np.float64), before)
-    assert draccus.encode(policy_config({"path": str(path)}))["sigma"] == 0  # learning goes on as it began
-    assert draccus.encode(policy_config({"loss": "categorical"}))["sigma"] == 3
+    assert draccus.encode(policy_config(FitConfig({"path": str(path)})))["sigma"] == 0  # learning goes on as it began
+    assert draccus.encode(policy_config(FitConfig({"loss": "categorical"})))["sigma"] == 3
 
 
 def test_loading_needs_no_network(checkpoint, monkeypatch):
@@ -121,8 +121,8 @@ def test_pictures_go_in_as_lerobot_feeds_them():
             return torch.zeros(2, 4)
 
     inner = Seen()
-    interface = Interface("act", {"observation.state": 4}, {"front": (5, 6)}, 4)
-    policy = LearnedPolicy(inner, interface)
+    numbers, pictures = {"observation.state": 4}, {"front": (5, 6)}
+    policy = LearnedPolicy(inner, Checkpoint(Path("x"), {"type": "act"}, numbers, pictures, 4, "", "", None, {}))
     picture = np.arange(2 * 5 * 6 * 3, dtype=np.uint8).reshape(2, 5, 6, 3)
     states, environments = observations(2)
     policy.act(states, environments, {"front": picture, "wrist": picture}, [40, 30])
@@ -137,63 +137,18 @@ def test_pictures_go_in_as_lerobot_feeds_them():
         policy.act(states, environments, {"front": picture}, [40])
 
 
-def generators(*seeds: int) -> list[np.random.Generator]:
-    return [np.random.default_rng(seed) for seed in seeds]
+@pytest.mark.parametrize("loss", LIKELIHOODS)
+def test_a_policys_own_action_is_likelier_than_one_far_off_whatever_is_beside_it(loss, dataset, tmp_path):
+    policy = LearnedPolicy.load(make_checkpoint(dataset, tmp_path, loss))
+    states, environments = observations(5)
+    own = policy.act(states, environments)
+    near, far = (policy.log_prob(states, environments, {}, own + off) for off in (0.0, 0.5))
+    assert (near > far).all()
+    one = policy.log_prob(states[3:4], environments[3:4], {}, own[3:4])
+    assert np.array_equal(one, near[3:4])
 
 
-@pytest.mark.parametrize("loss", DISTRIBUTIONS)
-def test_a_sample_is_its_generators_whatever_is_sampled_beside_it(loss, table, spec, tmp_path):
-    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, loss))
-    states, environments = observations(130)
-    together = policy.sample(states, environments, {}, generators(*range(130)))
-    assert np.array_equal(policy.sample(states, environments, {}, generators(*range(130))), together)
-    likely = policy.log_prob(states, environments, {}, together)
-    for rows in ([0], [77], [129, 3], list(range(129, 40, -1))):
-        assert np.array_equal(policy.sample(states[rows], environments[rows], {}, generators(*rows)), together[rows])
-        assert np.array_equal(policy.log_prob(states[rows], environments[rows], {}, together[rows]), likely[rows])
-    other = policy.sample(states, environments, {}, generators(*range(1, 131)))
-    assert (other != together).any(axis=1).mean() > 0.9
-
-
-@pytest.mark.parametrize("loss", ["gaussian", "mixture"])
-def test_what_is_sampled_is_likelier_than_what_is_not(loss, table, spec, tmp_path):
-    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, loss))
-    states, environments = observations(200)
-    sampled = policy.sample(states, environments, {}, generators(*range(200)))
-    assert sampled.shape == (200, 4)
-    near, far = (policy.log_prob(states, environments, {}, sampled + shift) for shift in (0.0, 5.0))
-    assert np.isfinite(near).all()
-    assert (near > far).mean() > 0.95
-
-
-def test_gaussian_samples_lie_around_the_action(table, spec, tmp_path):
-    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, "gaussian"))
-    states, environments = (np.tile(one, (4_000, 1)) for one in (table["observation.state"][:1], observations(1)[1]))
-    samples = policy.sample(states, environments, {}, generators(*range(4_000)))
-    error = np.abs(samples.mean(axis=0) - policy.act(states[:1], environments[:1])[0])
-    assert (error < 5 * samples.std(axis=0) / np.sqrt(4_000)).all()
-
-
-@pytest.mark.parametrize(
-    ("kind", "says"),
-    [
-        ("checkpoint", "loss 'mse' learns no spread of actions; expected gaussian, mixture, categorical"),
-        (
-            "act",
-            "type 'act' has no distribution of actions here; expected an mlp with loss gaussian, mixture, categorical",
-        ),
-    ],
-)
-def test_a_policy_without_a_distribution_says_so_in_one_line(kind, says, request):
-    policy, (states, environments) = LearnedPolicy.load(request.getfixturevalue(kind)), observations(2)
-    with pytest.raises(UsageError, match=says):
-        policy.sample(states, environments, {}, generators(0, 1))
-    with pytest.raises(UsageError, match=says):
-        policy.log_prob(states, environments, {}, np.zeros((2, 4)))
-
-
-def test_every_row_wants_a_generator_of_its_own(table, spec, tmp_path):
-    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, "gaussian"))
-    with pytest.raises(MismatchError, match="the states has 2, the generators has 1"):
-        policy.sample(*observations(2), {}, generators(0))
-    assert policy.sample(*observations(0), {}, []).shape == (0, 4)
+def test_a_policy_without_a_likelihood_says_so_in_one_line(checkpoint, act):
+    for path in (checkpoint, act):
+        with pytest.raises(UsageError, match=r"needs a policy with a likelihood: .*mixture or categorical"):
+            LearnedPolicy.load(path).require_likelihood()

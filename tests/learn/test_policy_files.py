@@ -6,7 +6,7 @@ import pytest
 
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy_files import policy_cameras
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
 
@@ -19,7 +19,7 @@ DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
 def test_a_checkpoint_says_what_it_must_be_shown(tmp_path):
     assert policy_cameras(write_checkpoint(tmp_path / "blind", "act", env_spec(ENV))) is None
     spec = env_spec(ENV, DIM)
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV, DIM), observation="images", look={"brightness": 0.5})
+    meta = Origin.of(spec, env_fingerprint(ENV, DIM), observation="images", look={"brightness": 0.5})
     assert policy_cameras(write_checkpoint(tmp_path / "dim", "act", spec, "images", meta=meta)) == DIM
     spec = env_spec(ENV, CameraConfig(("wrist", "front"), 32, 64))
     other = write_checkpoint(tmp_path / "other", "act", spec, "both")  # as lerobot-train leaves it

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from manip_il.cli.main import main
-from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, UsageError
+from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.fit_policy import PolicyTrainer
-from manip_il.learn.samples import JoinedFrames, Windows, windows_of
+from manip_il.learn.samples import Pictures, Windows, windows_of
+from manip_il.learn.sources import Sources
+from manip_il.learn.train import Trainer
 
-from .tiny_policies import ACT
+from .conftest import make_table, write_table
+from .tiny_policies import ACT, DIFFUSION
 
 EPISODES = np.repeat([0, 1, 2], [5, 2, 4])
 
@@ -28,7 +32,8 @@ EPISODES = np.repeat([0, 1, 2], [5, 2, 4])
 def test_a_window_never_leaves_its_episode(lengths, deltas) -> None:
     episodes = np.repeat(np.arange(len(lengths)), lengths)
     samples = np.arange(len(episodes))
-    rows, padded = Windows(episodes, {"action": np.array(deltas)}).rows(samples, "action")
+    rows, padding = Windows(episodes, {"action": np.array(deltas)}).rows(samples, "action")
+    padded = padding["action_is_pad"].numpy()
     assert (episodes[rows] == episodes[:, None]).all()
     wanted = samples[:, None] + np.array(deltas)
     assert (rows[~padded] == wanted[~padded]).all()
@@ -39,7 +44,11 @@ def test_a_window_never_leaves_its_episode(lengths, deltas) -> None:
 def test_a_frame_outside_is_the_nearest_one_inside() -> None:
     rows, padded = Windows(EPISODES, {"action": np.array([-1, 0, 1, 2])}).rows(np.array([0, 4, 5]), "action")
     assert rows.tolist() == [[0, 0, 1, 2], [3, 4, 4, 4], [5, 5, 6, 6]]
-    assert padded.tolist() == [[True, False, False, False], [False, False, True, True], [True, False, False, True]]
+    assert padded["action_is_pad"].tolist() == [
+        [True, False, False, False],
+        [False, False, True, True],
+        [True, False, False, True],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -79,58 +88,37 @@ def test_joined_frames_are_those_of_the_concatenation(shape):
     rng = np.random.default_rng(0)
     pieces = [rng.integers(0, 255, (count, 3, 2, 2), dtype=np.uint8) for count in (4, 1, 6)]
     rows = rng.integers(0, 11, shape)
-    np.testing.assert_array_equal(JoinedFrames(pieces)[rows], np.concatenate(pieces)[rows])
+    np.testing.assert_array_equal(Pictures(pieces)[rows], np.concatenate(pieces)[rows])
 
 
-@pytest.fixture(scope="module")
-def two(tmp_path_factory) -> list[Path]:
-    """Datasets of three and of two episodes."""
-    folder = tmp_path_factory.mktemp("two")
-    for name, count, seed in (("a", 3, 0), ("b", 2, 1)):
-        words = [f"--dataset.root={folder / name}", f"--dataset.num_episodes={count}", f"--seed={seed}"]
-        assert main(["record", "--task.type=reach", "--workers=1", *words]) == 0
-    return [folder / "a", folder / "b"]
+@pytest.mark.parametrize(
+    ("settings", "observation"),
+    [(ACT, "state"), (DIFFUSION, "state"), (ACT, "images"), (ACT, "both")],
+    ids=lambda value: str(value["type"] if isinstance(value, dict) else value),
+)
+def test_a_batch_is_that_of_lerobots_loader(settings, observation, write, table, pictured, tmp_path):
+    sources = write(table, spec=pictured)
+    config = FitConfig({**settings, "pretrained_backbone_weights": None}, observation=observation, batch_size=8)
+    samples = Trainer(sources, config, tmp_path / "run").data.samples
+    meta = read_metadata(*sources.roots)
+    ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in samples.windows.deltas.items()}
+    lerobots: Any = LeRobotDataset(meta.repo_id, root=sources.roots[0], delta_timestamps=ahead or None)
+    for rows in (np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])):
+        theirs = torch.utils.data.default_collate([lerobots[int(row)] for row in rows])
+        for key, value in samples.batch(rows).items():
+            if key == "task":
+                assert list(value) == list(theirs[key])
+                continue
+            other = theirs[key].to(torch.float64).reshape(value.shape)
+            value = to_float(value) if value.dtype == torch.uint8 else value
+            torch.testing.assert_close(value.to(torch.float64), other, rtol=0, atol=1e-7)
 
 
-def trainer(roots, folder: Path, weights=None) -> PolicyTrainer:
-    config = FitConfig(ACT, steps=4, batch_size=8, save_freq=4, log_freq=2, eval_split=0.0)
-    return PolicyTrainer(roots, config, folder, spec=Dataset.open(roots[0]).spec, weights=weights)
-
-
-def test_several_datasets_are_numbered_throughout_and_have_the_statistics_of_all_frames(two):
-    joined = joined_columns(two, ("action", "episode_index", "index"))
-    action = joined["action"].astype(np.float64)
-    assert np.array_equal(np.unique(joined["episode_index"]), np.arange(5))
-    assert np.array_equal(joined["index"].ravel(), np.arange(len(action)))
-    np.testing.assert_array_equal(
-        action, np.concatenate([Dataset.open(root).columns(("action",))["action"] for root in two])
-    )
-    stats = read_metadata(*two).stats
-    assert stats is not None
-    np.testing.assert_allclose(stats["action"]["mean"], action.mean(0), rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(stats["action"]["std"], action.std(0), rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(stats["action"]["max"], action.max(0), atol=1e-6)
-
-
-def test_a_chunk_policy_learns_from_several_datasets_with_no_window_over_a_seam(two, tmp_path):
-    one = trainer(two, tmp_path)
-    samples = one.samples
-    assert len(samples.train) == sum(len(Dataset.open(root).columns(("index",))["index"]) for root in two)
-    seam = len(Dataset.open(two[0]).columns(("index",))["index"]) - 1
-    batch = next(iter(samples.source.batches([np.array([seam])])))
-    assert batch["action_is_pad"][0].tolist() == [False, True, True, True]
-    assert one.fit().is_dir()
-
-
-def test_frames_of_no_weight_are_never_drawn(two, tmp_path):
-    frames = len(joined_columns(two, ("index",))["index"])
-    weights = (np.arange(frames) < 20).astype(np.float64)
-    one = trainer(two, tmp_path, weights)
-    assert max(int(one._rows_of(step).max()) for step in range(50)) < 20
-
-
-def test_datasets_of_different_robots_are_not_one(two, tmp_path):
-    words = [f"--dataset.root={tmp_path / 'c'}", "--dataset.num_episodes=1", "--task.type=lift", "--workers=1"]
-    assert main(["record", *words]) == 0
-    with pytest.raises(MismatchError, match="environment_state differs: "):
-        read_metadata(two[0], tmp_path / "c")
+def test_tasks_of_several_datasets_are_numbered_together(spec, tmp_path):
+    texts = [replace(spec, instruction=text) for text in ("reach", "touch")]
+    made = [write_table(make_table(), tmp_path / one.instruction, one).datasets[0] for one in texts]
+    samples = Trainer(Sources(tuple(made)), FitConfig(ACT, batch_size=8), tmp_path / "run").data.samples
+    batch = samples.batch(np.array([0, 239, 240, 479]))
+    assert batch["task"] == ["reach", "reach", "touch", "touch"]
+    assert batch["index"].tolist() == [0, 239, 240, 479]
+    assert batch["episode_index"].tolist() == [0, 11, 12, 23]

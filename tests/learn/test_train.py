@@ -1,7 +1,8 @@
-"""Training is a function of table, config and seed; it refuses what it cannot learn from."""
+"""Training is a function of data, options and seed, for every kind of policy; it refuses what it cannot learn from."""
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import os
@@ -10,169 +11,251 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.error import URLError
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 
 from manip_il import checks
+from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
+from manip_il.data.dataset import Dataset
+from manip_il.data.schema import features
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UsageError
-from manip_il.learn.checkpoint import CheckpointMeta, check_fits, publish, read_meta, recorded_look
-from manip_il.learn.columns import learning_rows, split_by_episode
+from manip_il.learn import train
+from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_policy import usable_statistics
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.metrics import METRICS_FILE, json_lines
 from manip_il.learn.mlp import MLPConfig
+from manip_il.learn.mlp.configuration_mlp import WarmUpAndCosineConfig
 from manip_il.learn.network import MLPNetwork, fit_statistics
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.train import fit, lr_at
+from manip_il.learn.sources import Sources, recorded_look
+from manip_il.learn.train import Trainer
+from manip_il.learn.training_state import publish
+
+from .conftest import LENGTH, make_table, write_table
+from .tiny_policies import ACT, DIFFUSION, observations
+
+MLP = {"type": "mlp", "width": 16, "depth": 2, "device": "cpu"}
+CNN = {"type": "cnn", "channels": [4, 8], "keypoints": 4, "width": 8, "device": "cpu"}
+VISION = {**ACT, "pretrained_backbone_weights": None, "use_vae": False}
+CROPPED = {"crop_shape": [32, 48], "pretrained_backbone_weights": None}
+SEEING = {**DIFFUSION, **CROPPED, "spatial_softmax_num_keypoints": 4}
+VQBET = {"type": "vqbet", "device": "cpu", "n_vqvae_training_steps": 2, "spatial_softmax_num_keypoints": 4, **CROPPED}
 
 
-def tiny(policy: dict[str, Any] | None = None, **changes) -> FitConfig:
-    values = {"steps": 4, "batch_size": 32, "log_freq": 2, "save_freq": 2, "eval_split": 0.2}
-    return FitConfig({"width": 16, "depth": 2, "device": "cpu"} | (policy or {}), **(values | changes))
+def config(settings: Any = MLP, **changes: Any) -> FitConfig:
+    values = {"steps": 4, "batch_size": 8, "save_freq": 2, "log_freq": 1, "eval_split": 0.2}
+    return FitConfig(settings, **(values | changes))
 
 
 @pytest.fixture
-def train(table, spec, tmp_path):
-    """Fit a tiny network to the table in a folder of the test's."""
+def fit(dataset, tmp_path):
+    """Fits a tiny policy to a dataset in a folder of the test's."""
 
-    def run(config=None, name="", data=table, spec=spec, **options) -> Path:
-        return fit(data, config or tiny(), tmp_path / name, spec=spec, **options)
+    def run(settings: Any = MLP, name: str = "run", data: Sources = dataset, stop_after: int = 0, **more: Any) -> Path:
+        given = {key: more.pop(key) for key in ("resume", "weights") if key in more}
+        done = 0
+
+        def step(_record: Any) -> None:
+            nonlocal done
+            done += 1
+            if done == stop_after:
+                raise KeyboardInterrupt
+
+        return Trainer(data, config(settings, **more), tmp_path / name, **given).fit(step)
 
     return run
 
 
-def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+def saved(run: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((run / "checkpoints/last").rglob("*.safetensors"))}
 
 
-def errors(table, path) -> np.ndarray:
-    actions = LearnedPolicy.load(path).act(table["observation.state"], table["observation.environment_state"])
-    return np.abs(actions - table["action"]).mean(0)
+@pytest.mark.parametrize("settings", [MLP, {**MLP, "loss": "mixture"}, ACT, DIFFUSION], ids=str)
+def test_a_resumed_fit_ends_with_the_same_bits(fit, tmp_path, settings):
+    fit(settings, "straight")
+    with pytest.raises(KeyboardInterrupt):
+        fit(settings, "stopped", stop_after=3)
+    assert (tmp_path / "stopped/checkpoints/last").resolve().name == "000003"
+    fit(settings, "stopped", resume=True)
+    straight, stopped = saved(tmp_path / "straight"), saved(tmp_path / "stopped")
+    assert {"model.safetensors", "optimizer_state.safetensors"} <= straight.keys()
+    assert straight == stopped
+    one, other = (
+        [[record[key] for key in ("step", "loss", "val_loss")] for record in read_jsonl(tmp_path / name / METRICS_FILE)]
+        for name in ("straight", "stopped")
+    )
+    assert one == other
 
 
-def test_the_same_seed_gives_the_same_bits_and_the_global_generator_has_no_say(train, weights):
-    torch.manual_seed(5)
-    before = torch.get_rng_state()
-    a, b, c = (weights(train(tiny(seed=seed), name)) for name, seed in (("a", 1), ("b", 1), ("c", 2)))
-    assert torch.equal(before, torch.get_rng_state())
-    assert equal(a, b)
-    assert not equal(a, c)
+@pytest.mark.parametrize(
+    ("settings", "observation"),
+    [(VISION, "both"), (CNN, "images"), (SEEING, "images"), (VQBET, "images")],
+    ids=lambda value: str(value["type"] if isinstance(value, dict) else value),
+)
+@pytest.mark.slow
+def test_two_steps_are_saved_resumed_and_act(fit, table, write, pictured, settings, observation, tmp_path):
+    data = write(table, spec=replace(pictured, cameras=("front",)))
+    more = {"data": data, "observation": observation, "save_freq": 2}
+    with pytest.raises(KeyboardInterrupt):
+        fit(settings, stop_after=2, **more)
+    path = fit(settings, resume=True, **more)
+    policy = LearnedPolicy.load(path)
+    assert policy.checkpoint.observation == observation
+    states, environments = observations(2)
+    assert policy.act(states, environments, {"front": np.zeros((2, 32, 48, 3), np.uint8)}).shape == (2, 4)
+    assert [record["step"] for record in read_jsonl(tmp_path / "run" / METRICS_FILE)] == [1, 2, 3, 4]
 
 
-class KilledError(Exception):
-    pass
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_two_steps_and_two_more_are_four(loss, train, tmp_path, weights):
-    config = tiny({"loss": loss})
-    straight = weights(train(config, "straight"))
-
-    def kill(record):
-        if record["step"] == 4:
-            raise KilledError
-
-    with pytest.raises(KilledError):
-        train(config, "killed", on_log=kill)
-    at_two = weights(tmp_path / "killed/checkpoints/last/pretrained_model")
-    resumed = weights(train(config, "killed", resume=True))
-    assert not equal(at_two, straight)
-    assert equal(resumed, straight)
-    assert [line["step"] for line in read_jsonl(tmp_path / "killed" / METRICS_FILE)] == [2, 4]
-
-
-def test_a_finished_run_is_resumed_unchanged_and_neither_overwritten_nor_continued_as_another(
-    table, train, tmp_path, weights
-):
-    before = weights(train())
-    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["000004", "last"]
-    assert equal(before, weights(train(resume=True)))
-    with pytest.raises(FolderExistsError, match="--resume=true"):
-        train()
-    with pytest.raises(MismatchError, match="option lr"):
-        train(tiny(lr=0.1), resume=True)
-    with pytest.raises(MismatchError, match="data"):
-        train(data=table | {"action": table["action"] + 0.01}, resume=True)
-
-
-def test_a_half_written_checkpoint_is_passed_over(train, tmp_path, weights):
-    straight = weights(train(name="a"))
-    for stale in (".000002.tmp/pretrained_model", "000002/pretrained_model"):
-        (tmp_path / "b/checkpoints" / stale).mkdir(parents=True)
-    assert equal(straight, weights(train(name="b", resume=True)))
-
-
-def test_frames_without_a_valid_label_do_not_touch_the_weights(table, train, weights):
-    invalid = np.random.default_rng(0).random(len(table["action"])) < 0.3
-    table["label_valid"][invalid] = 0
-    rubbish = {key: column.copy() for key, column in table.items()}
-    rubbish["action"][invalid] = 1e6
-    rubbish["observation.environment_state"][invalid] = -1e6
-    without = {key: column[~invalid] for key, column in table.items()}
-    a, b, c = (weights(train(name=name, data=data)) for name, data in (("a", table), ("b", rubbish), ("c", without)))
-    assert equal(a, b)
-    assert equal(a, c)
-
-
-@pytest.mark.parametrize("key", ["observation.state", "observation.environment_state", "action"])
-def test_nan_is_refused_with_column_episode_and_frame(key, table, train):
-    table[key][47, 1] = np.nan
-    with pytest.raises(NotFiniteError, match=rf"{key}, row 47, episode 2, frame 7"):
-        train()
-
-
-def test_a_loss_that_explodes_says_at_which_step(train):
-    with pytest.raises(NotFiniteError, match=r"loss is (inf|nan) at step \d"):
-        train(tiny(lr=1e30, steps=20))
-
-
-def test_a_table_that_cannot_be_learnt_from_is_named(table, spec, train):
-    with pytest.raises(MismatchError, match=r"observation.environment_state has \(240, 6\).*\(N, 5\)"):
-        train(spec=replace(spec, environment_state_names=("x",) * 5))
-    with pytest.raises(ManipError, match="none of 240 frames"):
-        train(data=table | {"label_valid": np.zeros((240, 1), np.int64)})
-    del table["action"]
-    with pytest.raises(ManipError, match="no column 'action'"):
-        train()
-
-
-def test_metrics_hold_the_loss_of_whole_held_out_episodes(train):
-    records = []
-    train(on_log=records.append)
-    assert [record["step"] for record in records] == [2, 4]
-    assert {"loss", "lr", "samples_per_s", "val_loss", "val_arm_error", "val_gripper_error"} <= records[0].keys()
-    episodes = np.repeat(np.arange(12), 20)
-    train, held_out = split_by_episode(episodes, 0.2, seed=0)
-    assert len(np.unique(episodes[held_out])) == 2
-    assert not set(episodes[train]) & set(episodes[held_out])
+def test_the_seed_decides_and_metrics_and_checkpoints_change_nothing(fit, weights):
+    a = weights(fit({**DIFFUSION}, "a", log_freq=4, save_freq=4))
+    b = weights(fit({**DIFFUSION}, "b", log_freq=1, save_freq=1))
+    c = weights(fit({**DIFFUSION}, "c", seed=1))
+    assert all(torch.equal(a[key], b[key]) for key in a)
+    assert not all(torch.equal(a[key], c[key]) for key in a)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_every_loss_learns_to_act(loss, table, train):
-    policy = {"loss": loss, "components": 2, "width": 64}
-    config = tiny(policy, steps=400, save_freq=400, log_freq=400, batch_size=64, lr=5e-3)
-    before = errors(table, train(tiny({"loss": loss}), "before"))
-    after = errors(table, train(config, "after"))
+def test_every_loss_learns_to_act(loss, table, write, fit):
+    data = write(table)
+    settings = {**MLP, "loss": loss, "components": 2, "width": 64}
+
+    def errors(path: Path) -> np.ndarray:
+        actions = LearnedPolicy.load(path).act(table["observation.state"], table["observation.environment_state"])
+        return np.abs(actions - table["action"]).mean(0)
+
+    before = errors(fit(settings, "before", data, steps=1))
+    after = errors(fit(settings, "after", data, steps=400, save_freq=400, log_freq=400, batch_size=64, lr=5e-3))
     assert after[:-1].mean() < 0.6 * before[:-1].mean()
     assert after[-1] < 0.01
 
 
-def test_a_warm_start_acts_as_the_policy_it_came_from(table, train, weights):
-    first = train(tiny(steps=50), "first")
+def test_a_chunk_policy_learns_and_says_how(fit, tmp_path):
+    plan = {**ACT, "use_vae": False, "chunk_size": 1, "n_action_steps": 1}
+    fit(plan, steps=90, batch_size=32, log_freq=30, save_freq=90, lr=3e-3)
+    first, _, last = read_jsonl(tmp_path / "run" / METRICS_FILE)
+    assert last["loss"] < 0.7 * first["loss"]
+    assert last["val_loss"] < first["val_loss"]
+    assert {"grad_norm", "lr", "samples_per_s", "data_share", "l1_loss", "val_l1_loss"} <= first.keys()
+
+
+def test_metrics_of_the_mlp_hold_errors_of_acting(fit, tmp_path):
+    fit()
+    [record, *_] = read_jsonl(tmp_path / "run" / METRICS_FILE)
+    assert {"val_loss", "val_arm_error", "val_gripper_error"} <= record.keys()
+
+
+def test_held_out_episodes_are_never_learnt_from(dataset, tmp_path):
+    data = Trainer(dataset, config(eval_split=0.25), tmp_path).data
+    assert len(set(data.held_out // LENGTH)) == 3
+    assert not set(data.held_out // LENGTH) & set(data.train // LENGTH)
+
+
+def test_frames_without_a_valid_label_do_not_touch_the_weights(table, write, fit, weights):
+    table["label_valid"][np.random.default_rng(0).random(len(table["action"])) < 0.3] = 0
+    invalid = table["label_valid"][:, 0] == 0
+    rubbish = {key: column.copy() for key, column in table.items()}
+    rubbish["action"][invalid] = 1e6
+    rubbish["observation.environment_state"][invalid] = -1e6
+    a, b = (weights(fit(name=name, data=write(data, name))) for name, data in (("a", table), ("b", rubbish)))
+    assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+def test_a_run_is_neither_trained_over_nor_continued_as_another(fit, write, table, tmp_path, weights):
+    before = weights(fit(ACT))
+    assert sorted(path.name for path in (tmp_path / "run/checkpoints").iterdir()) == ["000002", "000004", "last"]
+    after = weights(fit(ACT, resume=True))
+    assert all(torch.equal(before[key], after[key]) for key in before)
+    with pytest.raises(FolderExistsError, match="--resume=true"):
+        fit(ACT)
+    with pytest.raises(MismatchError, match="batch_size"):
+        fit(ACT, resume=True, batch_size=4)
+    with pytest.raises(MismatchError, match="policy"):
+        fit({**ACT, "dropout": 0.0}, resume=True)
+    with pytest.raises(MismatchError, match="training data"):
+        fit(ACT, data=write(table), resume=True)
+    with pytest.raises(MismatchError, match="training data"):
+        fit(ACT, weights=np.ones(240), resume=True)
+
+
+def test_a_half_written_checkpoint_is_passed_over(fit, tmp_path, weights):
+    straight = weights(fit(name="a"))
+    for stale in (".000002.tmp/pretrained_model", "000002/pretrained_model"):
+        (tmp_path / "b/checkpoints" / stale).mkdir(parents=True)
+    after = weights(fit(name="b", resume=True))
+    assert all(torch.equal(straight[key], after[key]) for key in after)
+
+
+@pytest.mark.parametrize(
+    "name", ["training_step.json", "optimizer_state.safetensors", "scheduler_state.json", "rng_state.safetensors"]
+)
+def test_a_run_whose_state_is_broken_is_not_resumed(name, fit, tmp_path):
+    fit()
+    (tmp_path / "run/checkpoints/last/training_state" / name).write_bytes(b"[[[")
+    with pytest.raises(ManipError, match=rf"{name} is not valid JSON|cannot be resumed .*--overwrite=true"):
+        fit(resume=True)
+
+
+def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(fit):
+    path = fit(ACT) / "policy_preprocessor.json"
+    values = json.loads(path.read_text())
+    values["steps"].append({"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}})
+    path.write_text(json.dumps(values))
+    with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
+        fit(ACT, resume=True)
+
+
+@pytest.mark.parametrize("key", ["observation.state", "observation.environment_state", "action"])
+def test_nan_is_refused_with_column_episode_and_frame(key, table, write, fit):
+    data = write(table)
+    [file] = data.datasets[0].data_files
+    columns = pq.read_table(file).to_pydict()
+    columns[key][47][1] = math.nan
+    stored = pq.read_table(file)
+    pq.write_table(type(stored).from_pydict(columns, schema=stored.schema), file)
+    with pytest.raises(NotFiniteError, match=rf"{key}, row 47, episode 2, frame 7"):
+        fit(data=data)
+
+
+def test_a_loss_that_explodes_says_at_which_step(fit):
+    with pytest.raises(NotFiniteError, match=r"loss is (inf|nan) at step \d"):
+        fit(lr=1e30, steps=20)
+
+
+def test_a_warm_mlp_acts_as_the_one_it_came_from_in_the_units_of_new_data(table, write, fit, weights):
+    first = fit(steps=50, data=write(table, "one"), name="first")
     wider = {key: column.copy() for key, column in table.items()}
     wider["observation.environment_state"] *= 3.0  # other statistics
-    second = train(tiny(steps=1, lr=1e-12, init_from=first), "second", wider)
-    a, b = LearnedPolicy.load(first), LearnedPolicy.load(second)
-    assert not torch.equal(weights(first)["model.input_scale"], weights(second)["model.input_scale"])
     inputs = table["observation.state"], table["observation.environment_state"]
-    np.testing.assert_allclose(a.act(*inputs), b.act(*inputs), atol=2e-5)
+    for name, settings, more in (("a", MLP, {"init_from": first}), ("b", {"path": str(first)}, {})):
+        second = fit(settings, name, write(wider, f"wider_{name}"), steps=1, lr=1e-12, **more)
+        assert not torch.equal(weights(first)["model.input_scale"], weights(second)["model.input_scale"])
+        before, after = (LearnedPolicy.load(path).act(*inputs) for path in (first, second))
+        np.testing.assert_allclose(after, before, atol=2e-5)
 
 
-def test_a_feature_that_never_moves_is_not_seen(table, train):
-    policy = LearnedPolicy.load(train())
+def test_a_policy_of_lerobots_starts_from_a_checkpoints_weights(fit, weights):
+    first = fit(ACT, "first")
+    for name, settings, more in (("a", {"path": str(first)}, {}), ("b", ACT, {"init_from": first})):
+        before, after = weights(first), weights(fit(settings, name, steps=1, lr=1e-12, **more))
+        assert all(torch.allclose(before[key], after[key], atol=1e-6) for key in before)
+    (first / "model.safetensors").write_bytes(b"\x08" + bytes(7) + b"nothing}")
+    with pytest.raises(ManipError, match=r"does not fit this policy"):
+        fit({"path": str(first)}, "again")
+    mlp = fit(name="mlp")
+    (mlp / "model.safetensors").write_bytes(b"\xff" * 100)
+    with pytest.raises(ManipError, match=r"model\.safetensors cannot be read"):
+        fit(name="warm", init_from=mlp)
+
+
+def test_a_feature_that_never_moves_is_not_seen(table, fit):
+    policy = LearnedPolicy.load(fit())
     environment = table["observation.environment_state"].copy()
     before = policy.act(table["observation.state"], environment)
     environment[:, 2] += 100.0
@@ -180,54 +263,140 @@ def test_a_feature_that_never_moves_is_not_seen(table, train):
 
 
 def test_statistics_undo_themselves_and_take_constant_targets(table):
-    rows = learning_rows(table)
-    targets = rows.targets.copy()
+    inputs = np.concatenate([table["observation.state"], table["observation.environment_state"]], axis=1)
+    targets = table["action"].copy()
     targets[:, 1] = 0.5
     for loss in ("mse", "categorical"):
-        s = fit_statistics(rows.inputs, targets, loss)
-        network = MLPNetwork(rows.inputs.shape[1], targets.shape[1], MLPConfig(loss=loss).network_shape())
+        s = fit_statistics(inputs, targets, loss)
+        network = MLPNetwork(inputs.shape[1], targets.shape[1], MLPConfig(loss=loss).network_shape())
         network.set_statistics(s)
         y = network.encode_targets(torch.from_numpy(targets))
-        assert torch.isfinite(y).all()
-        np.testing.assert_allclose(y * s.target_scale + s.target_mean, targets, atol=1e-6)
+        np.testing.assert_allclose(y * s["target_scale"] + s["target_mean"], targets, atol=1e-6)
     assert y.abs().max() <= 1 + 1e-5
 
 
+def test_a_column_that_hardly_moves_is_not_blown_up():
+    flat = {"mean": np.zeros(2), "std": np.array([1e-7, 0.5]), "min": np.zeros(2), "max": np.array([1e-6, 2.0])}
+    usable = usable_statistics({"observation.state": flat, "observation.images.front": flat})
+    assert usable["observation.state"]["std"].tolist() == [1e-3, 0.5]
+    assert usable["observation.state"]["max"].tolist() == [1e-2, 2.0]
+    assert usable["observation.images.front"]["std"].tolist() == [1e-7, 0.5]
+
+
 def test_the_learning_rate_warms_up_and_goes_to_zero():
-    rates = [lr_at(step, 1000, 1.0) for step in range(1000)]
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
+    share = WarmUpAndCosineConfig().build(optimizer, 1000).lr_lambdas[0]
+    rates = [share(step) for step in range(1000)]
     assert rates[:100] == sorted(rates[:100])
+    assert rates[0] > 0
     assert rates[100] == 1.0
     assert rates[100:] == sorted(rates[100:], reverse=True)
     assert rates[-1] < 1e-5
 
 
-def test_the_meta_says_what_the_policy_is_for(spec, train):
-    meta = read_meta(train(fingerprint={"mujoco": "3.11"}))
-    assert meta is not None
-    assert meta == replace(
-        CheckpointMeta.of(spec, {"mujoco": "3.11"}, action_space="joint_delta"), options=meta.options
+def test_a_backbone_that_cannot_be_downloaded_is_one_line_with_two_ways_out(fit, monkeypatch):
+    def no_network(*_args, **_kwargs):
+        raise URLError("no network")
+
+    monkeypatch.setattr("manip_il.learn.lerobot_policy.make_policy", no_network)
+    with pytest.raises(ManipError) as raised:
+        fit(ACT)
+    for word in ("--policy.pretrained_backbone_weights=null", "checkpoints", "ResNet18_Weights"):
+        assert word in str(raised.value)
+
+
+def test_half_precision_trains_in_bfloat16_on_a_cpu(fit, tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "_on_this_cpu", lambda: "bf16")  # also one that has it not, slowly
+    path = fit({**ACT, "use_amp": True}, "half")
+    fit(ACT, "full")
+    assert saved(tmp_path / "half")["model.safetensors"] != saved(tmp_path / "full")["model.safetensors"]
+    assert json.loads((path / "config.json").read_text())["use_amp"] is True
+
+
+def test_a_checkpoint_has_lerobots_layout_and_no_place_of_this_machine(fit, spec, dataset, tmp_path):
+    for settings in (MLP, ACT):
+        path = fit(settings, settings["type"], init_from=fit(settings, f"first_{settings['type']}"))
+        made = {file.name for file in path.iterdir()}
+        assert {"config.json", "model.safetensors", "train_config.json", "manip_il.json"} <= made
+        assert {"policy_preprocessor.json", "policy_postprocessor.json"} <= made
+        for file in path.glob("*.json"):
+            assert str(tmp_path) not in file.read_text(), file
+            assert str(dataset.roots[0].parent) not in file.read_text(), file
+        origin = Checkpoint.open(path).origin
+        assert origin is not None
+        space = "joint_delta" if settings is MLP else "joint_target"
+        assert replace(origin, options={}, datasets=[]) == Origin.of(spec, {"mujoco": "3.11"}, action_space=space)
+        assert origin.options["steps"] == 4
+        assert origin.datasets == [{"name": "dataset", "frames": 240, "weight": None}]
+        origin.check_fits(spec)
+
+
+def test_several_datasets_are_one_in_the_units_of_all_and_the_shares_asked_for(spec, tmp_path):
+    tables = make_table(0), make_table(1)
+    for key in ("observation.state", "action"):
+        tables[1][key] = tables[1][key] + np.float32(3.0)
+    roots = [write_table(table, tmp_path / name, spec).datasets[0] for table, name in zip(tables, "ab", strict=True)]
+    inputs = np.concatenate(
+        [np.hstack([one["observation.state"], one["observation.environment_state"]]) for one in tables]
     )
-    assert meta.options["policy"]["width"] == 16
-    check_fits(meta, spec)
+    for weights in ((), (3.0, 1.0)):
+        trainer = Trainer(Sources(tuple(roots), weights), config(eval_split=0.0), tmp_path / f"run{len(weights)}")
+        np.testing.assert_allclose(trainer.policy.model.input_mean, inputs.mean(0), rtol=1e-5)
+        drawn = np.concatenate([trainer.batch(step)["index"].numpy() for step in range(1000)])
+        assert (drawn < 240).mean() == pytest.approx(0.75 if weights else 0.5, abs=0.02)
+        assert trainer.fit().is_dir()
+    chunks = Trainer(Sources(tuple(roots)), config(ACT, eval_split=0.0), tmp_path / "act")
+    assert chunks.data.samples.batch(np.array([239]))["action_is_pad"][0].tolist() == [False, True, True, True]
+    trainer = Trainer(Sources(tuple(roots)), config(), tmp_path / "few", weights=(np.arange(480) < 20).astype(float))
+    assert max(int(trainer.batch(step)["index"].max()) for step in range(50)) < 20
+    with pytest.raises(ManipError, match="b has no sample to learn from"):
+        Sources(tuple(roots), (1.0, 1.0)).row_weights(np.arange(100))
+
+
+def test_datasets_that_mean_other_things_are_refused_with_both_named(spec, write, table):
+    one = write(table, "one").datasets[0]
+    for change, words in (
+        ({"robot": "leg"}, r"robot differs: .*one has arm, .*other has leg"),
+        ({"fps": 30}, r"fps differs: .*one has 25, .*other has 30"),
+        ({"task": "lift"}, r"task differs: .*one has reach, .*other has lift"),
+        ({"cameras": ("front",), "image_size": (32, 32), "video": False}, r"cameras differs"),
+    ):
+        other = write(table, f"{next(iter(change))}/other", replace(spec, **change)).datasets[0]
+        with pytest.raises(MismatchError, match=words):
+            Sources((one, other)).check_alike(pictures=True, language=False)
+    Sources((one, other)).check_alike(pictures=False, language=False)
+
+
+def test_curves_for_tensorboard_and_weights_and_biases(fit, tmp_path, curves):
+    path, plain = fit(name="r", **curves.options), fit(name="plain")
+    assert curves.steps(tmp_path / "r") == [1, 2, 3, 4]
+    for name in ("model.safetensors", "manip_il.json"):
+        assert (path / name).read_bytes() == (plain / name).read_bytes()
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("module", "options", "words"),
     [
-        {"robot": "leg"},
-        {"fps": 50},
-        {"joint_names": ("a", "c", "b", "gripper")},
-        {"environment_state_names": ("x",)},
-        {"action_meaning": "torques"},
+        ("torch.utils.tensorboard", {"tensorboard": True}, r"manip_il\[tensorboard\]"),
+        ("wandb", {"wandb": {"enable": True}}, "pip install wandb"),
     ],
 )
-def test_a_policy_for_something_else_is_refused_naming_both(change, spec):
-    meta = CheckpointMeta.of(spec)
-    with pytest.raises(MismatchError) as error:
-        check_fits(meta, replace(spec, **change))
-    ((name, value),) = change.items()
-    assert str(value) in str(error.value)
-    assert str(getattr(spec, name)) in str(error.value)
+def test_a_logger_that_is_not_installed_is_named(module, options, words, fit, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=words):
+        fit(**options)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_number_that_is_not_finite_is_null_and_lines_that_are_none_are_dropped(tmp_path, value):
+    path = tmp_path / "metrics.jsonl"
+    lines = [json.dumps({"step": step, "grad_norm": math.nan}) for step in (1, 2, 3)]
+    path.write_text("\n".join(["[" * 100_000, '{"step": "1"}', *lines, ""]))
+    with json_lines(path, 2) as write:
+        write({"step": 3, "loss": 0.5, "grad_norm": value})
+    expected = {"step": 3, "loss": 0.5, "grad_norm": None}
+    assert read_jsonl(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None}, expected]
+    assert checks.parse_json("a line", path.read_bytes().splitlines()[-1]) == expected
 
 
 def test_a_checkpoint_is_readable_for_whom_the_umask_lets_read(tmp_path):
@@ -242,34 +411,6 @@ def test_a_checkpoint_is_readable_for_whom_the_umask_lets_read(tmp_path):
     assert stat.S_IMODE((tmp_path / "last" / "model.safetensors").stat().st_mode) == 0o640
 
 
-def test_curves_for_tensorboard_and_weights_and_biases(train, tmp_path, curves):
-    config = FitConfig(steps=4, batch_size=8, log_freq=1)
-    path, plain = train(replace(config, **curves.options), "r"), train(config, "plain")
-    assert curves.steps(tmp_path / "r") == [1, 2, 3, 4]
-    for name in ("model.safetensors", "manip_il.json"):
-        assert (path / name).read_bytes() == (plain / name).read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("module", "options", "words"),
-    [
-        ("torch.utils.tensorboard", {"tensorboard": True}, r"manip_il\[tensorboard\]"),
-        ("wandb", {"wandb": {"enable": True}}, "pip install wandb"),
-    ],
-)
-def test_a_logger_that_is_not_installed_is_named(module, options, words, train, monkeypatch):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UsageError, match=words):
-        train(FitConfig(steps=1, batch_size=8, **options))
-
-
-@pytest.mark.parametrize("content", [b"", b"\xff" * 100, b"\x02\0\0\0\0\0\0\0[]"])
-def test_a_warm_start_from_weights_that_cannot_be_read_names_them(train, tmp_path, content):
-    (tmp_path / "model.safetensors").write_bytes(content)
-    with pytest.raises(ManipError, match=f"cannot read {tmp_path}/model.safetensors to start from its weights: "):
-        train(tiny(steps=1, init_from=tmp_path), "run")
-
-
 def test_a_datasets_light_is_that_of_its_last_rendering_else_the_default():
     made = {"cameras_sha256": "0"}
     look = {"shadows": True, "brightness": 0.5, "light_turn": 0.0}
@@ -278,12 +419,123 @@ def test_a_datasets_light_is_that_of_its_last_rendering_else_the_default():
     assert recorded_look({}, {}) is None
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_number_that_is_not_finite_is_null_also_in_lines_of_earlier_versions(tmp_path: Path, value: float) -> None:
-    path = tmp_path / "metrics.jsonl"
-    path.write_text("".join(json.dumps({"step": step, "grad_norm": math.nan}) + "\n" for step in (1, 2, 3)))
-    with json_lines(path, 2) as write:
-        write({"step": 3, "loss": 0.5, "grad_norm": value})
-    expected = {"step": 3, "loss": 0.5, "grad_norm": None}
-    assert read_jsonl(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None}, expected]
-    assert checks.parse_json("a line", path.read_bytes().splitlines()[-1]) == expected
+def acts(path: Path) -> bytes:
+    """What the policy in a folder does in six states of three episodes."""
+    rng, policy = np.random.default_rng(0), LearnedPolicy.load(path)
+    states, environment = rng.normal(size=(6, 3, 4)), rng.normal(size=(6, 3, 6))
+    actions = [
+        policy.act(joints.astype(np.float32), scene.astype(np.float32), episodes=[5, 6, 7])
+        for joints, scene in zip(states, environment, strict=True)
+    ]
+    return np.stack(actions).tobytes()
+
+
+ACTS = f"""
+import sys
+from pathlib import Path
+import numpy as np
+from manip_il.learn.policy import LearnedPolicy
+{inspect.getsource(acts)}
+print(*(acts(Path(path)).hex() for path in sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+def test_a_fresh_process_acts_to_the_bit_as_this_one(warm_lerobot, fit):
+    paths = [fit(settings, settings["type"]) for settings in (MLP, ACT, DIFFUSION)]
+    done = warm_lerobot.run("python", "-c", ACTS, *paths)
+    assert done.returncode == 0, done.stderr
+    [line] = done.stdout.splitlines()  # loading prints nothing
+    assert [bytes.fromhex(word) for word in line.split()] == [acts(path) for path in paths]
+
+
+# `torchrun --standalone --nproc_per_node=2`, with processes that need not import torch again
+LAUNCH = """
+import sys
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+from manip_il.cli.main import main
+place = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0"}
+config = LaunchConfig(min_nodes=1, max_nodes=1, nproc_per_node=2, run_id="two", start_method="fork", **place)
+sys.exit(max(elastic_launch(config, main)(sys.argv[1:]).values()))
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_learn_what_one_learns_from_both_shares(warm_lerobot, dataset, tmp_path, weights):
+    """Every process takes its share of the batch; the gradients are averaged."""
+    words = ["train", f"--dataset.root={dataset.roots[0]}", "--steps=3", "--save_freq=3"]
+    words += ["--optimizer.type=sgd", "--optimizer.lr=0.001"]
+    words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in ACT.items()]
+    # One action a chunk: ACT's mean over all that is no padding is then the mean of the shares' means.
+    words += ["--policy.use_vae=false", "--policy.dropout=0.0", "--policy.chunk_size=1", "--policy.n_action_steps=1"]
+    two = tmp_path / "two"
+    done = warm_lerobot.run("python", "-c", LAUNCH, *words, "--batch_size=4", f"--output_dir={two}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.count("checkpoint:") == 1
+    assert main([*words, "--batch_size=8", f"--output_dir={tmp_path / 'one'}"]) == 0
+    one, both = (weights(run / "checkpoints/last/pretrained_model") for run in (tmp_path / "one", two))
+    assert all(torch.allclose(one[name], both[name], atol=1e-5) for name in one)
+
+
+def somebodys(root: Path) -> Path:
+    """A dataset that LeRobot's API made of a real arm: six joints, two cameras, a text."""
+    from lerobot.datasets import LeRobotDataset
+
+    joints = [f"{name}.pos" for name in ("pan", "lift", "elbow", "flex", "roll", "gripper")]
+    columns: dict[str, Any] = {
+        key: {"dtype": "float32", "shape": (6,), "names": joints} for key in ("observation.state", "action")
+    }
+    size = {"dtype": "image", "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
+    columns |= {f"observation.images.{camera}": size for camera in ("front", "wrist")}
+    made = LeRobotDataset.create("somebody/so101", 30, columns, root=root, robot_type="so_follower", use_videos=False)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        for _ in range(10):
+            state = rng.normal(size=6).astype(np.float32)
+            frame = {"observation.state": state, "action": 0.9 * state, "task": "put the cube into the box"}
+            pictures = rng.integers(256, size=(2, 32, 48, 3), dtype=np.uint8)
+            frame |= dict(zip((key for key in columns if "images" in key), pictures, strict=True))
+            made.add_frame(frame)
+        made.save_episode()
+    made.finalize()
+    return root
+
+
+@pytest.mark.slow
+def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerobot, tmp_path, capsys):
+    root, run = somebodys(tmp_path / "theirs"), tmp_path / "run"
+    words = ["train", f"--dataset.root={root}", f"--output_dir={run}", "--steps=4", "--save_freq=2", "--batch_size=4"]
+    words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in VISION.items()]
+    assert main(words) == 1
+    assert "no observation.environment_state, which --observation=state needs" in capsys.readouterr().err
+    assert main([*words, "--observation=images"]) == 0
+    policy = LearnedPolicy.load(run / "checkpoints/last/pretrained_model", task="put the cube into the box")
+    assert policy.checkpoint.origin.robot == "so101"
+    pictures = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in ("front", "wrist")}
+    assert policy.act(np.zeros((1, 6), np.float32), np.empty((1, 0), np.float32), pictures).shape == (1, 6)
+    config = run / "checkpoints/last/pretrained_model/train_config.json"
+    more = [f"--dataset.root={root}", f"--output_dir={run}", "--steps=6", "--num_workers=0"]
+    done = warm_lerobot.run("lerobot-train", f"--config_path={config}", "--resume=true", *more)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (run / "checkpoints/last").resolve().name == "000006"
+
+
+@pytest.mark.parametrize(
+    ("lacking", "observation", "words"),
+    [
+        (["action"], "state", "no action: there is nothing to learn"),
+        (["observation.state"], "images", "no observation.state: every policy needs"),
+        (["observation.images.front", "observation.images.wrist"], "both", "no pictures.*--observation=state"),
+        (
+            ["observation.environment_state"],
+            "both",
+            "no observation.environment_state.*--observation=images, or record",
+        ),
+    ],
+)
+def test_what_a_dataset_lacks_is_said_with_the_way_out(lacking, observation, words, write, table, pictured):
+    dataset = Dataset.open(write(table, spec=pictured).roots[0])
+    assert list(features(pictured))[:4] == config(ACT, observation="both").inputs(dataset.root, dataset.info)
+    left = {key: feature for key, feature in dataset.info.features.items() if key not in lacking}
+    with pytest.raises(ManipError, match=words):
+        config(ACT, observation=observation).inputs(dataset.root, replace(dataset.info, features=left))

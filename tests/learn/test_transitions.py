@@ -69,7 +69,7 @@ def read(monkeypatch):
         table = make_table()
         table["label_valid"] = table["label_valid"].reshape(-1)
         table["actor"] = np.full(EPISODES * LENGTH, Actor.EXPERT)
-        table["next.success"] = table["frame_index"] >= LENGTH - 5
+        table["next.success"] = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
         table |= {name.replace("__", "."): value for name, value in changes.items()}
         monkeypatch.setattr(transitions, "joined_columns", lambda roots, names: {name: table[name] for name in names})
         monkeypatch.setattr(transitions.Dataset, "open", lambda root: SimpleNamespace(features=table))

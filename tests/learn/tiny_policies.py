@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,9 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
-from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE, RobotTaskSpec, features
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.learn.lerobot_config import policy_features, policy_types
 from manip_il.learn.policy import LearnedPolicy
 
@@ -53,14 +52,16 @@ def write_checkpoint(
     spec: RobotTaskSpec,
     observation: str = "state",
     *,
-    meta: CheckpointMeta | None = None,
+    origin: Origin | None = None,
     **options: Any,
 ) -> Path:
-    """A `pretrained_model` folder for data of `spec`; without `meta` as lerobot-train leaves it."""
+    """A `pretrained_model` folder for data of `spec`; without `origin` as lerobot-train leaves it."""
     policy_types()  # registers all of them
     settings = {"device": "cpu", "push_to_hub": False} | TINY.get(kind, {}) | options
     config = make_policy_config(kind, **{name: value for name, value in settings.items() if name != "type"})
-    config.input_features, config.output_features = policy_features(features(spec), observation)
+    inputs = [STATE, *([ENVIRONMENT_STATE] if observation != "images" else [])]
+    inputs += list(spec.image_keys) if observation != "state" else []
+    config.input_features, config.output_features = policy_features(features(spec), inputs)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         policy = get_policy_class(kind)(config)
@@ -68,8 +69,8 @@ def write_checkpoint(
     policy.save_pretrained(folder)
     for processor in make_pre_post_processors(config, dataset_stats=_statistics(config)):
         processor.save_pretrained(folder)
-    if meta is not None:
-        (folder / META_FILE).write_text(json.dumps(asdict(meta)))
+    if origin is not None:
+        (folder / META_FILE).write_text(json.dumps(origin.to_json()))
     return folder
 
 

@@ -21,7 +21,7 @@ from manip_il.learn.lerobot_reward import score_by_lerobot
 from manip_il.learn.preference.modeling_preference import write_reward
 from manip_il.learn.preference.network import RewardNetwork, RewardShape
 from manip_il.learn.reward import LearnedReward
-from manip_il.learn.weights import rabc_weights, read_progress
+from manip_il.learn.weights import rabc_weights
 from manip_il.preferences.frames import Frames, read_frames
 from manip_il.preferences.score_report import score_report
 from manip_il.preferences.scores import Scores, episode_scores, roc_auc, write_weights
@@ -78,7 +78,7 @@ def test_weights_are_lerobots(ahead, scored, tmp_path):
     write_weights(path, scored)
     theirs = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
     deltas = np.array([theirs._compute_delta(index) for index in range(len(scored.frames))], np.float32)
-    ours = rabc_weights(read_progress(path, scored.data.episodes), scored.data.episodes, ahead)
+    ours = rabc_weights(path, scored.data.episodes, ahead)
     assert ours == pytest.approx(theirs._compute_weights(deltas), abs=1e-5)
     assert {0.0, 1.0} < set(ours.tolist())
 
@@ -87,7 +87,7 @@ def test_frames_weigh_by_how_their_episode_ends(scored, tmp_path):
     """But for an episode's last frame, after which nothing rises or falls."""
     path, data = tmp_path / "rabc.parquet", scored.data
     write_weights(path, scored)
-    weights = rabc_weights(read_progress(path, data.episodes), data.episodes, 5)
+    weights = rabc_weights(path, data.episodes, 5)
     inner = np.delete(np.arange(len(weights)), data.firsts + data.lengths - 1)
     assert (weights[inner] == scored.succeeded.repeat(data.lengths)[inner]).all()
     assert pq.read_table(path)["score"].to_numpy() == pytest.approx(scored.frames, abs=1e-6)
@@ -98,7 +98,7 @@ def test_frames_weigh_by_how_their_episode_ends(scored, tmp_path):
 def test_where_all_episodes_end_alike_all_are_kept(level, scored, tmp_path):
     path, data = tmp_path / "rabc.parquet", scored.data
     write_weights(path, replace(scored, frames=np.full(len(data.states), level)))
-    weights = rabc_weights(read_progress(path, data.episodes), data.episodes, 1)
+    weights = rabc_weights(path, data.episodes, 1)
     assert (np.delete(weights, data.firsts + data.lengths - 1) == 1).all()
 
 
@@ -115,26 +115,15 @@ def test_lerobot_weights_a_batch_by_the_file(scored, tmp_path):
     assert weights[:2].tolist() == pytest.approx([1.5, 1.5], abs=1e-4)
 
 
-def test_a_frame_without_progress_weighs_one():
-    progress = np.array([0.0, np.nan, 0.5, 0.4])
-    assert rabc_weights(progress, np.zeros(4, int), 2)[1] == 1
-
-
-def test_what_gets_worse_weighs_nothing_and_an_end_little():
-    weights = rabc_weights(np.array([0.0, 0.5, 1.0, 0.9, 0.5, 0.1]), np.array([0, 0, 0, 1, 1, 1]), 1)
-    assert weights[[0, 1, 3, 4]].tolist() == [1, 1, 0, 0]
-    assert 0 < weights[2] < 1
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"index": [0, 0, 1]}, "frames differs"),
-        ({"index": [0, 1, 9]}, "frames differs"),
+        ({"index": [0, 0, 1]}, "episodes differs"),
+        ({"index": [0, 1, 9]}, "episodes differs"),
         ({"episode_index": [0, 1, 1]}, "episodes differs"),
         ({"index": ["a", "b", "c"]}, "is no file of weights"),
-        ({"progress_sparse": [0.0, 1.0, np.inf]}, "progress_sparse of frame 2 is infinite"),
-        ({"progress_sparse": None}, "unknown column"),
+        ({"progress_sparse": None}, "is no file of weights"),
+        ({"progress_sparse": [1.0, 0.0, np.nan], "episode_index": [0, 0, 0]}, "episodes differs"),
     ],
 )
 def test_a_file_of_other_weights_is_refused(change, says, tmp_path):
@@ -142,7 +131,7 @@ def test_a_file_of_other_weights_is_refused(change, says, tmp_path):
     path = tmp_path / "rabc.parquet"
     pq.write_table(pa.table({key: value for key, value in columns.items() if value is not None}), path)
     with pytest.raises(ManipError, match=says):
-        read_progress(path, np.array([0, 0, 1]))
+        rabc_weights(path, np.array([0, 0, 1]), 1)
 
 
 def test_a_reward_model_is_scored_through_lerobots_factory(datasets, tmp_path):

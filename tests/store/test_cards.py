@@ -14,7 +14,7 @@ from PIL import Image
 
 from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.checkpoint import Origin
 from manip_il.store.cards import write_cards
 
 from ..learn.tiny_policies import write_checkpoint
@@ -84,7 +84,7 @@ def test_a_card_tells_no_place_and_no_secret(demos: Path, monkeypatch: pytest.Mo
 
 def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path: Path):
     spec, run = Dataset.open(SAMPLE).spec, tmp_path / "run"
-    meta = CheckpointMeta("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
+    meta = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
     write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
     write_checkpoint(run / "best" / "pretrained_model", "act", spec, meta=meta)
     text = cards(run, "policy", "user/act")[CARD].decode()

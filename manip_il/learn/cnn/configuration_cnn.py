@@ -7,12 +7,10 @@ from typing import override
 
 from lerobot.configs import PreTrainedConfig
 
-from manip_il import checks
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 
 MIN_SIDE = 32  # of a picture [pixels]
-MOST_LAYERS, LARGEST = 32, 4_096  # of channels, keypoints, numbers to read off
 
 
 @PreTrainedConfig.register_subclass("cnn")
@@ -44,23 +42,19 @@ class CNNConfig(MLPConfig):
     depth: int = 2
     loss: str = "l1"
     use_amp: bool = True
-    optimizer_lr: float = 2e-3
     scheduler_warmup_steps: int = 200
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        try:
-            layers = checks.array("channels", self.channels, MOST_LAYERS)
-            self.channels = tuple(checks.whole("channels", layer, 1, LARGEST) for layer in layers)
-            if len(self.channels) < 2:
-                raise ManipError(f"channels is {list(self.channels)}; expected at least two layers")
-            checks.whole("keypoints", self.keypoints, 1, LARGEST)
-            for name in ("privileged_size", "named_points"):  # 0: off
-                checks.whole(name, getattr(self, name), 0, LARGEST)
-            for name in ("aux_weight", "heatmap_weight"):
-                checks.number(name, getattr(self, name), 0.0)
-        except ManipError as error:
-            raise UsageError(f"policy.{error}") from error
+        self.channels = tuple(self.channels)
+        if len(self.channels) < 2 or min(self.channels) < 1 or self.keypoints < 1:
+            raise UsageError(
+                f"policy.channels is {list(self.channels)}, keypoints {self.keypoints}; expected two layers or "
+                "more, and at least 1"
+            )
+        for name in ("aux_weight", "heatmap_weight"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"policy.{name} is {getattr(self, name)}; expected 0 or more")
 
     @override
     def validate_features(self) -> None:

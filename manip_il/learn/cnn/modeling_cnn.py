@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, KEYPOINTS, STATE
 from manip_il.errors import UsageError
 from manip_il.learn.cnn.configuration_cnn import CNNConfig
-from manip_il.learn.columns import INDEX, Table
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.network import MLPNetwork, fit_statistics
+from manip_il.learn.samples import Table
 
 NUMBERS = 4  # a keypoint: x, y, spread, strength
 STRIDE = 4  # of heat maps [pixels]
@@ -173,8 +173,6 @@ class CNNPolicy(MLPPolicy):
         self.privileged: nn.Module | None = None
         self.aux_weight, self.heatmap_weight = config.aux_weight, config.heatmap_weight
         self._make(config)
-        self._privileged_by_index: Tensor | None = None
-        self._places_by_index: Tensor | None = None
 
     def _make(self, config: CNNConfig) -> None:
         """Make encoders, the perceptron that reads the state off, and the one for the action, of the sizes given."""
@@ -208,14 +206,13 @@ class CNNPolicy(MLPPolicy):
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
         with torch.autocast(inputs.device.type, enabled=False):
             losses = super()._row_losses(inputs, batch)
-            if not self.training or batch.get(INDEX) is None:
+            if not self.training:
                 return losses
-            index = batch[INDEX].reshape(-1).cpu()
-            if self._privileged_by_index is not None:
-                truth = (self._privileged_by_index[index].to(inputs.device) - self.truth_mean) * self.truth_scale
-                losses = losses + self.aux_weight * (inputs[:, self.seen_size :] - truth).abs().mean(-1)
-            if self._places_by_index is not None:
-                losses = losses + self.heatmap_weight * self._heat_map_losses(self._places_by_index[index])
+            if (truth := self._of_frames(ENVIRONMENT_STATE, batch)) is not None:
+                wanted = (truth - self.truth_mean) * self.truth_scale
+                losses = losses + self.aux_weight * (inputs[:, self.seen_size :] - wanted).abs().mean(-1)
+            if (places := self._of_frames(KEYPOINTS, batch)) is not None:
+                losses = losses + self.heatmap_weight * self._heat_map_losses(places)
             return losses
 
     def _heat_map_losses(self, places: Tensor) -> Tensor:
@@ -227,38 +224,40 @@ class CNNPolicy(MLPPolicy):
 
     @override
     def _more_columns(self) -> Sequence[str]:
-        """The places of named points, where heat maps are learnt."""
-        return [key.replace(IMAGES, KEYPOINTS) for key in self.cameras] if self.heatmap_weight else ()
+        """The truth to read off, and the places of named points, where heat maps are learnt."""
+        return [ENVIRONMENT_STATE, *self._place_columns()]
+
+    def _place_columns(self) -> list[str]:
+        return [key.replace(IMAGES, KEYPOINTS) for key in self.cameras] if self.heatmap_weight else []
 
     @override
-    def _learn_columns(self, columns: Table, loss: str) -> None:
+    def _learn_columns(self, columns: Table) -> None:
         config, truth, places = cast(CNNConfig, self.config), self._truth(columns), self._places(columns)
         sizes = 0 if truth is None else truth.shape[1], 0 if places is None else places.shape[2]
         if not config.privileged_size and not config.named_points and any(sizes):
             config.privileged_size, config.named_points = sizes
             self._make(config)
-        if truth is not None and config.privileged_size == sizes[0]:
+        super()._learn_columns(columns)
+        if truth is not None and config.privileged_size == sizes[0]:  # a checkpoint from another task goes on without
             statistics = fit_statistics(truth.numpy(), truth.numpy(), "mse")
-            self.truth_mean.copy_(statistics.input_mean)
-            self.truth_scale.copy_(statistics.input_scale)
-        super()._learn_columns(columns, loss)
-        index = torch.from_numpy(columns[INDEX])
-        # A checkpoint from another task goes on without.
-        self._privileged_by_index = _by_index(index, truth) if config.privileged_size == sizes[0] else None
-        self._places_by_index = _by_index(index, places) if config.named_points == sizes[1] else None
+            self.truth_mean.copy_(statistics["input_mean"])
+            self.truth_scale.copy_(statistics["input_scale"])
+            self._remember(ENVIRONMENT_STATE, columns, truth)
+        if places is not None and config.named_points == sizes[1]:
+            self._remember(KEYPOINTS, columns, places)
 
     def _truth(self, columns: Table) -> Tensor | None:
         """The state of the environment, (N, k), where it is to be read off."""
         if not self.aux_weight or ENVIRONMENT_STATE not in columns or ENVIRONMENT_STATE in self.inputs:
             return None
-        return torch.from_numpy(columns[ENVIRONMENT_STATE])
+        return torch.from_numpy(columns[ENVIRONMENT_STATE].astype(np.float32))
 
     def _places(self, columns: Table) -> Tensor | None:
         """Where named points are in every camera's picture, (N, cameras, K, 3), where heat maps are to be learnt.
 
         Raises `UsageError` for a dataset without.
         """
-        keys = self._more_columns()
+        keys = self._place_columns()
         if not keys:
             return None
         if missing := [key for key in keys if key not in columns]:
@@ -268,12 +267,3 @@ class CNNPolicy(MLPPolicy):
             )
         found = np.stack([np.asarray(columns[key], np.float32) for key in keys], axis=1)
         return torch.from_numpy(found).unflatten(2, (-1, 3))
-
-
-def _by_index(index: Tensor, values: Tensor | None) -> Tensor | None:
-    """Values (N, ...) of frames at their `index`."""
-    if values is None:
-        return None
-    known = torch.zeros(int(index.max()) + 1, *values.shape[1:])
-    known[index] = values
-    return known

@@ -1,19 +1,41 @@
-"""The options of the `mlp` policy, in LeRobot's form."""
+"""The options of the `mlp` policy, in LeRobot's form, and the schedule of its learning rate."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import override
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
-from lerobot.optim import AdamWConfig
-from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.fit_config import JOINT_DELTA, MLPOptions
+from manip_il.learn.checkpoint import JOINT_DELTA
+from manip_il.learn.fit_config import MLPOptions
 from manip_il.learn.network import Shape
 
 SIGMA = 3.0  # [bins]
+
+
+@LRSchedulerConfig.register_subclass("warm_up_and_cosine")
+@dataclass
+class WarmUpAndCosineConfig(LRSchedulerConfig):
+    """A linear warm-up of a tenth of the steps at most, then a cosine down to zero."""
+
+    num_warmup_steps: int = 100  # type: ignore[assignment]
+
+    @override
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        warmup = min(self.num_warmup_steps, num_training_steps // 10)
+
+        def share(step: int) -> float:
+            if step < warmup:
+                return (step + 1) / (warmup + 1)
+            return 0.5 * (1.0 + math.cos(math.pi * (step - warmup) / max(1, num_training_steps - warmup)))
+
+        return LambdaLR(optimizer, share)
 
 
 @PreTrainedConfig.register_subclass("mlp")
@@ -30,7 +52,7 @@ class MLPConfig(PreTrainedConfig):
     The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
 
-    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of bounds.
+    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of range.
     """
 
     width: int = MLPOptions.width
@@ -48,13 +70,11 @@ class MLPConfig(PreTrainedConfig):
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("STATE", "ENV", "VISUAL", "ACTION"), NormalizationMode.IDENTITY)
     )
-
-    observation_delta_indices = action_delta_indices = reward_delta_indices = None  # type: ignore[assignment]
-
-    # Read by lerobot-train alone; `manip_il.learn.train` has its own.
-    optimizer_lr: float = 1e-3
+    optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
     scheduler_warmup_steps: int = 100
+
+    observation_delta_indices = action_delta_indices = reward_delta_indices = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,5 +106,5 @@ class MLPConfig(PreTrainedConfig):
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
 
     @override
-    def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
-        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+    def get_scheduler_preset(self) -> LRSchedulerConfig:
+        return WarmUpAndCosineConfig(self.scheduler_warmup_steps)

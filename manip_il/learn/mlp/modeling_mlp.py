@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast, override
+from typing import Any, override
 
-import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from numpy.typing import NDArray
 from torch import Tensor
 
 from manip_il.data.dataset import joined_columns
+from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError
-from manip_il.learn.action_spaces import JointTarget, conversion
-from manip_il.learn.columns import INDEX, Table, learning_rows, valid_frames
-from manip_il.learn.fit_config import EE_DELTA
+from manip_il.learn.action_spaces import ARM, GRIPPER
+from manip_il.learn.checkpoint import EE_DELTA
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.network import MLPNetwork, fit_statistics
+from manip_il.learn.samples import Table, valid_frames
 
 
 class MLPPolicy(PreTrainedPolicy):
@@ -27,8 +26,8 @@ class MLPPolicy(PreTrainedPolicy):
     Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, to learn,
     `action` (B, n), all raw ([rad], [m]).
 
-    dataset_meta: LeRobot's, given by `make_policy` for training, or ours of several; the statistics are then those of
-    its columns, and frames without a valid label are left out of the loss.
+    dataset_meta: LeRobot's, given by `make_policy` for training, or with a `table` of the columns; the statistics are
+    then theirs, and frames without a valid label are left out of the loss.
     """
 
     config_class = MLPConfig  # type: ignore[assignment]
@@ -38,28 +37,25 @@ class MLPPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})]
+        self._by_index: dict[str, Tensor] = {}  # of every frame of the data, by its `index`
         self._build(config)
-        self._valid_by_index: Tensor | None = None
         if dataset_meta is not None:
-            roots = getattr(dataset_meta, "roots", None) or (dataset_meta.root,)
-            wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, *self._more_columns())
-            names = [key for key in wanted if key in dataset_meta.features]
-            table = joined_columns(roots, [*names, INDEX])
-            if config.action_space == EE_DELTA:
-                table[ACTION] = _converted(dataset_meta)
-            self._learn_columns(table, config.loss)
+            self._learn_columns(self._columns(config, dataset_meta))
 
     @override
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Return the mean loss of rows with a valid label; with `reduction="none"` each row's, (B,), 0 without one."""
-        losses = self._row_losses(self._inputs(batch), batch)
-        valid = self._valid(batch)
+        """Return the mean loss of rows with a valid label; with `reduction="none"` each row's, (B,), 0 without one.
+
+        When it does not train, the mean absolute errors of acting, too: of the arm [rad] and the gripper [m].
+        """
+        inputs = self._inputs(batch)
+        losses, valid = self._row_losses(inputs, batch), self._of_frames(LABEL_VALID, batch)
         # `where`, as 0 * inf is NaN
         losses = losses if valid is None else torch.where(valid, losses, torch.zeros_like(losses))
         if reduction == "none":
             return losses, {}
         count = len(losses) if valid is None else valid.sum().clamp(min=1)
-        return losses.sum() / count, {}
+        return losses.sum() / count, {} if self.training else self._errors(inputs.detach(), batch)
 
     @override
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
@@ -77,11 +73,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def get_optim_params(self) -> Any:
-        return self.parameters()
-
-    def _more_columns(self) -> Sequence[str]:
-        """Columns that learning looks at beside the mlp's."""
-        return ()
+        return [{"params": list(self.parameters()), "fused": True}]
 
     def _build(self, config: MLPConfig) -> None:
         """Make the network, and leave out the features that it does not look at."""
@@ -94,33 +86,47 @@ class MLPPolicy(PreTrainedPolicy):
         targets = self.model.encode_targets(self.model.relative(batch[ACTION], inputs))
         return self.model.row_losses(self.model.encode(inputs), targets)
 
+    def _errors(self, inputs: Tensor, batch: dict[str, Tensor]) -> dict[str, float]:
+        error = (self.model.act(inputs) - batch[ACTION]).abs().mean(0)
+        return {"arm_error": error[ARM].mean().item(), "gripper_error": error[GRIPPER].item()}
+
     def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
         return torch.cat([batch[key] for key in self.inputs], dim=-1)
 
-    def _valid(self, batch: dict[str, Tensor]) -> Tensor | None:
-        if LABEL_VALID in batch:
-            return batch[LABEL_VALID].reshape(-1) != 0
-        # LeRobot's preprocessor drops columns that it does not know; `index` is one that it keeps.
-        if self._valid_by_index is not None and batch.get(INDEX) is not None:
-            index = batch[INDEX].reshape(-1)
-            return self._valid_by_index.to(index.device)[index]
-        return None
+    def _of_frames(self, name: str, batch: dict[str, Tensor]) -> Tensor | None:
+        """What is known of the frames of a batch, (B, ...): of these LeRobot's preprocessor keeps `index` alone."""
+        if name not in self._by_index or batch.get(INDEX) is None:
+            return None
+        return self._by_index[name][batch[INDEX].reshape(-1).cpu()].to(batch[STATE].device)
 
-    def _learn_columns(self, columns: Table, loss: str) -> None:
+    def _remember(self, name: str, columns: Table, values: Tensor) -> None:
+        """Keep values (N, ...) of all frames of the data."""
+        index = torch.from_numpy(columns[INDEX].reshape(-1))
+        self._by_index[name] = values.new_zeros((int(index.max()) + 1, *values.shape[1:]))
+        self._by_index[name][index] = values
+
+    def _columns(self, config: MLPConfig, dataset_meta: Any) -> Table:
+        """The columns of the data that is learnt from; those that nobody has read yet are read."""
+        table = dict(getattr(dataset_meta, "table", {}))
+        if config.action_space == EE_DELTA and not table:
+            raise ManipError(
+                f"{EE_DELTA} needs the robot's kinematics, which LeRobot has not: train with manip-il train"
+            )
+        wanted = [key for key in (*self.inputs, ACTION, LABEL_VALID, *self._more_columns()) if key not in table]
+        if names := [key for key in wanted if key in dataset_meta.features]:
+            roots = getattr(dataset_meta, "roots", ()) or (dataset_meta.root,)
+            table |= joined_columns(roots, [*names, INDEX])
+        return table
+
+    def _more_columns(self) -> Sequence[str]:
+        """Columns that learning looks at beside the mlp's."""
+        return ()
+
+    def _learn_columns(self, columns: Table) -> None:
         """Take statistics and valid labels from a dataset's columns."""
-        space = cast(MLPConfig, self.config).action_space
-        rows = learning_rows(
-            {key: columns[key] for key in (*self.inputs, ACTION, LABEL_VALID) if key in columns},
-            JointTarget() if space == EE_DELTA else conversion(space, ""),  # hand motions are converted already
-        )
-        self.model.set_statistics(fit_statistics(rows.inputs, rows.targets, loss))
-        valid = torch.zeros(int(columns[INDEX].max()) + 1, dtype=torch.bool)
-        valid[torch.from_numpy(columns[INDEX])] = torch.from_numpy(valid_frames(columns))
-        self._valid_by_index = valid
-
-
-def _converted(dataset_meta: Any) -> NDArray[np.float32]:
-    """The dataset's actions as motions of the hand, (N, n), which `PolicyTrainer` leaves with the metadata."""
-    if (actions := getattr(dataset_meta, "learnt_actions", None)) is None:
-        raise ManipError(f"{EE_DELTA} needs the robot's kinematics, which LeRobot has not: train with manip-il train")
-    return actions
+        valid = torch.from_numpy(valid_frames(columns))
+        seen = torch.cat([torch.from_numpy(columns[key])[valid] for key in self.inputs], dim=1).float()
+        actions = torch.from_numpy(columns[ACTION])[valid].float()
+        targets = self.model.relative(actions, seen)
+        self.model.set_statistics(fit_statistics(seen.numpy(), targets.numpy(), self.model.loss))
+        self._remember(LABEL_VALID, columns, valid)

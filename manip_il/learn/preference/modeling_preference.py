@@ -14,7 +14,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
-from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.learn.preference.configuration_preference import PreferenceConfig
 from manip_il.learn.preference.network import RewardNetwork, RewardShape
 
@@ -63,6 +63,5 @@ def write_reward(
     model = PreferenceRewardModel(made)
     model.model.load_state_dict(network.state_dict())
     model.save_pretrained(folder)
-    meta = asdict(CheckpointMeta.of(spec, fingerprint, options))
-    words = {name: value for name, value in meta.items() if value or name != "object"}
-    (folder / META_FILE).write_text(json.dumps(words, indent=2) + "\n", encoding="utf-8")
+    origin = Origin.of(spec, fingerprint, options).to_json()
+    (folder / META_FILE).write_text(json.dumps(origin, indent=2) + "\n", encoding="utf-8")

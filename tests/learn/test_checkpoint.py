@@ -1,0 +1,338 @@
+"""A folder from anywhere: what it says is checked before anything of it is loaded, and nothing that it names runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.job import RolloutJob
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.learn.checkpoint import PLAIN, Checkpoint, Origin, read_origin, require_trust
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_config import policy_class, policy_config, policy_types
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.train import fit
+from manip_il.sim.env import EnvConfig
+
+from .tiny_policies import edit_config, observations, refused, write_checkpoint
+
+DEEP = "[" * 100_000
+EVIL = {
+    "registry_name": "action_tokenizer_processor",
+    "config": {"action_tokenizer_name": "evil/tokenizer", "trust_remote_code": True},
+}
+
+
+@pytest.fixture
+def mlp(dataset, tmp_path) -> Path:
+    return fit(dataset, FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8), tmp_path / "run")
+
+
+def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured, tmp_path):
+    origin = Origin.of(pictured, {"mujoco": "3"}, {"steps": 2}, "both", {}, action_space="joint_target")
+    folder = write_checkpoint(tmp_path / "policy", "act", pictured, "both", origin=origin)
+    (folder / "model.safetensors").write_bytes(b"")
+    found = Checkpoint.open(folder)
+    assert (found.kind, found.observation, found.action, found.space) == ("act", "both", 4, "joint_target")
+    assert found.numbers == {"observation.state": 4, "observation.environment_state": 6}
+    assert found.pictures == {"front": (32, 48), "wrist": (32, 48)}
+    assert found.origin == origin
+    found.check_fits(pictured)
+    edit_config(folder, input_features={"observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 48, 64]}})
+    assert Checkpoint.open(folder).pictures == {}  # LeRobot fills it in itself
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"numbers": {"observation.state": 5}}, r"width of observation\.state .*the policy has 5, arm/reach has 4"),
+        ({"numbers": {"observation.effort": 4}}, r"inputs .*the policy has observation\.effort, .*arm/reach has obs"),
+        ({"action": 7}, r"width of the action differs: the policy has 7, arm/reach has 4"),
+        ({"pictures": {"top": (32, 48)}}, r"the policy has .*images\.top, .*images\.front, observation\.images\.wrist"),
+        ({"pictures": {"wrist": (48, 32)}}, r"pictures of wrist .*\(48, 32\).*\(32, 48\)"),
+        ({"robot": "leg"}, r"robot, whose hand moves.*the policy has leg, arm/reach has arm"),
+    ],
+)
+def test_an_environment_that_lacks_an_input_is_refused_by_both_names(change, words, act, pictured):
+    with pytest.raises(MismatchError, match=words):
+        replace(Checkpoint.open(act), **change).check_fits(pictured)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"robot": "leg"},
+        {"fps": 50},
+        {"joint_names": ("a", "c", "b", "gripper")},
+        {"environment_state_names": ("x",)},
+        {"action_meaning": "torques"},
+    ],
+)
+def test_a_policy_for_something_else_is_refused_naming_both(change, act, spec):
+    with pytest.raises(MismatchError) as error:
+        Checkpoint.open(act).check_fits(replace(spec, **change))
+    ((name, value),) = change.items()
+    assert str(value) in str(error.value)
+    assert str(getattr(spec, name)) in str(error.value)
+
+
+class Bomb:
+    """Says that it was unpickled."""
+
+    def __init__(self, mark: Path):
+        self.mark = mark
+
+    def __reduce__(self):
+        return Path.touch, (self.mark,)
+
+
+@pytest.mark.parametrize("name", ["pytorch_model.bin", "sub/weights.PT", "rng.pkl", "last.ckpt"])
+def test_a_folder_with_a_pickle_is_refused_and_the_pickle_not_opened(name, act, tmp_path):
+    mark = tmp_path / "opened"
+    (act / name).parent.mkdir(exist_ok=True)
+    (act / name).write_bytes(pickle.dumps(Bomb(mark)))
+    refused(act, rf"{name} is a pickle.*convert it to safetensors")
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("config.json", r"no config\.json in"),
+        ("model.safetensors", r"no model\.safetensors in .*weights are missing"),
+        ("policy_preprocessor.json", r"no .*policy_preprocessor\.json"),
+    ],
+)
+def test_a_file_that_is_missing_is_named(name, words, act):
+    (act / name).rename(act / "adapter_model.safetensors")
+    refused(act, "adapter: merge" if name == "model.safetensors" else words)
+    (act / "adapter_model.safetensors").unlink()
+    refused(act, words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "is not valid JSON"),
+        (DEEP, "nested too deeply"),
+        ('{"type": {"act": 1}}', "is not a LeRobot policy's: type is"),
+        ('{"type": "act", "input_features": null}', "is not a LeRobot policy's: input_features is None"),
+    ],
+)
+def test_a_config_that_is_no_policys_is_refused(text, words, act):
+    (act / "config.json").write_text(text)
+    refused(act, words)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"width": "256"}, "width is '256'; expected a whole number"),
+        ({"width": 32}, "do not match"),
+        ({"loss": {}}, "unknown loss"),
+        ({"activation": "sqrt"}, "unknown activation 'sqrt'"),
+        ({"clamp": 0}, "clamp is 0; expected more than 0"),
+        ({"action_space": "nowhere"}, "unknown action space"),
+        ({"input_features": {"observation.state": {"type": "STATE", "shape": ["4"]}}}, "a side of observation.state"),
+        ({"input_features": {"observation.state": 4}}, "expected an object"),
+        ({"output_features": {"move": {"type": "ACTION", "shape": [4]}}}, "no action among the outputs"),
+        ({"input_features": {"observation.images.x": {"type": "VISUAL", "shape": [3, 32]}}}, r"expected \(3, H, W\)"),
+    ],
+)
+def test_an_mlps_config_that_cannot_be_is_one_line(changes, words, mlp):
+    edit_config(mlp, **changes)
+    refused(mlp, words)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"dim_model": "wide"}, "dim_model"),
+        ({"chunk_size": -5}, "LeRobot cannot load it"),
+        ({"vision_backbone": None}, "LeRobot cannot load it"),
+        ({"no_such_option": 3}, r"LeRobot cannot load it.*no_such_option"),
+        ({"dim_model": 32}, "do not match"),
+    ],
+)
+def test_a_config_of_lerobots_that_cannot_be_is_one_line(changes, words, act):
+    edit_config(act, **changes)
+    refused(act, words, longest=600)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"width": 0}, r"policy\.width is 0"),
+        ({"clamp": -1}, r"policy\.clamp is -1"),
+        ({"type": "cnn", "channels": [16]}, r"policy\.channels is \[16\].*expected two layers"),
+        ({"type": "cnn", "aux_weight": -1}, r"policy\.aux_weight is -1"),
+    ],
+)
+def test_options_of_our_own_policies_are_checked_where_they_are_made(settings, words):
+    with pytest.raises(UsageError, match=words):
+        policy_config(FitConfig(settings | {"device": "cpu"}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fps": "20"}, "fps is '20'; expected a whole number"),
+        ({"robot": "../../x"}, "robot is"),
+        ({"joint_names": 5}, "joint_names is 5; expected a list"),
+        ({"image_size": [1, "x"]}, "a side of image_size is 'x'"),
+        ({"options": 7}, "options is 7"),
+        ({"colour": "red"}, "colour"),
+    ],
+)
+def test_what_a_policy_was_trained_for(changes: dict[str, Any], words, act):
+    path = act / "manip_il.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    with pytest.raises(ManipError, match=rf"manip_il\.json cannot be read \(.*{words}"):
+        read_origin(act)
+    for text in (DEEP, "", "null", '{"robot": "panda"}'):
+        path.write_text(text)
+        refused(act, r"manip_il\.json")
+
+
+def header(table: Any, length: int | None = None) -> bytes:
+    text = table if isinstance(table, bytes) else json.dumps(table).encode()
+    return struct.pack("<Q", len(text) if length is None else length) + text
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        header({}, length=2**60),
+        header(b"[]"),
+        header({"x": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4 * 10**12]}}),
+        header({"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}) + b"0000",
+    ],
+)
+@pytest.mark.parametrize("kind", ["mlp", "act"])
+def test_weights_that_are_broken_or_of_another_network(data, kind, request):
+    policy = request.getfixturevalue(kind)
+    (policy / "model.safetensors").write_bytes(data)
+    refused(policy, r"model\.safetensors cannot be read|do not match|LeRobot cannot load it")
+
+
+@pytest.fixture
+def ran(monkeypatch) -> list[tuple[Any, ...]]:
+    """What has been loaded by name, from a machine on which `transformers` is installed."""
+    from lerobot.processor import tokenizer_processor
+
+    calls: list[tuple[Any, ...]] = []
+
+    class Fake:
+        @classmethod
+        def from_pretrained(cls, name: str, **options: Any) -> Fake:
+            calls.append((name, options))
+            return cls()
+
+        def __call__(self, *_: Any) -> list[list[int]]:
+            return [[0]]
+
+    monkeypatch.setattr(tokenizer_processor, "_transformers_available", True)
+    monkeypatch.setattr(tokenizer_processor, "require_package", lambda *_, **__: None, raising=False)
+    for name in ("AutoProcessor", "AutoTokenizer"):
+        monkeypatch.setattr(tokenizer_processor, name, Fake, raising=False)
+    return calls
+
+
+def add_step(policy: Path, step: Any) -> None:
+    path = policy / "policy_preprocessor.json"
+    values = json.loads(path.read_text())
+    values["steps"].append(step)
+    path.write_text(json.dumps(values))
+
+
+def test_a_step_that_loads_by_name_runs_only_where_it_is_trusted(act, ran):
+    add_step(act, EVIL)
+    refused(act, r"action_tokenizer_processor.*evil/tokenizer.*add --trust=true")
+    assert ran == []
+    LearnedPolicy.load(act, trust=True)
+    assert ran[0] == ("evil/tokenizer", {"trust_remote_code": True})
+
+
+def test_a_worker_trusts_only_what_its_job_does(act, ran):
+    add_step(act, EVIL)
+    edit_config(act, input_features={"observation.state": {"type": "STATE", "shape": [8]}})
+    edit_config(act, output_features={"action": {"type": "ACTION", "shape": [8]}})
+    (act / "manip_il.json").unlink()
+    job = RolloutJob(EnvConfig("panda", "reach", horizon=8), PolicyDriver((act,)), label="last")
+    with pytest.raises(ManipError, match="--trust=true"):
+        list(pickle.loads(pickle.dumps(job)).run([0]))
+    assert ran == []
+    trusting = replace(job, driver=replace(job.driver, trust=True))
+    with pytest.raises(ManipError) as caught:  # sizes that do not belong together are found after all is allowed
+        list(pickle.loads(pickle.dumps(trusting)).run([0]))
+    assert "--trust" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        ({"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}}, "--trust=true"),
+        ({"registry_name": "groot_n1_7_pack_inputs_v1", "config": {}}, "--trust=true"),
+        ({"registry_name": "x" * 90, "config": {"y" * 10_000: "z" * 10_000}}, "--trust=true"),
+        ({"registry_name": "device_processor", "config": {"hook": "evil"}}, "LeRobot cannot load it"),
+        ({"class": "subprocess.Popen", "config": {"args": "true"}}, r"subprocess\.Popen"),
+        (5, "a step is 5"),
+        ({"registry_name": 5}, "registry_name is 5"),
+        *(
+            ({"registry_name": "normalizer_processor", "config": {}, "state_file": name}, "cannot be read")
+            for name in ("../secret.safetensors", "/etc/secret", "missing.safetensors")
+        ),
+    ],
+)
+def test_a_processor_loads_registered_steps_and_files_beside_it_alone(step, words, act):
+    (act.parent / "secret.safetensors").write_bytes((act / "model.safetensors").read_bytes())
+    add_step(act, step)
+    refused(act, words)
+    if "trust" not in words:
+        with pytest.raises(ManipError, match=words):
+            LearnedPolicy.load(act, trust=True)
+
+
+@pytest.mark.parametrize("changes", [{"eps": "small"}, {"features": 5}, {"norm_map": 3}])
+def test_odd_options_of_a_normaliser_are_found_before_the_first_episode(changes, act):
+    path = act / "policy_preprocessor.json"
+    values = json.loads(path.read_text())
+    [step] = [step for step in values["steps"] if step["registry_name"] == "normalizer_processor"]
+    step["config"] |= changes
+    path.write_text(json.dumps(values))
+    with pytest.raises(ManipError, match=r"LeRobot cannot load it|the policy cannot act"):
+        LearnedPolicy.load(act).act(*observations(1))
+
+
+@pytest.mark.parametrize("kind", policy_types())
+def test_every_policy_of_lerobots_is_plain_or_needs_trust(kind):
+    options = [field.name for field in dataclasses.fields(policy_class(kind))]
+    assert kind not in PLAIN or not any(name.endswith(("model_name", "tokenizer_name")) for name in options)
+    settings = {"type": kind}
+    if kind in PLAIN:
+        require_trust(settings, "x", trust=False)
+    else:
+        with pytest.raises(ManipError, match=rf"'{kind}' that would load models.*--trust=true"):
+            require_trust(settings, "x", trust=False)
+    require_trust(settings, "x", trust=True)
+
+
+def test_an_encoder_that_a_checkpoint_names_is_made_only_where_it_is_trusted(act):
+    edit_config(act, type="gaussian_actor", vision_encoder_name="evil/encoder")
+    for settings, source in (
+        ({"path": str(act)}, r"--policy\.path"),
+        ({"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, r"--policy\.type=gaussian_actor"),
+    ):
+        with pytest.raises(ManipError, match=rf"{source}.*vision_encoder_name='evil/encoder'.*--trust=true"):
+            policy_config(FitConfig(settings))
+    allowed = FitConfig({"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, trust=True)
+    assert policy_config(allowed).type == "gaussian_actor"
