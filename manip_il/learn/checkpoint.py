@@ -206,7 +206,7 @@ class Checkpoint:
 
     @property
     def observation(self) -> str:
-        """Which of `OBSERVATIONS` the policy takes."""
+        """The one of `OBSERVATIONS` that the policy takes."""
         return observation_of(self.columns)
 
     @property

@@ -132,7 +132,7 @@ class FitConfig:
 
     @property
     def observes(self) -> str:
-        """Which of `OBSERVATIONS` the policy takes: the one asked for, else the checkpoint's, else its kind's."""
+        """The one of `OBSERVATIONS` asked for, else the checkpoint's, else that of the policy's kind."""
         return self.observation or (self.start.observation if self.start else "images" if self.kind == CNN else "state")
 
     @property

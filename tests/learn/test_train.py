@@ -513,6 +513,15 @@ def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerob
     assert policy.checkpoint.origin.robot == "so101"
     pictures = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in ("front", "wrist")}
     assert policy.act(np.zeros((1, 6), np.float32), np.empty((1, 0), np.float32), pictures).shape == (1, 6)
+    again = [
+        "dagger",
+        "--robot.type=so101",
+        "--cameras=front",
+        f"--dataset.root={root}",
+        f"--output_dir={tmp_path / 'd'}",
+    ]
+    assert main([*again, "--policy.type=act", "--observation=images"]) == 1
+    assert "has no sim_state: it was not recorded in simulation" in capsys.readouterr().err
     config = run / "checkpoints/last/pretrained_model/train_config.json"
     more = [f"--dataset.root={root}", f"--output_dir={run}", "--steps=6", "--num_workers=0"]
     done = warm_lerobot.run("lerobot-train", f"--config_path={config}", "--resume=true", *more)
