@@ -50,15 +50,16 @@ class CertifyOptions:
 
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
-        policy = meta = None
+        policy = checkpoint = None
         if self.policy.path is not None:
-            from manip_il.learn.checkpoint import read_origin
+            from manip_il.learn.checkpoint import Checkpoint
 
             policy = find_policy(self.policy.path)
-            meta = read_origin(policy)
+            checkpoint = Checkpoint.open(policy)
+        meta = checkpoint.origin if checkpoint else None
         env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
-        if policy is not None:
-            check_policy(policy, meta, env, draw=self.engine == "local", trust=self.trust)
+        if checkpoint is not None:
+            check_policy(checkpoint, env, draw=self.engine == "local", trust=self.trust)
         from manip_il.collect.workers import Engine
         from manip_il.evaluation.certificate import FILE_NAME, summary_lines
         from manip_il.evaluation.certify import certify, count_episodes

@@ -128,12 +128,13 @@ class EnvGroup:
         robot, task, shape (of its object): None for those of the policy. meta: what a policy says of itself, where
         there is one. reward: of `carry`, empty for the task's own.
         """
+        from manip_il.data.dataset import UNKNOWN_TASK
         from manip_il.robots.robot import get_robot
         from manip_il.sim.scene import build_scene
         from manip_il.tasks.table import get_task
 
         robot = robot or (meta.robot if meta else EnvConfig.robot)
-        task = task or (meta.task if meta else EnvConfig.task)
+        task = task or (meta.task if meta and meta.task != UNKNOWN_TASK else EnvConfig.task)
         if shape is None:
             shape = meta.object if meta and meta.task == task else ""
         is_stock = robot == stock.ROBOT

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.options import Open
 from manip_il.cli.progress import warn
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError
 
 if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.algorithms.config import RunConfig
@@ -107,6 +107,7 @@ def check_given(config: RunConfig) -> None:
     """
     from manip_il.collect.environments import env_spec
     from manip_il.data.dataset import Dataset
+    from manip_il.data.schema import SIM_STATE
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.learn.sources import check_same_sources
 
@@ -114,6 +115,11 @@ def check_given(config: RunConfig) -> None:
     here, run = env_spec(config.env, recorded), f"{config.env.robot} {config.env.task} of this run"
     for root in config.datasets:
         given = Dataset.open(root)
+        if SIM_STATE not in given.features:
+            raise ManipError(
+                f"{root} has no {SIM_STATE}: it was not recorded in simulation, so rollouts cannot be added to it; fit "
+                f"a policy to it by manip-il train --dataset.root={root}, and begin with that: --policy.path=RUN"
+            )
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
         check_dataset(root, given.spec, given.fingerprint)
     if config.start is None:

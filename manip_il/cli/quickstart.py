@@ -20,7 +20,8 @@ from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.trials import Pictures, Shot, Trial, film_shots, suite_conditions
 from manip_il.errors import UnknownName, UsageError
-from manip_il.learn.fit_config import MLP, MLPOptions
+from manip_il.learn.fit_config import MLPOptions
+from manip_il.learn.names import MLP
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:

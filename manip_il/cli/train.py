@@ -16,7 +16,6 @@ from manip_il.cli.outputs import check_same_options, prepare_output, require_out
 from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
 from manip_il.cli.redraw import RedrawOptions
 from manip_il.data.atomic import exclusive
-from manip_il.data.info import read_info
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig, check_weights
 from manip_il.option import option, option_of
@@ -88,10 +87,10 @@ class TrainOptions:
         check_weights(self.dataset.root, self.dataset.weights)
         for root in self.dataset.root:
             require_dataset(root)
-            if not self.redraw:
-                config.inputs(root, read_info(root))
         self._check_redraw()
         self._check_weights()
+        if not self.redraw:
+            self._check_columns(config)
         if _is_first_process():
             require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
 
@@ -122,6 +121,14 @@ class TrainOptions:
             prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
             if self.resume:
                 check_same_options(self.output_dir, self, _FREE)
+
+    def _check_columns(self, config: FitConfig) -> None:
+        """Refuse datasets that lack what the policy looks at."""
+        from manip_il.data.info import read_info
+        from manip_il.learn.sources import input_columns
+
+        for root in self.dataset.root:
+            input_columns(config, root, read_info(root))
 
     def _check_redraw(self) -> None:
         if self.redraw < 0:
@@ -176,7 +183,7 @@ class TrainOptions:
     def _sources(self, config: FitConfig, roots: tuple[Path, ...]) -> Sources:
         """Return the datasets, which must agree with the first."""
         from manip_il.data.dataset import Dataset
-        from manip_il.learn.checkpoint import PLAIN
+        from manip_il.learn.names import PLAIN
         from manip_il.learn.sources import Sources
 
         sources = Sources(tuple(map(Dataset.open, roots)), tuple(self.dataset.weights))

@@ -131,14 +131,15 @@ class Trial:
     def check_policies(self, policies: dict[str, Path], folder: Path, engine: str) -> None:
         """Raise, before any episode runs, where one of the policies (name -> folder) cannot be measured."""
         from manip_il.cli.inputs import check_policy
-        from manip_il.learn.checkpoint import read_origin
+        from manip_il.learn.checkpoint import Checkpoint
 
         for name, policy in policies.items():
             if not self.file(folder, policy).is_file():
-                meta = read_origin(policy)
+                checkpoint = Checkpoint.open(policy)
+                meta = checkpoint.origin
                 if meta is not None and meta.task != self.env.task:
                     raise MismatchError("task", name, meta.task, "the comparison", self.env.task)
-                check_policy(policy, meta, self.env, draw=engine == "local", trust=self.trust)
+                check_policy(checkpoint, self.env, draw=engine == "local", trust=self.trust)
 
 
 def suite_conditions(suite: str, task: str, shape: str = "", *, sees: bool) -> tuple[Condition, ...]:

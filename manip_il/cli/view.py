@@ -118,13 +118,14 @@ class ViewOptions:
         """Return the episodes to show; without pictures where no policy looks at any and a window is open."""
         from manip_il.collect.drivers import PolicyDriver, driver_of
         from manip_il.collect.job import RolloutJob
-        from manip_il.learn.checkpoint import read_origin
+        from manip_il.learn.checkpoint import Checkpoint
         from manip_il.mdp import LONGEST_EPISODE
 
         path = None if self.policy.path is None else find_policy(self.policy.path)
-        meta = None if path is None else read_origin(path)
+        checkpoint = None if path is None else Checkpoint.open(path)
+        meta = checkpoint.origin if checkpoint else None
         env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
-        cameras = None if path is None else check_policy(path, meta, env, trust=self.trust)
+        cameras = None if checkpoint is None else check_policy(checkpoint, env, trust=self.trust)
         if cameras is not None and path is not None:
             say(observation_text(cameras, path))
         if cameras is None and not self._in_a_window:

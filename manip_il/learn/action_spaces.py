@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from manip_il.data.schema import JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
-from manip_il.learn.checkpoint import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
+from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.robots import ROBOTS
 from manip_il.robots.rotations import rotation_vector
 

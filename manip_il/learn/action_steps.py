@@ -23,7 +23,8 @@ from lerobot.processor import (
 from manip_il.data.schema import STATE
 from manip_il.errors import ManipError
 from manip_il.learn.action_spaces import Conversion, HandDelta, conversion
-from manip_il.learn.checkpoint import DECODER, JOINT_TARGET, MEASURED, OWN_SPACE
+from manip_il.learn.checkpoint import DECODER, MEASURED
+from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
 
 Pipeline = PolicyProcessorPipeline[Any, Any]
 _NORMALISER = "normalizer_processor"

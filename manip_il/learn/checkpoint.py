@@ -17,13 +17,10 @@ from typing import Any
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, OWN_OBJECT, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 
 CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
-MLP, CNN = OWN_SPACE = ("mlp", "cnn")  # policies that know their action space: joint_delta unless told otherwise
-OBSERVATIONS = ("state", "images", "both")  # besides the joints: the true poses, pictures, or both
-PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load nothing by name
 MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that carry an action space
 
 _PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
@@ -209,7 +206,7 @@ class Checkpoint:
 
     @property
     def observation(self) -> str:
-        """Which of `OBSERVATIONS` the policy takes."""
+        """The one of `OBSERVATIONS` that the policy takes."""
         return observation_of(self.columns)
 
     @property

@@ -25,7 +25,8 @@ from manip_il.checks import mapping, shorten
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
-from manip_il.learn.checkpoint import CONFIG, EE_DELTA, JOINT_DELTA, META_FILE
+from manip_il.learn.checkpoint import CONFIG, META_FILE
+from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 

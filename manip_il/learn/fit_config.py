@@ -7,23 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from manip_il.data.info import Info
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE
-from manip_il.errors import ManipError, UnknownName, UsageError
-from manip_il.learn.checkpoint import (
-    ACTION_SPACES,
-    CNN,
-    JOINT_TARGET,
-    MLP,
-    OBSERVATIONS,
-    OWN_SPACE,
-    Checkpoint,
-)
+from manip_il.errors import UnknownName, UsageError
+from manip_il.learn.names import ACTION_SPACES, CNN, CONVERTED, JOINT_TARGET, MLP, OBSERVATIONS
 from manip_il.option import option
 
-CONVERTED = (*OWN_SPACE, "act", "diffusion", "vqbet")  # policies whose actions may be converted
+if TYPE_CHECKING:  # it imports numpy
+    from manip_il.learn.checkpoint import Checkpoint
+
 _AT_LEAST_1 = ("steps", "batch_size", "threads", "log_freq", "save_freq")
 
 
@@ -122,7 +114,11 @@ class FitConfig:
     @cached_property
     def start(self) -> Checkpoint | None:
         """The checkpoint in `policy.path`. Raises `ManipError` for one that cannot be read."""
-        return Checkpoint.open(Path(self.policy["path"])) if "path" in self.policy else None
+        if "path" not in self.policy:
+            return None
+        from manip_il.learn.checkpoint import Checkpoint
+
+        return Checkpoint.open(Path(self.policy["path"]))
 
     @property
     def kind(self) -> str:
@@ -136,7 +132,7 @@ class FitConfig:
 
     @property
     def observes(self) -> str:
-        """Which of `OBSERVATIONS` the policy takes: the one asked for, else the checkpoint's, else its kind's."""
+        """The one of `OBSERVATIONS` asked for, else the checkpoint's, else that of the policy's kind."""
         return self.observation or (self.start.observation if self.start else "images" if self.kind == CNN else "state")
 
     @property
@@ -168,32 +164,6 @@ class FitConfig:
     def steps_per_checkpoint(self) -> int:
         """Steps from one checkpoint to the next."""
         return self.save_freq or self.defaults.save_freq
-
-    def inputs(self, root: Path, info: Info) -> list[str]:
-        """Return the columns of a dataset that the policy observes, by LeRobot's names.
-
-        Raises `ManipError` for one that the dataset lacks, with the way out.
-        """
-        cameras = [key for key, feature in info.features.items() if feature.is_rgb]
-        about = f"{root}: the dataset has no"
-        if ACTION not in info.features:
-            raise ManipError(f"{about} {ACTION}: there is nothing to learn")
-        if STATE not in info.features:
-            raise ManipError(f"{about} {STATE}: every policy needs the measured joints")
-        if self.observes != "images" and ENVIRONMENT_STATE not in info.features:
-            other = f"--policy.type={CNN} or act with --observation=images" if self.is_mlp else "--observation=images"
-            hint = f"choose {other}, or" if cameras else "record pictures, or"
-            raise ManipError(
-                f"{about} {ENVIRONMENT_STATE}, which --observation={self.observes} needs; {hint} record with "
-                "manip-il record"
-            )
-        if self.takes_images and not cameras:
-            raise ManipError(
-                f"{about} pictures, which --observation={self.observes} needs; record with --cameras=front,wrist, add "
-                "pictures with manip-il render, or choose --observation=state"
-            )
-        numbers = [STATE] if self.observes == "images" else [STATE, ENVIRONMENT_STATE]
-        return [*numbers, *(cameras if self.takes_images else [])]
 
 
 def check_convertible(kind: str, space: str) -> None:

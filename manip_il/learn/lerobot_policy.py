@@ -20,8 +20,9 @@ from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError, UnknownName
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.action_steps import add_steps, expect_converted  # known here, they are known to what is loaded
-from manip_il.learn.checkpoint import CONFIG, MLP, PROCESSORS, Checkpoint
+from manip_il.learn.checkpoint import CONFIG, PROCESSORS, Checkpoint
 from manip_il.learn.lerobot_config import policy_class, policy_types
+from manip_il.learn.names import MLP
 from manip_il.learn.network import warm_start
 from manip_il.learn.training_state import readable_state
 

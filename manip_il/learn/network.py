@@ -21,8 +21,9 @@ from torch import Tensor, nn
 from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.learn.action_spaces import ARM, GRIPPER
-from manip_il.learn.checkpoint import ACTION_SPACES, JOINT_DELTA, WEIGHTS
+from manip_il.learn.checkpoint import WEIGHTS
 from manip_il.learn.losses import LOSSES, make_head
+from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always
 # multiplies this many, filled up with zeros.
@@ -194,7 +195,7 @@ def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
 
 
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
-    """Return the network's tensors in a `pretrained_model` folder. Raises `ManipError` if they cannot be read."""
+    """Return weights (n, d) and units (n,) by name from a `pretrained_model` folder; `ManipError` if they are unreadable."""
     path = Path(pretrained_model) / WEIGHTS
     try:
         return {name.removeprefix("model."): tensor for name, tensor in load_file(path).items()}

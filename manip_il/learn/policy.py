@@ -14,8 +14,9 @@ from manip_il import checks
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion
-from manip_il.learn.checkpoint import CONFIG, EE_DELTA, JOINT_TARGET, MLP, Checkpoint
+from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.losses import LIKELIHOODS
+from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, Shape, read_weights
 from manip_il.learn.threads import threads
 from manip_il.mdp import F32, F64, Images

@@ -103,7 +103,7 @@ def _read_network(path: Path, config: dict[str, Any], width: int) -> RewardNetwo
     try:
         lists: dict[str, Any] = {name: tuple(checks.array(name, config.get(name, []))) for name in ("ways", "unread")}
         sizes: dict[str, Any] = {name: config.get(name) for name in ("members", "width", "depth")}
-        shape = RewardShape(**sizes, **lists, logarithms=bool(config.get("logarithms", False)))
+        shape = RewardShape(**sizes, **lists, logarithms=checks.truth("logarithms", config.get("logarithms", False)))
         network = RewardNetwork(width, shape)
         network.load_state_dict(read_weights(path))
     except (ManipError, RuntimeError) as error:

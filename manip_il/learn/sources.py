@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
-from manip_il.data.schema import RobotTaskSpec, check_same_spec
+from manip_il.data.info import Info
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.fit_config import check_weights
+from manip_il.learn.fit_config import FitConfig, check_weights
+from manip_il.learn.names import CNN
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 
@@ -96,6 +98,32 @@ def check_same_sources(
             left, right = getattr(specs[0], name), getattr(spec, name)
             if left != right and UNKNOWN_TASK not in (left, right):
                 raise MismatchError(name, str(roots[0]), left, str(root), right)
+
+
+def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
+    """Return the columns of a dataset that a policy observes, by LeRobot's names.
+
+    Raises `ManipError` for one that the dataset lacks, with the way out.
+    """
+    cameras = [key for key, feature in info.features.items() if feature.is_rgb]
+    about, observes = f"{root}: the dataset has no", config.observes
+    if ACTION not in info.features:
+        raise ManipError(f"{about} {ACTION}: there is nothing to learn")
+    if STATE not in info.features:
+        raise ManipError(f"{about} {STATE}: every policy needs the measured joints")
+    if observes != "images" and ENVIRONMENT_STATE not in info.features:
+        other = f"--policy.type={CNN} or act with --observation=images" if config.is_mlp else "--observation=images"
+        hint = f"choose {other}, or" if cameras else "record pictures, or"
+        raise ManipError(
+            f"{about} {ENVIRONMENT_STATE}, which --observation={observes} needs; {hint} record with manip-il record"
+        )
+    if config.takes_images and not cameras:
+        raise ManipError(
+            f"{about} pictures, which --observation={observes} needs; record with --cameras=front,wrist, add pictures "
+            "with manip-il data render, or choose --observation=state"
+        )
+    numbers = [STATE] if observes == "images" else [STATE, ENVIRONMENT_STATE]
+    return [*numbers, *(cameras if config.takes_images else [])]
 
 
 def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -30,13 +30,14 @@ from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
-from manip_il.learn.checkpoint import JOINT_TARGET, OWN_SPACE, Origin
+from manip_il.learn.checkpoint import Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit, without_places
 from manip_il.learn.lerobot_policy import build_policy, build_processors
 from manip_il.learn.metrics import Writer, metric_writers
+from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
 from manip_il.learn.samples import I64, Batch, load_data
-from manip_il.learn.sources import Sources
+from manip_il.learn.sources import Sources, input_columns
 from manip_il.learn.threads import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
@@ -84,7 +85,7 @@ class Trainer:
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
         checkpoint = last_checkpoint(output_dir, resume=resume)
         self.meta: Any = read_metadata(*sources.roots)
-        self.lerobot.set_features(self.meta.features, config.inputs(first.root, first.info))
+        self.lerobot.set_features(self.meta.features, input_columns(config, first.root, first.info))
         self._check_widths()
         self.data = load_data(
             sources.roots,

@@ -15,7 +15,7 @@ from lerobot.envs import EnvConfig
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName, UsageError, silence_ffmpeg_warning
-from manip_il.learn.checkpoint import OBSERVATIONS
+from manip_il.learn.names import OBSERVATIONS
 from manip_il.option import option_of
 from manip_il.robots.robot import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig

@@ -17,9 +17,10 @@ from manip_il.data.lerobot_library import read_metadata
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion, conversion_for
-from manip_il.learn.checkpoint import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, META_FILE
+from manip_il.learn.checkpoint import META_FILE
 from manip_il.learn.export import export_torchscript
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer, fit

@@ -15,9 +15,10 @@ import pytest
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import PLAIN, Checkpoint, Origin, read_origin, require_trust
+from manip_il.learn.checkpoint import Checkpoint, Origin, read_origin, require_trust
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_class, policy_config, policy_types
+from manip_il.learn.names import PLAIN
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import fit
 from manip_il.sim.env import EnvConfig

@@ -34,7 +34,7 @@ from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.mlp.configuration_mlp import WarmUpAndCosineConfig
 from manip_il.learn.network import MLPNetwork, fit_statistics
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import Sources, recorded_look
+from manip_il.learn.sources import Sources, input_columns, recorded_look
 from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import publish
 
@@ -513,6 +513,15 @@ def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerob
     assert policy.checkpoint.origin.robot == "so101"
     pictures = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in ("front", "wrist")}
     assert policy.act(np.zeros((1, 6), np.float32), np.empty((1, 0), np.float32), pictures).shape == (1, 6)
+    again = [
+        "dagger",
+        "--robot.type=so101",
+        "--cameras=front",
+        f"--dataset.root={root}",
+        f"--output_dir={tmp_path / 'd'}",
+    ]
+    assert main([*again, "--policy.type=act", "--observation=images"]) == 1
+    assert "has no sim_state: it was not recorded in simulation" in capsys.readouterr().err
     config = run / "checkpoints/last/pretrained_model/train_config.json"
     more = [f"--dataset.root={root}", f"--output_dir={run}", "--steps=6", "--num_workers=0"]
     done = warm_lerobot.run("lerobot-train", f"--config_path={config}", "--resume=true", *more)
@@ -535,7 +544,7 @@ def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerob
 )
 def test_what_a_dataset_lacks_is_said_with_the_way_out(lacking, observation, words, write, table, pictured):
     dataset = Dataset.open(write(table, spec=pictured).roots[0])
-    assert list(features(pictured))[:4] == config(ACT, observation="both").inputs(dataset.root, dataset.info)
+    assert list(features(pictured))[:4] == input_columns(config(ACT, observation="both"), dataset.root, dataset.info)
     left = {key: feature for key, feature in dataset.info.features.items() if key not in lacking}
     with pytest.raises(ManipError, match=words):
-        config(ACT, observation=observation).inputs(dataset.root, replace(dataset.info, features=left))
+        input_columns(config(ACT, observation=observation), dataset.root, replace(dataset.info, features=left))

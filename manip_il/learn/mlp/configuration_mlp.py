@@ -12,8 +12,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import JOINT_DELTA
 from manip_il.learn.fit_config import MLPOptions
+from manip_il.learn.names import JOINT_DELTA
 from manip_il.learn.network import Shape
 
 SIGMA = 3.0  # [bins]

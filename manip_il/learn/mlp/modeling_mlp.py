@@ -14,8 +14,8 @@ from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.action_spaces import ARM, GRIPPER
-from manip_il.learn.checkpoint import EE_DELTA
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
+from manip_il.learn.names import EE_DELTA
 from manip_il.learn.network import MLPNetwork, fit_statistics
 from manip_il.learn.samples import Table, valid_frames
 
