@@ -11,7 +11,6 @@ from manip_il.cli.inputs import require_dataset
 from manip_il.cli.outputs import check_output, check_same_options, prepare_output, require_output, save_options
 from manip_il.cli.progress import progress, say, warn
 from manip_il.cli.record import OwnRobotGroup
-from manip_il.cli.trials import varied
 from manip_il.data.atomic import exclusive
 from manip_il.errors import UsageError
 from manip_il.option import option
@@ -104,6 +103,8 @@ class RedrawOptions:
 
         cameras = self.image.config(self.cameras)
         assert cameras is not None
+        from manip_il.evaluation.suites import varied
+
         conditions = varied(self.vary, source.env, sees=True)
         return RedrawJob(
             source.env,

@@ -6,9 +6,8 @@ something else under the same name, which is then ignored.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,19 +24,12 @@ Place = tuple[float, float, float]  # x away from the robot, y to its left, z ab
 _KEYS = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")  # of every episode
 _HZ, _SUCCESS_STEPS = 20, 5  # of files without them
 _MOST_CONDITIONS = 100  # of a suite
-_UNITS = {
-    "knock": "m",
-    "knock_step": "steps",
+_UNITS = dict.fromkeys(("knock", "position_noise", "size", "camera_shift"), "m") | {
+    **dict.fromkeys(("knock_step", "delay", "picture_delay"), "steps"),
+    **dict.fromkeys(("camera_turn", "light_turn"), "deg"),
     "joint_noise": "rad",
-    "position_noise": "m",
-    "delay": "steps",
     "mass": "kg",
-    "size": "m",
-    "camera_shift": "m",
-    "camera_turn": "deg",
-    "light_turn": "deg",
 }
-_COMPONENTS = {name: ("red", "green", "blue") for name in ("colour", "table")}  # of other vectors, the length counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +71,18 @@ class EpisodeResult:
 
     @property
     def drawn_numbers(self) -> dict[str, float]:
-        """Every drawn number by its name and unit, `mass [kg]`: components of a colour, lengths of other vectors."""
+        """Every drawn number by its name and unit, `mass [kg]`; the length of a vector, and one a camera."""
         drawn = self.detail.get("drawn")
-        given = drawn.items() if isinstance(drawn, Mapping) else ()
-        numbers = itertools.chain.from_iterable(_numbers(str(key), one, _UNITS.get(str(key))) for key, one in given)
-        return {name: value for name, value in numbers if math.isfinite(value)}
+        found: dict[str, float] = {}
+        for name, given in drawn.items() if isinstance(drawn, Mapping) else ():
+            unit = f" [{_UNITS[name]}]" if name in _UNITS else ""
+            cameras = given.items() if isinstance(given, Mapping) else [("", given)]
+            for camera, value in cameras:
+                numbers = value if isinstance(value, list | tuple) else [value]
+                if numbers and all(map(_is_number, numbers)):
+                    length = float(numbers[0]) if len(numbers) == 1 else math.hypot(*numbers)
+                    found[f"{name} {camera}".strip() + unit] = length
+        return found
 
     def _moving_thing(self, when: Literal["start", "end"]) -> Place | None:
         places = self.detail.get(when)
@@ -197,28 +196,12 @@ class EvalSettings:
         )
 
 
-def _numbers(name: str, given: Any, unit: str | None) -> Iterator[tuple[str, float]]:
-    if isinstance(given, Mapping):  # one value a camera
-        for key, value in given.items():
-            yield from _numbers(f"{name} {key}", value, unit)
-    elif _is_number(given):
-        yield name + (f" [{unit}]" if unit else ""), float(given)
-    elif isinstance(given, Sequence) and not isinstance(given, str) and given and all(map(_is_number, given)):
-        components = _COMPONENTS.get(name, ())
-        if len(components) == len(given):
-            yield from ((f"{name}, {part}", float(value)) for part, value in zip(components, given, strict=True))
-        else:
-            yield name + (f" [{unit}]" if unit else ", length"), math.hypot(*given)
-
-
 def _place(given: Any) -> Place | None:
-    if not isinstance(given, Sequence) or isinstance(given, str) or len(given) != 3:
+    if not isinstance(given, list | tuple) or len(given) != 3 or not all(map(_is_number, given)):
         return None
-    if not all(_is_number(value) and math.isfinite(value) for value in given):
-        return None
-    x, y, z = given
-    return float(x), float(y), float(z)
+    x, y, z = map(float, given)
+    return x, y, z
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

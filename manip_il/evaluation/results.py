@@ -19,7 +19,7 @@ from manip_il.evaluation.significance import PairedComparison, compare_paired
 FILE_NAME = "eval.json"
 WILSON = "Wilson's score interval"
 ANYTIME = "confidence sequence: holds whenever one stops"
-_EQUAL_IN_PARTS = ("policy_sha256", "robot", "task", "settings", "confidence")
+_EQUAL_IN_PARTS = ("policy_sha256", "robot", "task", "settings")
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,6 @@ class EvalResult:
     fingerprint: Mapping[str, Any]
     episodes: tuple[EpisodeResult, ...]
     settings: EvalSettings
-    confidence: float = CONFIDENCE
     policy_sha256: str = ""
     until_width: float | None = None
 
@@ -63,7 +62,7 @@ class EvalResult:
         return self._proportion([episode.success_at_end for episode in self.episodes])
 
     def _proportion(self, outcomes: Sequence[bool]) -> Proportion:
-        return Proportion.of(outcomes, self.confidence, self.until_width is not None)
+        return Proportion.of(outcomes, self.until_width is not None)
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
@@ -91,7 +90,7 @@ class EvalResult:
         return {
             "success_rate": self.success.rate,
             "interval": list(self.success.interval),
-            "confidence": self.confidence,
+            "confidence": CONFIDENCE,
             "interval_method": WILSON if self.until_width is None else ANYTIME,
             "n_episodes": len(self.episodes),
             "success_at_end_rate": self.success_at_end.rate,
@@ -120,7 +119,6 @@ class EvalResult:
             fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
             episodes=tuple(EpisodeResult.from_json(one) for one in checks.array("episodes", data["episodes"])),
             settings=EvalSettings.from_json(data["settings"]),
-            confidence=checks.number("confidence", data.get("confidence", CONFIDENCE), 0.5, 0.9999),
             policy_sha256=checks.text("policy_sha256", data.get("policy_sha256", "")),
             until_width=None if width is None else checks.number("until_width", width, 0, 1),
         )
@@ -162,7 +160,7 @@ def compare_results(left: EvalResult, right: EvalResult, names: tuple[str, str] 
     shared = sorted(ours.keys() & theirs.keys())
     if not shared:
         raise ManipError(f"{names[0]} and {names[1]} share no seed; evaluate both with the same --seed=")
-    return compare_paired([ours[seed] for seed in shared], [theirs[seed] for seed in shared], names, left.confidence)
+    return compare_paired([ours[seed] for seed in shared], [theirs[seed] for seed in shared], names)
 
 
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:

@@ -27,8 +27,8 @@ from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.parsing import from_yaml, parse
 from manip_il.cli.quickstart import quickstart_verdict
 from manip_il.data.dataset import Dataset
-from manip_il.evaluation.report_data import PolicyRow
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.tables import PolicyRow
 
 from ..damage import edit_table
 from .made_runs import files
@@ -213,7 +213,7 @@ def test_the_best_round_of_few_episodes_is_not_said_to_be_better(successes, n, v
 
 
 def test_the_quickstart_says_where_nothing_is_shown():
-    rows = [PolicyRow.of(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
+    rows = [PolicyRow(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
     assert quickstart_verdict(rows, significant=False).endswith(
         "no difference between DAgger and cloning with as many labels."
     )

@@ -122,7 +122,6 @@ ODD_VALUES = {
     ("task",): ["a/b", None],
     ("policy",): [None, 5, "x" * 100_000],
     ("fingerprint",): [None, [], "x"],
-    ("confidence",): [0, 2, None, "x"],
     ("until_width",): [-1, 2, "x"],
     ("n_episodes",): [2**80, "x" * 100_000, []],
 }

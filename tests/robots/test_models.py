@@ -225,7 +225,7 @@ def test_a_models_defaults_are_not_for_what_is_added(tmp_path: Path):
 
 FREED = """
 from manip_il.checks import read_yaml
-from manip_il.evaluation.robot_check.joints import arm_facts
+from manip_il.evaluation.robot_check import arm_facts
 from manip_il.errors import ManipError
 from manip_il.robots import ROBOTS
 from manip_il.robots.found import complete
