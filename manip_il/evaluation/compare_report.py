@@ -16,7 +16,6 @@ from manip_il.evaluation.figures import ARMS, Bar, Curve, Figure, rates_figure
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import Report, Section, curve_section
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.significance import format_p, holm, sign_flip_exact
 from manip_il.evaluation.study import Study, arms_table
 from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, NO_CONDITION, Table
 
@@ -30,21 +29,14 @@ def comparison_table(comparison: Comparison) -> Table:
 
 
 def condition_table(comparison: Comparison) -> Table | None:
-    """Return both arms by condition, all training seeds together; None if there is one condition alone.
-
-    p: exact over test episodes as in `Comparison.p_value`, corrected for the number of conditions (Holm).
-    """
+    """Return success of both arms by condition, the mean over training seeds; None if there is one condition alone."""
     parts = comparison.left.members[0].test.by_condition
-    if len(parts) < 2:
-        return None
-    seeds = {name: [episode.seed for episode in part.episodes] for name, part in parts.items()}
-    corrected = holm([sign_flip_exact([comparison.margins[seed] for seed in own]) for own in seeds.values()])
     rows: list[tuple[str, ...]] = []
-    for name, p in zip(seeds, corrected, strict=True):
+    for name, part in parts.items():
         left, right = (fmean(m.test.by_condition[name].success.rate for m in arm.members) for arm in comparison.arms)
-        cells = (format_percent(left), format_percent(right), f"{100 * (right - left):+.1f} points", format_p(p))
-        rows.append((name or NO_CONDITION, f"{len(seeds[name]):,}", *cells))
-    return Table(("condition", "episodes", *comparison.names, "difference", "corrected p"), tuple(rows))
+        cells = (format_percent(left), format_percent(right), f"{100 * (right - left):+.1f} points")
+        rows.append((name or NO_CONDITION, f"{part.success.n:,}", *cells))
+    return Table(("condition", "episodes", *comparison.names, "difference"), tuple(rows)) if len(parts) > 1 else None
 
 
 def compare_report(
@@ -63,7 +55,7 @@ def compare_report(
     )
     arms = zip(comparison.arms, _COLOURS, strict=True)
     curves = [_curve(arm, colour) for arm, colour in arms if all(member.history for member in arm.members)]
-    sections = [_results(comparison, first), *_conditions(comparison), *_failures(comparison)]
+    sections = [_results(comparison, first), *_failures(comparison)]
     return Report(
         title=f"{' against '.join(comparison.names)}: {first.robot} {first.task}",
         verdict=comparison.verdict,
@@ -78,13 +70,8 @@ def compare_report(
 def _results(comparison: Comparison, first: EvalResult) -> Section:
     bars = [_bar(arm, colour) for arm, colour in zip(comparison.arms, _COLOURS, strict=True)]
     note = f"Both ran the same {first.success.n:,} test episodes.{_disturbed(first)}{_dots(len(bars[0].successes) > 1)}"
-    return Section("Results", figures=(rates_figure(bars),), tables=(comparison_table(comparison),), notes=(note,))
-
-
-def _conditions(comparison: Comparison) -> list[Section]:
-    table = condition_table(comparison)
-    note = "p: exact over the paired episodes of a condition, corrected for the number of conditions (Holm)."
-    return [Section("By condition", tables=(table,), notes=(note,))] if table else []
+    tables = filter(None, (comparison_table(comparison), condition_table(comparison)))
+    return Section("Results", figures=(rates_figure(bars),), tables=tuple(tables), notes=(note,))
 
 
 def _failures(comparison: Comparison) -> list[Section]:

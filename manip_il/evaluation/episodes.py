@@ -1,7 +1,6 @@
 """One episode of `eval.json`, and the settings that all its episodes share.
 
-Places, condition and drawn numbers are optional: files of older versions and of other tools may lack them, or hold
-something else under the same name, which is then ignored.
+Places and condition are optional: files of older versions and of other tools may lack them.
 """
 
 from __future__ import annotations
@@ -17,19 +16,11 @@ from manip_il.sim.conditions import NOMINAL, Condition
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.sim.env import EnvConfig
+    from manip_il.sim.config import EnvConfig
 
 Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
-
 _KEYS = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")  # of every episode
 _HZ, _SUCCESS_STEPS = 20, 5  # of files without them
-_MOST_CONDITIONS = 100  # of a suite
-_UNITS = dict.fromkeys(("knock", "position_noise", "size", "camera_shift"), "m") | {
-    **dict.fromkeys(("knock_step", "delay", "picture_delay"), "steps"),
-    **dict.fromkeys(("camera_turn", "light_turn"), "deg"),
-    "joint_noise": "rad",
-    "mass": "kg",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +41,13 @@ class EpisodeResult:
 
     @property
     def condition(self) -> str:
-        """The condition's name; empty where none is given."""
+        """The condition's name; empty if none is given."""
         name = self.detail.get("condition")
         return name if isinstance(name, str) else ""
 
     @property
     def start(self) -> Place | None:
-        """Start of the object, or of the hand where the task has no object [m]."""
+        """Start of the object, or of the hand if the task has no object [m]."""
         return self._moving_thing("start")
 
     @property
@@ -68,21 +59,6 @@ class EpisodeResult:
     def goal(self) -> Place | None:
         """Goal of the same [m]."""
         return _place(self.detail.get("goal"))
-
-    @property
-    def drawn_numbers(self) -> dict[str, float]:
-        """Every drawn number by its name and unit, `mass [kg]`; the length of a vector, and one a camera."""
-        drawn = self.detail.get("drawn")
-        found: dict[str, float] = {}
-        for name, given in drawn.items() if isinstance(drawn, Mapping) else ():
-            unit = f" [{_UNITS[name]}]" if name in _UNITS else ""
-            cameras = given.items() if isinstance(given, Mapping) else [("", given)]
-            for camera, value in cameras:
-                numbers = value if isinstance(value, list | tuple) else [value]
-                if numbers and all(map(_is_number, numbers)):
-                    length = float(numbers[0]) if len(numbers) == 1 else math.hypot(*numbers)
-                    found[f"{name} {camera}".strip() + unit] = length
-        return found
 
     def _moving_thing(self, when: Literal["start", "end"]) -> Place | None:
         places = self.detail.get(when)
@@ -96,15 +72,8 @@ class EpisodeResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
-        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
+        """Return the inverse of `to_json`; `ManipError` or `KeyError` if a value is invalid or missing."""
         data = checks.mapping("an episode", data)
-        detail = {key: value for key, value in data.items() if key not in _KEYS}
-        if detail.get("steps_to_success") is not None:
-            checks.whole("steps_to_success", detail["steps_to_success"], 0, LONGEST_EPISODE)
-        if "condition" in detail:
-            checks.text("condition", detail["condition"], checks.LONGEST_NAME)
-        if "drawn" in detail:
-            checks.mapping("drawn", detail["drawn"])
         return cls(
             seed=checks.whole("seed", data["seed"], 0, checks.LARGEST_SEED),
             success=checks.truth("success", data["success"]),
@@ -112,14 +81,14 @@ class EpisodeResult:
             steps=checks.whole("steps", data["steps"], 0, LONGEST_EPISODE),
             ret=checks.number("return", data["return"]),
             phase_at_end=checks.text("phase_at_end", data.get("phase_at_end", ""), checks.LONGEST_NAME),
-            detail=detail,
+            detail={key: value for key, value in data.items() if key not in _KEYS},
         )
 
 
 def moving_thing(episodes: Sequence[EpisodeResult]) -> Literal["object", "hand"]:
-    """Return what is to reach the goal: the hand where episodes have starts, but none of an object."""
+    """Return what is to reach the goal: the hand if episodes have starts, but none of an object."""
     starts = [start for one in episodes if isinstance(start := one.detail.get("start"), Mapping)]
-    return "object" if not starts or any(_place(start.get("object")) is not None for start in starts) else "hand"
+    return "object" if not starts or any("object" in start for start in starts) else "hand"
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +97,8 @@ class EvalSettings:
 
     horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
     of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
-    where it goes on to the horizon. object: shape and size of what is grasped, reward: of `carry`, empty for the
-    task's own.
+    if it goes on to the horizon. object: shape and size of what is grasped, reward: of `carry`, empty for the task's
+    own.
     """
 
     horizon: int
@@ -151,22 +120,15 @@ class EvalSettings:
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """Return the environment that was evaluated in."""
-        from manip_il.sim.env import EnvConfig  # here, as reading results needs no simulator
+        from manip_il.sim.config import EnvConfig
 
         limits = self.tolerance, self.success_steps, self.horizon
         return EnvConfig(robot, task, self.control_hz, *limits, self.object, self.reward)
 
     @property
     def disturbance(self) -> str:
-        """The conditions in words, `none` where all are nominal."""
+        """The conditions in words, `none` if all are nominal."""
         return "; ".join(map(str, self.conditions)) if any(one.ranges for one in self.conditions) else "none"
-
-    def __str__(self) -> str:
-        rate = f"{self.control_hz} Hz, {self.success_steps} steps in a row"
-        ends = "" if self.hold is None else f", ended {self.hold} steps after success"
-        shape = f", object {self.object}" if self.object else ""
-        reward = f", reward {self.reward}" if self.reward else ""
-        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}{shape}{reward}"
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -177,11 +139,10 @@ class EvalSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
-        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
+        """Return the inverse of `to_json`; `ManipError` or `KeyError` if a value is invalid or missing."""
         data = checks.mapping("settings", data)
-        given = checks.array("conditions", data.get("conditions", [NOMINAL.to_json()]), _MOST_CONDITIONS)
-        named = [checks.mapping("a condition", one) for one in given]
-        ranges = [{key: value for key, value in one.items() if key != "name"} for one in named]
+        given = checks.array("conditions", data.get("conditions", [NOMINAL.to_json()]), 100)
+        named = [dict(checks.mapping("a condition", one)) for one in given]
         steps = data.get("success_steps", _SUCCESS_STEPS)
         return cls(
             horizon=checks.whole("horizon", data["horizon"], 1, LONGEST_EPISODE),
@@ -189,7 +150,7 @@ class EvalSettings:
             control_hz=checks.whole("control_hz", data.get("control_hz", _HZ), 1, 1_000),
             success_steps=checks.whole("success_steps", steps, 1, LONGEST_EPISODE),
             suite=checks.text("suite", data.get("suite", NOMINAL.name)),
-            conditions=tuple(Condition.from_mapping(one["name"], own) for one, own in zip(named, ranges, strict=True)),
+            conditions=tuple(Condition.from_mapping(one.pop("name"), one) for one in named),
             hold=None if data.get("hold") is None else checks.whole("hold", data["hold"], 0, LONGEST_EPISODE),
             object=checks.text("object", data.get("object", ""), checks.LONGEST_NAME),
             reward=checks.text("reward", data.get("reward", "")),
@@ -197,11 +158,9 @@ class EvalSettings:
 
 
 def _place(given: Any) -> Place | None:
-    if not isinstance(given, list | tuple) or len(given) != 3 or not all(map(_is_number, given)):
+    if not isinstance(given, list | tuple) or len(given) != 3:
+        return None
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in given):
         return None
     x, y, z = map(float, given)
     return x, y, z
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -9,9 +9,7 @@ from typing import Any
 from manip_il.evaluation.failures import (
     evaluation_facts,
     evaluation_verdict,
-    factor_table,
     failure_maps,
-    find_factors,
     phase_table,
 )
 from manip_il.evaluation.figures import Bar, Curve, rates_figure
@@ -21,11 +19,6 @@ from manip_il.evaluation.tables import BASELINE, DAGGER, NO_CONDITION, PolicyRow
 from manip_il.sim.conditions import words
 
 MAP_NOTE = "Circles: starts, squares: goals, crosses: where failed episodes ended."
-_ASSOCIATED = (
-    "Median and quartiles of start, goal and what was drawn, over the failed and the solved episodes. p: Kolmogorov "
-    "and Smirnov's test of both, corrected (Holm) for the {count} numbers that varied. An association with a number "
-    "does not show that it causes the failures."
-)
 
 
 def eval_report(
@@ -40,17 +33,11 @@ def eval_report(
 
     films: of failures (False) and successes (True). no_films: why there are none. curve: of the run of the policy.
     """
-    factors = find_factors(result)
     sections = [_results(result), *([curve_section([curve])] if curve else []), *_failures(result)]
-    if factors:
-        shown = [factor for factor in factors if factor.significant]
-        lead = () if shown else (f"None of the {len(factors)} numbers that varied is shown to go with failures.",)
-        table, note = (factor_table(shown),) if shown else (), _ASSOCIATED.format(count=len(factors))
-        sections.append(Section("What failures go with", lead=lead, tables=table, notes=(note,)))
     return Report(
         title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
         verdict=evaluation_verdict(result),
-        facts=evaluation_facts(result, factors),
+        facts=evaluation_facts(result),
         command=command,
         sections=(*sections, *film_sections(films or {}, no_films)),
         config=config or {},

@@ -1,29 +1,21 @@
-"""An evaluation's result in sentences: the phases that failed episodes ended in, and what failures go with."""
+"""An evaluation's result in sentences: where episodes fail, and the phases that they end in."""
 
 from __future__ import annotations
 
-import math
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import numpy as np
-from scipy import stats
 
 from manip_il.evaluation.episodes import EpisodeResult, moving_thing
 from manip_il.evaluation.figures import Figure, MapGroup, map_figures
-from manip_il.evaluation.intervals import CONFIDENCE
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.significance import format_p, holm
 from manip_il.evaluation.tables import BASELINE, CLONING, NO_CONDITION, Table
 from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import NO_PHASE
 
 MAX_MARKS = 600  # of one outcome on a map; more would hide each other
 NOT_RECORDED = "not recorded"
-_FEWEST = 5  # of failed and of solved episodes, to ask what failures go with
-_SAME_PLACE = 0.005  # coordinates that differ by less are one: what settled on the table rests there [m]
 _NO_PHASE = "not even the expert can continue: an object is off the table, or something is out of reach"
 
 
@@ -69,8 +61,8 @@ def evaluation_verdict(result: EvalResult) -> str:
     return "; ".join(parts) + "."
 
 
-def evaluation_facts(result: EvalResult, factors: Sequence[Factor]) -> tuple[str, ...]:
-    """Return further sentences: main phase, lowest condition, first factor, successes that did not last."""
+def evaluation_facts(result: EvalResult) -> tuple[str, ...]:
+    """Return further sentences: main phase, lowest condition, successes that did not last."""
     facts: list[str] = []
     if phase := _main_phase(result):
         meaning = phase_meanings(result.task).get(phase)
@@ -81,12 +73,6 @@ def evaluation_facts(result: EvalResult, factors: Sequence[Factor]) -> tuple[str
     if len(rates) > 1 and result.failures:
         worst = min(rates, key=lambda name: rates[name].rate)
         facts.append(f"Of {len(rates)} conditions {worst} has the lowest success: {rates[worst]}.")
-    if factors and factors[0].significant:
-        first = factors[0]
-        facts.append(
-            f"Failures go most with {first.name}: median {first.failed[1]:.3g} where it failed, {first.solved[1]:.3g} "
-            f"where it succeeded, corrected {format_p(first.corrected)}."
-        )
     if lost := sum(episode.success and not episode.success_at_end for episode in result.episodes):
         facts.append(f"{lost:,} of the episodes that succeeded were no longer at the goal in their last frame.")
     return tuple(facts)
@@ -99,84 +85,6 @@ def _main_phase(result: EvalResult) -> str:
 
 def _spaced(phase: str) -> str:
     return phase.replace("_", " ")
-
-
-@dataclass(frozen=True)
-class Factor:
-    """A number that varied between episodes. failed, solved: its quartiles where episodes failed and where not.
-
-    p_value: Kolmogorov and Smirnov's, that both are of one distribution. corrected: the same, corrected for the number
-    of factors (Holm).
-    """
-
-    name: str
-    failed: tuple[float, float, float]
-    solved: tuple[float, float, float]
-    p_value: float
-    corrected: float = 1.0
-
-    @property
-    def significant(self) -> bool:
-        """Whether failed and solved episodes differ in it by more than chance."""
-        return self.corrected < 1 - CONFIDENCE
-
-
-def find_factors(result: EvalResult) -> tuple[Factor, ...]:
-    """Return every coordinate and drawn number that varied, the smallest p first.
-
-    Places are taken over all episodes, drawn numbers within the condition that drew them, as they are constant
-    elsewhere. Numbers of fewer than a few failed or solved episodes are left out.
-    """
-    places = _coordinates(result.episodes).items()
-    columns = {name: column for name, column in places if np.ptp([value for value, _ in column]) > _SAME_PLACE}
-    conditions = result.by_condition
-    for condition, part in conditions.items():
-        prefix = f"{condition}: " if condition and len(conditions) > 1 else ""
-        for episode in part.episodes:
-            for name, value in episode.drawn_numbers.items():
-                columns.setdefault(prefix + name, []).append((value, episode.success))
-    factors: list[Factor] = []
-    for name, column in columns.items():
-        failed, solved = ([value for value, success in column if success == good] for good in (False, True))
-        if min(len(failed), len(solved)) >= _FEWEST and len({value for value, _ in column}) > 1:
-            p = float(cast(Any, stats.ks_2samp(failed, solved)).pvalue)
-            factors.append(Factor(name, _quartiles(failed), _quartiles(solved), p))
-    factors.sort(key=lambda factor: factor.p_value)
-    corrected = holm([factor.p_value for factor in factors])
-    return tuple(replace(factor, corrected=p) for factor, p in zip(factors, corrected, strict=True))
-
-
-def factor_table(factors: Sequence[Factor]) -> Table:
-    """Return the medians and quartiles of each factor where episodes failed and where not, and the corrected p."""
-    rows = (
-        (one.name, _quartile_cell(one.failed), _quartile_cell(one.solved), format_p(one.corrected)) for one in factors
-    )
-    return Table(("number", "failed: median [quartiles]", "solved: median [quartiles]", "corrected p"), tuple(rows))
-
-
-def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    low, median, high = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
-    return low, median, high
-
-
-def _quartile_cell(quartiles: tuple[float, float, float]) -> str:
-    low, median, high = quartiles
-    return f"{median:.3g} [{low:.3g}, {high:.3g}]"
-
-
-def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[float, bool]]]:
-    thing = moving_thing(episodes)
-    axes = "xy" if thing == "object" else "xyz"  # an object's height on the table is its size, a number of its own
-    columns: defaultdict[str, list[tuple[float, bool]]] = defaultdict(list)
-    for episode in episodes:
-        start, goal = episode.start, episode.goal
-        values = {f"start of the {thing}, {a} [m]": v for a, v in zip(axes, start or (), strict=False)}
-        values |= {f"goal, {axis} [m]": value for axis, value in zip("xyz", goal or (), strict=False)}
-        if start is not None and goal is not None:
-            values["distance from start to goal [m]"] = math.dist(start, goal)
-        for name, value in values.items():
-            columns[name].append((value, episode.success))
-    return columns
 
 
 def failure_maps(result: EvalResult) -> tuple[Figure, ...]:

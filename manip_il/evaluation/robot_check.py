@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,41 +69,6 @@ class JointFacts:
 
 
 @dataclass(frozen=True)
-class ArmFacts:
-    """Joints base to hand. step: of a joint's target in its response [rad]. sag: of the hand under `LOAD` [m]."""
-
-    joints: tuple[JointFacts, ...]
-    step: float
-    sag: float
-
-
-@dataclass(frozen=True)
-class HandFacts:
-    """A gripper from closed to open: commands of its first joint [m] or [rad], and the opening at each, rising [m]."""
-
-    joints: tuple[str, ...]
-    commands: tuple[float, ...]
-    openings: tuple[float, ...]
-
-    @property
-    def most(self) -> float:
-        """The widest opening [m]."""
-        return self.openings[-1]
-
-
-@dataclass(frozen=True)
-class ReachFacts:
-    """Shares of points on the table of the workspace that the hand gets to, upright, or leaning.
-
-    half_width: the widest at which a share of `ENOUGH` of the table is reached [m]; 0 if there is none.
-    """
-
-    table: float
-    leaning: float
-    half_width: float
-
-
-@dataclass(frozen=True)
 class TaskCheck:
     """One task with a robot.
 
@@ -146,14 +110,22 @@ class TaskCheck:
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """A robot as it was measured. name: as it was given. overlaps: pairs of links at home, and in any posture."""
+    """A robot as it was measured. name: as it was given. sag: of the hand under `LOAD` [m].
+
+    openings: of the gripper by command of its first joint [m] or [rad], rising [m]. overlaps: pairs of links at home,
+    and in any posture. table, leaning: shares of points on the table of the workspace that the hand gets to, upright,
+    or leaning. half_width: the widest at which a share of `ENOUGH` of the table is reached [m]; 0 if there is none.
+    """
 
     name: str
     robot: Robot
-    arm: ArmFacts
-    hand: HandFacts
+    joints: tuple[JointFacts, ...]
+    sag: float
+    openings: Mapping[float, float]
     overlaps: tuple[Pair, ...]
-    reach: ReachFacts
+    table: float
+    leaning: float
+    half_width: float
     tasks: tuple[TaskCheck, ...]
 
     @property
@@ -161,18 +133,25 @@ class RobotCheck:
         """Tasks that cannot be done."""
         return tuple(task for task in self.tasks if not task.done)
 
+    @property
+    def opening(self) -> float:
+        """The widest of the gripper [m]."""
+        return max(self.openings.values())
+
     def write(self, path: Path) -> None:
         """Write all figures as JSON."""
+        gripper = {"commands": list(self.openings), "openings": list(self.openings.values())}
         facts = {
             "robot": self.name,
             "hand": self.robot.hand,
-            **dataclasses.asdict(self.arm),
-            "gripper": dataclasses.asdict(self.hand),
+            "joints": [dataclasses.asdict(joint) for joint in self.joints],
+            "sag": self.sag,
+            "gripper": {"joints": self.robot.gripper.joints, **gripper},
             "home_overlaps": self.overlaps,
-            "reach": dataclasses.asdict(self.reach),
+            "reach": {name: getattr(self, name) for name in ("table", "leaning", "half_width")},
             "tasks": [task.to_json() for task in self.tasks],
         }
-        write_json(path, json.loads(json.dumps(facts)), indent=2)
+        write_json(path, facts, indent=2)
 
 
 def check_robot(
@@ -184,11 +163,12 @@ def check_robot(
     """
     robot, scene = get_robot(name), build_scene(name, _PLAIN)
     overlaps = tuple(meeting_at(robot, scene.model, PREFIX, np.asarray(robot.home)))
-    arm, hand, reach = arm_facts(scene), hand_facts(robot), reach_facts(robot)
     checked = [check_starts(name, task) for task in tasks]
     if episodes:
         checked = [_with_episodes(name, task, episodes, engine, on_result) for task in checked]
-    return RobotCheck(name, robot, arm, hand, overlaps, reach, tuple(checked))
+    return RobotCheck(
+        name, robot, *arm_facts(scene), openings(robot), overlaps, *reach_facts(robot), tasks=tuple(checked)
+    )
 
 
 def check_starts(name: str, task: str) -> TaskCheck:
@@ -229,20 +209,20 @@ def widths(task: Task) -> dict[str, float]:
     return found
 
 
-def hand_facts(robot: Robot) -> HandFacts:
-    """Return the measured openings of a robot's gripper."""
+def openings(robot: Robot) -> dict[float, float]:
+    """Return the measured openings of a robot's gripper by the command of its first joint."""
     measured, config = sweep(robot), robot.gripper
     commands = config.closed[0] + measured.shares * (config.open[0] - config.closed[0])
-    return HandFacts(config.joints, tuple(commands.tolist()), tuple(measured.openings.tolist()))
+    return dict(zip(commands.tolist(), measured.openings.tolist(), strict=True))
 
 
-def reach_facts(robot: Robot) -> ReachFacts:
-    """Return what of a robot's workspace its hand reaches; takes seconds if its map is not kept yet."""
+def reach_facts(robot: Robot) -> tuple[float, float, float]:
+    """Return `table`, `leaning` and `half_width` of a `RobotCheck`; takes seconds if the map is not kept yet."""
     reach, space = reach_of(robot), robot.workspace
     halves = np.arange(space.half_width, 0.0, -_NARROWER).tolist()
     enough = next((half for half in halves if _share(robot, reach.has, half) >= ENOUGH), 0.0)
     table, leaning = (_share(robot, test, space.half_width) for test in (reach.has, reach.leaning))
-    return ReachFacts(table, leaning, round(enough, 3))
+    return table, leaning, round(enough, 3)
 
 
 def reach_map(robot: Robot, room: float, cells: int = 60) -> tuple[F64, tuple[float, float, float, float]]:
@@ -265,11 +245,10 @@ def _share(robot: Robot, test: Callable[[tuple[float, float, float]], bool], hal
     return float(np.mean([test((x + dx, y + dy, LOW)) for dx in steps for dy in steps]))
 
 
-def arm_facts(scene: Scene) -> ArmFacts:
-    """Return what every joint of a scene's arm does, alone, from home, the gripper open."""
+def arm_facts(scene: Scene) -> tuple[tuple[JointFacts, ...], float]:
+    """Return what every joint of a scene's arm does alone, from home, and how far the hand sinks under `LOAD` [m]."""
     sags, sag = _sags(scene)
-    joints = tuple(_joint(scene, place, sags[place]) for place in range(len(scene.robot.joints)))
-    return ArmFacts(joints, scene.robot.max_joint_step, sag)
+    return tuple(_joint(scene, place, sags[place]) for place in range(len(scene.robot.joints))), sag
 
 
 def at_home(scene: Scene) -> mujoco.MjData:

@@ -33,7 +33,6 @@ def check_report(
     check: RobotCheck, pictures: Sequence[Still], no_pictures: str, command: str, config: Mapping[str, Any]
 ) -> Report:
     """Return the page of a check. no_pictures: why there are none."""
-    reach = check.reach
     lead = () if pictures else (f"No pictures: {no_pictures}",)
     tasks = (
         "Starts: of those drawn, how many find a place within reach. Random actions: a tenth of the control steps, the "
@@ -44,8 +43,8 @@ def check_report(
         home_line(check),
     )
     reaches = (
-        f"The hand, pointing down, gets to {100 * reach.table:.0f} % of the workspace (the frame) on the table, "
-        f"leaning to {100 * reach.leaning:.0f} %. Dark: upright, pale: leaning. Circles: objects at "
+        f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table, "
+        f"leaning to {100 * check.leaning:.0f} %. Dark: upright, pale: leaning. Circles: objects at "
         "the start, squares: goals, and what stands there.",
     )
     return Report(
@@ -86,7 +85,7 @@ def verdict(check: RobotCheck) -> str:
 def joint_table(check: RobotCheck) -> Table:
     """Return the joints base to hand: limits, home, gains, and how they move and hold."""
     columns = ("joint", "limits", "home", "kp", "kv", "force", "rise [ms]", "overshoot", "sag")
-    return Table(columns, tuple(_joint_row(joint) for joint in check.arm.joints))
+    return Table(columns, tuple(_joint_row(joint) for joint in check.joints))
 
 
 def task_table(check: RobotCheck) -> Table:
@@ -95,7 +94,7 @@ def task_table(check: RobotCheck) -> Table:
     rows: list[tuple[str, ...]] = []
     for task in check.tasks:
         wide = max(task.widths.values(), default=0.0)
-        fits = f"{1000 * wide:.0f}, {'fits' if wide < check.hand.most else 'too wide'}" if wide else "none grasped"
+        fits = f"{1000 * wide:.0f}, {'fits' if wide < check.opening else 'too wide'}" if wide else "none grasped"
         starts = f"{task.found} of {task.drawn}" if task.drawn else ""
         rows.append((task.name, fits, starts, *(str(one.success) if one else "" for one in (task.clean, task.noisy))))
     return Table(columns, tuple(rows), tuple(EXPERT if task.done else CLONING for task in check.tasks))
@@ -114,8 +113,8 @@ def motors_line(check: RobotCheck) -> str:
     return (
         "Position control drives the joints: torque = kp (target - joint) - kv velocity, at most the force; gravity is "
         "compensated. kp is in N m/rad, kv in N m s/rad, force in N m. "
-        f"Rise and overshoot: of a step of {check.arm.step:g} rad from home, the longest that a label takes. "
-        f"Sag: off home with {LOAD:g} kg in the hand, which sinks by {1000 * check.arm.sag:.1f} mm."
+        f"Rise and overshoot: of a step of {check.robot.max_joint_step:g} rad from home, the longest of a label. "
+        f"Sag: off home with {LOAD:g} kg in the hand, which sinks by {1000 * check.sag:.1f} mm."
     )
 
 
@@ -164,19 +163,18 @@ _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 
 def hand_figure(check: RobotCheck) -> Figure:
     """Draw the opening over the command, and how wide the tasks' objects are."""
-    hand, names = check.hand, dict[float, list[str]]()
+    names: dict[float, list[str]] = {}
     for task in check.tasks:
         for width in {round(width, 4) for width in task.widths.values()}:
             names.setdefault(width, []).append(task.name)
     with drawing(1, size=(4.4, 3.2)) as (drawn, axes):
         axis = axes[0, 0]
-        axis.plot(hand.commands, [1000 * one for one in hand.openings], color=DAGGER, lw=2)
+        axis.plot(list(check.openings), [1000 * one for one in check.openings.values()], color=DAGGER, lw=2)
         for width, tasks in sorted(names.items()):
-            colour = EXPERT if width < hand.most else CLONING
-            axis.axhline(
-                1000 * width, color=colour, ls="--", lw=1, label=plain(f"{1000 * width:.0f} mm: {', '.join(tasks)}")
-            )
-        axis.set(xlabel=f"command of {plain(hand.joints[0])}", ylabel="opening [mm]", ylim=(0, None))
+            words = plain(f"{1000 * width:.0f} mm: {', '.join(tasks)}")
+            colour = EXPERT if width < check.opening else CLONING
+            axis.axhline(1000 * width, color=colour, ls="--", lw=1, label=words)
+        axis.set(xlabel=f"command of {plain(check.robot.gripper.joints[0])}", ylabel="opening [mm]", ylim=(0, None))
         if names:
             drawn.legend(loc="outside lower left")
         return to_figure(drawn, "Opening of the gripper over its command, and the width of what tasks grasp")
@@ -184,19 +182,19 @@ def hand_figure(check: RobotCheck) -> Figure:
 
 def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML, the arm's first, then for each task that cannot be done."""
-    lines = [line for joint in check.arm.joints for line in _of_joint(joint)]
-    if check.arm.sag > SINKS:
-        weakest = max(check.arm.joints, key=lambda joint: joint.sag, default=None)
+    lines = [line for joint in check.joints for line in _of_joint(joint)]
+    if check.sag > SINKS:
+        weakest = max(check.joints, key=lambda joint: joint.sag, default=None)
         where = f", most of it in {weakest.name}" if weakest else ""
-        lines.append(f"{LOAD:g} kg let the hand sink by {1000 * check.arm.sag:.0f} mm{where}: raise gains, or forces.")
+        lines.append(f"{LOAD:g} kg let the hand sink by {1000 * check.sag:.0f} mm{where}: raise gains, or forces.")
     for one, other in check.overlaps:
         lines.append(f"{one} and {other} overlap however the arm stands: take one of their contacts out of the model.")
-    space, reach = check.robot.workspace, check.reach
-    if reach.table < ENOUGH:
+    space = check.robot.workspace
+    if check.table < ENOUGH:
         centre = f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green"
-        narrower = f"take half_width: {reach.half_width:g} in place of {space.half_width:g}"
-        part = f"The hand gets to {100 * reach.table:.0f} % of the workspace on the table"
-        lines.append(f"{part}: {narrower if reach.half_width else centre}.")
+        narrower = f"take half_width: {check.half_width:g} in place of {space.half_width:g}"
+        part = f"The hand gets to {100 * check.table:.0f} % of the workspace on the table"
+        lines.append(f"{part}: {narrower if check.half_width else centre}.")
     return (*lines, *(line for task in check.failed for line in _of_task(check, task)))
 
 
@@ -213,7 +211,7 @@ def _of_joint(joint: JointFacts) -> Iterator[str]:
 
 
 def _of_task(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
-    wide, most = max(task.widths.values(), default=0.0), check.hand.most
+    wide, most = max(task.widths.values(), default=0.0), check.opening
     if wide >= most:
         change = "widen gripper.open, or leave the task out"
         if isinstance(get_task(task.name), TakesShape):

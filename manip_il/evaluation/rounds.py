@@ -17,7 +17,6 @@ COSTS: tuple[Cost, ...] = ("labels", "episodes", "steps", "seconds")
 METRICS_FILE = "metrics.jsonl"
 END = "end"
 ENOUGH = 0.95  # share of an amount that a run must have reached to be compared at it: rounds are not that fine
-_MOST = 10**12  # labels, episodes
 
 
 @dataclass(frozen=True)
@@ -82,45 +81,26 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
 
     Of `manip-il gail`, `airl` and `ppo` those iterations are rounds that were validated.
     """
-    unit = "iteration" if records and "iteration" in records[0] else "round"
+    unit: Literal["round", "iteration"] = "iteration" if records and "iteration" in records[0] else "round"
     rounds: list[Round] = []
     seconds = validating = 0.0
     try:
-        numbered = sorted(
-            ((checks.whole(unit, record[unit], 0, _MOST), record) for record in records), key=lambda one: one[0]
-        )
-    except (KeyError, ManipError) as error:
-        raise ManipError(f"{name}: metrics.jsonl was not written by a run of manip-il ({error})") from error
-    first = min(1, numbered[0][0]) if numbered and unit == "iteration" else 0
-    for expected, (number, record) in enumerate(numbered, start=first):
-        if number != expected:
-            raise ManipError(f"{name}: metrics.jsonl has no {unit} {expected}; expected one line for each")
-        try:
-            times = checks.mapping("seconds", record["seconds"])
-            seconds += sum(checks.number(part, times[part], 0) for part in ("collect", "fit"))
-            validating += checks.number("validate", times["validate"], 0)
-            if unit == "round" or record["validation_success"] is not None:
-                rounds.append(_round(record, number, seconds, validating, unit))
-        except (KeyError, ManipError) as error:
-            why = f"no {error}, {unit} {number}" if isinstance(error, KeyError) else f"{unit} {number}: {error}"
-            raise ManipError(f"{name}: metrics.jsonl was not written by a run of manip-il ({why})") from error
+        for record in sorted(records, key=lambda record: record[unit]):
+            times, n = record["seconds"], record["validation_episodes"]
+            seconds += times["collect"] + times["fit"]
+            validating += times["validate"]
+            if record["validation_success"] is None:
+                continue
+            labels = record["labels"] if unit == "round" else 0  # reinforcement learning asks for none
+            queries = record.get("queries", labels)
+            costs = (labels, queries, record["episodes"], record.get("steps", queries), seconds, validating)
+            validation = Proportion(round(record["validation_success"] * n), n)
+            rounds.append(Round(record[unit], *costs, validation, unit))
+    except (KeyError, TypeError, UsageError) as error:
+        raise ManipError(f"{name}: metrics.jsonl was not written by a run of manip-il ({error!r})") from error
     if not rounds:
         raise ManipError(f"{name} has no finished round yet; continue it with --resume=true")
     return tuple(rounds)
-
-
-def _round(
-    record: Mapping[str, Any], number: int, seconds: float, validating: float, unit: Literal["round", "iteration"]
-) -> Round:
-    def count(key: str, default: int | None = None) -> int:
-        return checks.whole(key, record[key] if default is None else record.get(key, default), 0, _MOST)
-
-    n = checks.whole("validation_episodes", record["validation_episodes"], 1, _MOST)
-    success = checks.number("validation_success", record["validation_success"], 0, 1)
-    labels = count("labels") if unit == "round" else 0  # reinforcement learning asks for none
-    queries = count("queries", labels)
-    steps, validation = count("steps", queries), Proportion(round(success * n), n)
-    return Round(number, labels, queries, count("episodes"), steps, seconds, validating, validation, unit)
 
 
 def has_unqueried_steps(rounds: History) -> bool:

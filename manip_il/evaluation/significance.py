@@ -104,15 +104,6 @@ def sign_flip_exact(differences: Sequence[int]) -> float:
     return sum(count for place, count in enumerate(ways) if abs(2 * place - total) >= observed) / sum(ways)
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Return every p corrected for how many there are: Holm (1979), Scand. J. Statist. 6, 65-70."""
-    ranks = np.argsort(p_values, kind="stable")
-    scaled = np.array(p_values)[ranks] * np.arange(len(p_values), 0, -1)
-    corrected = np.empty(len(p_values))
-    corrected[ranks] = np.minimum(1.0, np.maximum.accumulate(scaled))
-    return corrected.tolist()
-
-
 def format_p(p: float) -> str:
     """Return `p = 0.031`, or `p < 0.001` for what is smaller."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"

@@ -48,8 +48,7 @@ def test_the_verdict_has_success_and_the_main_phase():
 
 def test_the_parts_stand_in_the_order_of_what_one_asks():
     assert re.findall(r"<h2>(.*?)</h2>", REPORT.render()) == [
-        *("Results", "Success against cost", "Where it fails", "What failures go with", "How it looks"),
-        "How it was made",
+        *("Results", "Success against cost", "Where it fails", "How it looks", "How it was made"),
     ]
 
 
@@ -84,12 +83,10 @@ def test_if_nothing_or_everything_failed_the_page_says_so():
     assert "Phase that it ended in" not in text
     bad = eval_report(made_eval(fails=lambda *_: True), COMMAND)
     assert bad.verdict.startswith("runs/a/best fails in all 120 unseen episodes of panda pick_place: 0.0 % [")
-    assert "What failures go with" not in page_of(bad).text
 
 
 def test_a_file_with_success_alone_still_has_its_page():
     page = page_of(eval_report(without_detail(made_eval()), COMMAND))
-    assert "What failures go with" not in page.text
     assert not any("Starts and goals" in words for words in page.figures)
     assert "not recorded" in page.text
 
@@ -130,8 +127,8 @@ def test_a_comparison_tells_the_four_counts_and_each_condition():
     ) in page.text
     knocked = made_comparison(lambda _, detail: detail["condition"] == "knocked", lambda *_: False)
     rows = {row[0]: row[1:] for row in condition_table(knocked).rows}
-    assert rows["knocked"] == ("40", "0.0 %", "100.0 %", "+100.0 points", "p < 0.001")
-    assert rows["nominal"] == ("40", "100.0 %", "100.0 %", "+0.0 points", "p = 1.000")
+    assert rows["knocked"] == ("40", "0.0 %", "100.0 %", "+100.0 points")
+    assert rows["nominal"] == ("40", "100.0 %", "100.0 %", "+0.0 points")
 
 
 @pytest.mark.parametrize("seeds", [1, 3])

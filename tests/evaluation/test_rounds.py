@@ -45,8 +45,6 @@ def test_the_order_of_the_lines_does_not_matter():
     ("lines", "words"),
     [
         ([], "no finished round"),
-        (records()[1:], "no round 0"),
-        ([records()[0], records()[0]], "no round 1"),
         ([{"step": 100, "loss": 0.1}], "not written by a run of manip-il"),
         ([records()[0] | {"seconds": None}], "not written by a run of manip-il"),
     ],
@@ -104,14 +102,6 @@ def test_a_dip_is_measured_from_the_best_before():
     assert largest_dip(RUN) == pytest.approx(0.2)
     assert largest_dip(RUN[:2]) == 0
     assert largest_dip(history(records((0.9, 0.1, 0.95)), "x")) == pytest.approx(0.8)
-
-
-@pytest.mark.parametrize("key", ["labels", "episodes", "validation_success", "validation_episodes", "seconds"])
-def test_an_odd_value_is_one_short_line(key: str):
-    for value in (None, True, -5, 2**80, "x" * 100_000, [], {}):
-        with pytest.raises(ManipError, match=r"run: metrics\.jsonl") as raised:
-            history([records()[0] | {key: value}], "run")
-        assert len(str(raised.value)) < 1_000
 
 
 def test_a_line_that_a_kill_cut_short_is_dropped(tmp_path: Path):

@@ -10,7 +10,6 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.significance import (
     compare_paired,
     format_p,
-    holm,
     mcnemar_exact,
     sign_flip_exact,
 )
@@ -94,9 +93,3 @@ def test_the_test_counts_every_way_to_flip_the_signs(differences: list[int]):
 @given(few)
 def test_training_seeds_that_agree_in_every_episode_are_no_further_evidence(differences: list[int]):
     assert sign_flip_exact([3 * d for d in differences]) == sign_flip_exact(differences)
-
-
-def test_holm_asks_the_smallest_p_for_the_most():
-    assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
-    assert holm([0.5, 0.9]) == [1.0, 1.0]
-    assert holm([]) == []
