@@ -76,7 +76,7 @@ class CompareOptions:
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
         from manip_il.collect.workers import Engine
-        from manip_il.evaluation.arm import match_seeds, read_arm
+        from manip_il.evaluation.arm import read_arm, require_pair
         from manip_il.evaluation.compare_report import compare_report, comparison_table
         from manip_il.evaluation.comparison import FILE_NAME, Comparison, seeds_facts
         from manip_il.evaluation.results import write_json
@@ -84,15 +84,11 @@ class CompareOptions:
         from manip_il.evaluation.tables import print_table
 
         rule = Rule.parse(self.checkpoint, self.at)
-        *both, lines = match_seeds(read_arm(self.left), read_arm(self.right))
+        both = [read_arm(self.left), read_arm(self.right)]
+        require_pair(*both)
         members = [member for arm in both for member in arm.members]
         warn(
-            *lines,
-            *(
-                f"{one.name} is not finished: its {len(one.history)} rounds count"
-                for one in members
-                if not one.finished
-            ),
+            *(f"{one.name} is not finished: its {len(one.history)} rounds count" for one in members if not one.finished)
         )
         limit = rule.limit({member.name: member.history for member in members})
         arms = [arm.map(lambda member: member.select(rule, limit)) for arm in both]
@@ -123,19 +119,16 @@ class CompareOptions:
         from manip_il.evaluation.results import compare_results
         from manip_il.evaluation.trial import Trial
 
-        given = [member for member in members if member.policy is None]
-        for other in given[1:]:
-            first, names = given[0], (given[0].name, other.name)
-            compare_results(first.test, other.test, names)
-            require_same_episodes(first.name, first.test, other.name, other.test)
-            warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
-        if len(given) == len(members):
+        if members[0].result is not None:
+            first = members[0]
+            for other in members[1:]:
+                compare_results(first.test, other.test, (first.name, other.name))
+                require_same_episodes(first.name, first.test, other.name, other.test)
+                warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
             return None
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
         trial = Trial.of(common_env(members, self._policy_env), seeds, self.suite, policies.values(), self.trust)
-        for member in given:
-            trial.require_same(member.name, member.test)
         check_policies(policies, trial, self.output_dir, self.engine)
         return trial
 

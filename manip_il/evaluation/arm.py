@@ -131,28 +131,19 @@ def read_arm(path: Path) -> Arm:
     return Arm(str(path), tuple(_of_seed(folder, seed) for seed, folder in sorted(seeds.items())))
 
 
-def match_seeds(left: Arm, right: Arm) -> tuple[Arm, Arm, list[str]]:
-    """Return both arms with the training seeds that both have, and a line for each side that loses some.
+def require_pair(left: Arm, right: Arm) -> None:
+    """Raise `UsageError` unless two arms can be compared: both or neither evaluated already, the same training seeds.
 
-    Two single ones are a pair, whatever their seeds. Raises `UsageError` if one policy meets several training seeds, or
-    none is shared.
+    Two single policies are a pair, whatever their seeds.
     """
-    if len(left.members) == len(right.members) == 1:
-        return left, right, []
-    ours, theirs = set(left.training_seeds), set(right.training_seeds)
-    shared = ours & theirs
-    if not shared:
+    if len({member.result is None for arm in (left, right) for member in arm.members}) > 1:
+        raise UsageError(f"{left.name} and {right.name}: one is evaluated already; give two eval.json, or two policies")
+    ours, theirs = left.training_seeds, right.training_seeds
+    if len(ours) != len(theirs) or (len(ours) > 1 and ours != theirs):
         raise UsageError(
-            f"no training seed is shared: {left.name} has {_numbers(ours)}, {right.name} {_numbers(theirs)}; runs are "
-            "paired by seed, so give two folders of seeds, or two single runs"
+            f"training seeds differ: {left.name} has {ours}, {right.name} {theirs}; runs are paired by seed, so both "
+            "sides need the same ones"
         )
-    lines = [
-        f"{arm.name}: training seeds {_numbers(seeds - shared)} have no partner and are left out"
-        for arm, seeds in ((left, ours), (right, theirs))
-        if seeds - shared
-    ]
-    kept = (tuple(one for one in arm.members if one.training_seed in shared) for arm in (left, right))
-    return Arm(left.name, next(kept)), Arm(right.name, next(kept)), lines
 
 
 def run_member(folder: Path, training_seed: int) -> Member:
@@ -234,7 +225,3 @@ def _round_policy(folder: Path, chosen: Round) -> Path:
     if chosen.unit == "iteration":
         return find_policy(folder / "validation" / f"{chosen.round:06d}")
     return find_policy(folder / f"round_{chosen.round:03d}" / "policy")
-
-
-def _numbers(seeds: set[int | None]) -> str:
-    return ", ".join("none" if seed is None else str(seed) for seed in sorted(seeds, key=lambda one: one or 0))

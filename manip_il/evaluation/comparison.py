@@ -9,7 +9,7 @@ from statistics import fmean
 from typing import Any
 
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.arm import Arm
+from manip_il.evaluation.arm import Arm, require_pair
 from manip_il.evaluation.intervals import CONFIDENCE, mean_interval
 from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.evaluation.significance import PairedComparison, format_p, format_points, sign_flip_exact
@@ -30,14 +30,9 @@ class Comparison:
     right: Arm
 
     def __post_init__(self) -> None:
-        left, right = self.left.training_seeds, self.right.training_seeds
         if self.left.name == self.right.name:
             raise UsageError(f"{self.left.name} is compared with itself; give two different ones")
-        if len(left) != len(right) or (len(left) > 1 and left != right):
-            raise UsageError(
-                f"training seeds differ: {self.left.name} has {left}, {self.right.name} {right}; runs are paired by "
-                "seed, so both sides need the same ones"
-            )
+        require_pair(self.left, self.right)
         # Also policies of different training seeds must have run the same episodes.
         first, *others = (*self.left.members, *self.right.members)
         for other in others:
@@ -140,15 +135,8 @@ class Comparison:
             "interval_method": "Student's t over training seeds" if several else "Newcombe's for paired proportions",
             "confidence": CONFIDENCE,
             "p_value": self.p_value,
-            "test": (
-                "exact sign flips of test episodes, training seeds summed; conditional on these training seeds"
-                if several
-                else "McNemar's, exact"
-            ),
             "only_left": sum(pair.only_left for pair in self.pairs),
             "only_right": sum(pair.only_right for pair in self.pairs),
-            "left_ahead": self.ahead(self.left.name),
-            "right_ahead": self.ahead(self.right.name),
             "n_episodes": self.pairs[0].n,
             "verdict": self.verdict,
             "training_seeds": [

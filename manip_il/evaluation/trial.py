@@ -13,7 +13,7 @@ from manip_il.collect.environments import env_fingerprint, policy_cameras, polic
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.fingerprint import canonical_json
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
@@ -105,19 +105,6 @@ class Trial:
                 raise ManipError(f"{name} has {have} test episodes, because workers died")
             result.write(file)
         return EvalResult.read(file)
-
-    def require_same(self, name: str, result: EvalResult) -> None:
-        """Raise `MismatchError` or `ManipError` unless a given evaluation is of this trial."""
-        settings = EvalSettings.of(self.job(None), self.suite)
-        for what, value in {"robot": self.env.robot, "task": self.env.task, "settings": settings}.items():
-            if getattr(result, what) != value:
-                raise MismatchError(what, name, getattr(result, what), "this comparison", value)
-        theirs = {episode.seed for episode in result.episodes}
-        if theirs != set(self.seeds):
-            raise ManipError(
-                f"test episodes differ: {name} has {len(theirs)}, this comparison {len(self.seeds)}, of which "
-                f"{len(theirs & set(self.seeds))} are the same; give its --seed and --eval.n_episodes here"
-            )
 
 
 def episode_hold(env: EnvConfig, hold: int | None) -> int | None:
