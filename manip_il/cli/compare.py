@@ -96,8 +96,8 @@ class CompareOptions:
         with open_output(self, FREE) as folder:
             kept = f"every finished evaluation, in {folder}"
             with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-                if trial is not None:
-                    arms = [arm.map(lambda one: one.measure(trial, folder, engine, stages)) for arm in arms]
+                last = (trial, folder, engine, stages)
+                arms = [arm.map(lambda one: one.measure(*last)) for arm in arms]
             comparison = Comparison(*arms)
             write_json(folder / FILE_NAME, comparison.file_json() | {"rule": rule.to_json(limit)})
             chosen = any(member.chosen for arm in arms for member in arm.members)

@@ -61,9 +61,9 @@ class Member:
         chosen = rule.select(self.history, limit, self.name)
         return replace(self, chosen=chosen, policy=_round_policy(self.path, chosen))
 
-    def measure(self, trial: Trial, folder: Path, engine: Engine, progress: Progress) -> Member:
-        """Return the member with the evaluation of its policy, which is stored in `folder`."""
-        if self.policy is None:
+    def measure(self, trial: Trial | None, folder: Path, engine: Engine, progress: Progress) -> Member:
+        """Return the member with the evaluation of its policy, which is stored in `folder`; itself without a trial."""
+        if self.policy is None or trial is None:
             return self
         file = trial.file(folder, self.policy)
         result = trial.measure(self.policy, self.name, file, engine, progress)

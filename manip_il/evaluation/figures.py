@@ -92,6 +92,12 @@ def plain(text: str) -> str:
     return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
 
 
+def plain_lines(name: str) -> str:
+    """Return a name as `plain` text in at most three short lines, broken at blanks and slashes."""
+    lines = textwrap.wrap(name.replace("/", "/ "), _NAME)
+    return "\n".join(plain(line.replace("/ ", "/")) for line in lines[-3:])
+
+
 @dataclass(frozen=True)
 class Bar:
     """Success rates of one thing: one with its interval, or those of training seeds, of which the bar is the mean."""
@@ -103,7 +109,7 @@ class Bar:
 
 def rates_figure(bars: Sequence[Bar]) -> Figure:
     """Draw success rates as bars from 0 to 100 %, with intervals, or with a dot for each training seed."""
-    names = ["\n".join(map(plain, textwrap.wrap(bar.name, _NAME)[:3])) for bar in bars]
+    names = [plain_lines(bar.name) for bar in bars]
     height = 0.55 + sum(0.24 + 0.14 * (1 + name.count("\n")) for name in names)
     with drawing(1, size=(4.4, height)) as (drawn, axes):
         axis = axes[0, 0]
@@ -154,9 +160,10 @@ def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple
     lowest = min([one.validation.interval[0] for one in rounds] + ([] if target is None else [target]))
     floor = math.floor(10 * lowest) * 10 if lowest > 0.5 else 0  # unlike bars, points may start above 0
     queried = not any(has_unqueried_steps(run) for curve in curves for run in curve.runs)
-    known: set[Cost] = {cost for curve in curves for cost in curve.costs if not (cost == "steps" and queried)}
     figures: list[Figure] = []
-    for cost in [cost for cost in COSTS if cost in known]:
+    for cost in COSTS:
+        if not any(cost in curve.costs for curve in curves) or (cost == "steps" and queried):
+            continue
         shown = [curve for curve in curves if cost in curve.costs]
         with drawing(1, size=_PANEL) as (drawn, axes):
             _draw_curves(axes[0, 0], shown, cost, floor, target)

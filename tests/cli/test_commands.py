@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.cli import trials
 from manip_il.cli.dagger import DaggerOptions, best_verdict
 from manip_il.cli.main import load, main
 from manip_il.cli.options import command_line, options_of
@@ -27,6 +26,7 @@ from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.parsing import from_yaml, parse
 from manip_il.cli.quickstart import quickstart_verdict
 from manip_il.data.dataset import Dataset
+from manip_il.evaluation import film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.tables import PolicyRow
 
@@ -166,7 +166,7 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
 
 @pytest.mark.slow
 def test_the_quickstart_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(trials, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
+    monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
     sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
     words = ["quickstart", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
     assert main(words) == 0

@@ -64,8 +64,9 @@ def test_what_cannot_be_a_film_is_refused(pictures, words):
 def test_a_film_shows_every_second_state_and_its_poster_is_the_last(episode):
     film = Shot(JOB, episode, "expert", "success", stills=6).film()
     poster = np.asarray(Image.open(io.BytesIO(film.poster), formats=["jpeg"]))
+    pictures: list[np.ndarray] = []
     with av.open(io.BytesIO(film.mp4), "r") as container:
-        pictures = [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
+        pictures += [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
     assert len(pictures) == -(-filmed_steps(episode, 20) // 2)
     assert poster.shape == pictures[-1].shape == (240, 320, 3)
     assert np.abs(pictures[-1].astype(int) - poster).mean() < 5
