@@ -6,7 +6,7 @@ Places and condition are optional: files of older versions and of other tools ma
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -83,12 +83,6 @@ class EpisodeResult:
             phase_at_end=checks.text("phase_at_end", data.get("phase_at_end", ""), checks.LONGEST_NAME),
             detail={key: value for key, value in data.items() if key not in _KEYS},
         )
-
-
-def moving_thing(episodes: Sequence[EpisodeResult]) -> Literal["object", "hand"]:
-    """Return what is to reach the goal: the hand if episodes have starts, but none of an object."""
-    starts = [start for one in episodes if isinstance(start := one.detail.get("start"), Mapping)]
-    return "object" if not starts or any("object" in start for start in starts) else "hand"
 
 
 @dataclass(frozen=True, slots=True)

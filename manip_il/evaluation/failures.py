@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from manip_il.evaluation.episodes import EpisodeResult, moving_thing
+from manip_il.evaluation.episodes import EpisodeResult
 from manip_il.evaluation.figures import Figure, MapGroup, map_figures
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.tables import BASELINE, CLONING, NO_CONDITION, Table
@@ -105,5 +105,4 @@ def map_groups(outcomes: Sequence[tuple[str, str, Sequence[EpisodeResult]]]) -> 
         if known:
             kept = np.unique(np.linspace(0, len(known) - 1, min(len(known), MAX_MARKS)).round().astype(int)).tolist()
             groups.append(MapGroup(name, colour, tuple(known[index] for index in kept), joined=name != outcomes[0][0]))
-    thing = moving_thing([one for *_, episodes in outcomes for one in episodes])
-    return map_figures(groups, thing) if groups else ()
+    return map_figures(groups) if groups else ()

@@ -226,12 +226,12 @@ class MapGroup:
     joined: bool = True  # start and goal by a line
 
 
-def map_figures(groups: Sequence[MapGroup], moving: str) -> tuple[Figure, ...]:
+def map_figures(groups: Sequence[MapGroup]) -> tuple[Figure, ...]:
     """Draw starts as circles, goals as squares, and ends as crosses, from above and from the side."""
-    return tuple(_map_figure(groups, moving, view) for view in ("above", "the side"))
+    return tuple(_map_figure(groups, view) for view in ("above", "the side"))
 
 
-def _map_figure(groups: Sequence[MapGroup], moving: str, view: Literal["above", "the side"]) -> Figure:
+def _map_figure(groups: Sequence[MapGroup], view: Literal["above", "the side"]) -> Figure:
     up = 1 if view == "above" else 2
     places = np.array([place for group in groups for one in group.places for place in one[:2]])[:, [0, up]]
     middle, half = (places.max(axis=0) + places.min(axis=0)) / 2, 0.55 * float(np.ptp(places, axis=0).max()) + 0.01
@@ -257,4 +257,4 @@ def _map_figure(groups: Sequence[MapGroup], moving: str, view: Literal["above", 
         axis.set_title(f"seen from {view}", loc="left")
         drawn.legend(loc="outside lower left")
         counts = ", ".join(f"{len(group.places)} {group.name}" for group in groups)
-        return to_figure(drawn, f"Starts and goals of the {moving} seen from {view}: {counts}")
+        return to_figure(drawn, f"Starts and goals seen from {view}: {counts}")

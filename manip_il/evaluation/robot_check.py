@@ -38,10 +38,9 @@ SOLVES = 0.9  # share of clean episodes that the expert solves, of a task that c
 STARTS = 50  # of each task that are drawn
 ENOUGH = 0.95  # share of a workspace that a robot reaches, of one that suits it
 LOW = 0.03  # height of what lies on the table [m]
-LOAD = 0.2  # in the hand [kg]
 _PLAIN = "reach"  # the task of the scene in which the arm itself is looked at
 _NOISE = "random_actions"  # of the suites
-_SECONDS = 1.0  # of each step response, and of holding
+_SECONDS = 1.0  # of each step response
 _FEW = 3  # starts without a place, after which no more are drawn
 _ACROSS = 41  # points of a share along each edge of the workspace
 _NARROWER = 0.01  # steps in which a smaller workspace is tried [m]
@@ -53,7 +52,7 @@ class JointFacts:
 
     limits: [rad], None if it turns freely. home [rad]. kp [N m/rad], kv [N m s/rad], force: the greatest [N m].
     rise: from a tenth to nine tenths of the longest step of its target [s], None if that takes over a second.
-    overshoot: beyond that step, as its share. sag: off home under `LOAD` in the hand [rad].
+    overshoot: beyond that step, as its share.
     """
 
     name: str
@@ -65,7 +64,6 @@ class JointFacts:
     force: float
     rise: float | None
     overshoot: float
-    sag: float
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ class TaskCheck:
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """A robot as it was measured. name: as it was given. sag: of the hand under `LOAD` [m].
+    """A robot as it was measured. name: as it was given.
 
     openings: of the gripper by command of its first joint [m] or [rad], rising [m]. overlaps: pairs of links at home,
     and in any posture. table, leaning: shares of points on the table of the workspace that the hand gets to, upright,
@@ -120,7 +118,6 @@ class RobotCheck:
     name: str
     robot: Robot
     joints: tuple[JointFacts, ...]
-    sag: float
     openings: Mapping[float, float]
     overlaps: tuple[Pair, ...]
     table: float
@@ -145,7 +142,6 @@ class RobotCheck:
             "robot": self.name,
             "hand": self.robot.hand,
             "joints": [dataclasses.asdict(joint) for joint in self.joints],
-            "sag": self.sag,
             "gripper": {"joints": self.robot.gripper.joints, **gripper},
             "home_overlaps": self.overlaps,
             "reach": {name: getattr(self, name) for name in ("table", "leaning", "half_width")},
@@ -167,7 +163,7 @@ def check_robot(
     if episodes:
         checked = [_with_episodes(name, task, episodes, engine, on_result) for task in checked]
     return RobotCheck(
-        name, robot, *arm_facts(scene), openings(robot), overlaps, *reach_facts(robot), tasks=tuple(checked)
+        name, robot, arm_facts(scene), openings(robot), overlaps, *reach_facts(robot), tasks=tuple(checked)
     )
 
 
@@ -245,10 +241,9 @@ def _share(robot: Robot, test: Callable[[tuple[float, float, float]], bool], hal
     return float(np.mean([test((x + dx, y + dy, LOW)) for dx in steps for dy in steps]))
 
 
-def arm_facts(scene: Scene) -> tuple[tuple[JointFacts, ...], float]:
-    """Return what every joint of a scene's arm does alone, from home, and how far the hand sinks under `LOAD` [m]."""
-    sags, sag = _sags(scene)
-    return tuple(_joint(scene, place, sags[place]) for place in range(len(scene.robot.joints))), sag
+def arm_facts(scene: Scene) -> tuple[JointFacts, ...]:
+    """Return what every joint of a scene's arm does alone, from home, the gripper open."""
+    return tuple(_joint(scene, place) for place in range(len(scene.robot.joints)))
 
 
 def at_home(scene: Scene) -> mujoco.MjData:
@@ -260,7 +255,7 @@ def at_home(scene: Scene) -> mujoco.MjData:
     return data
 
 
-def _joint(scene: Scene, place: int, sag: float) -> JointFacts:
+def _joint(scene: Scene, place: int) -> JointFacts:
     robot, model = scene.robot, scene.model
     joint, motor = model.joint(PREFIX + robot.joints[place]), int(scene.arm_ctrl[place])
     limits = (float(joint.range[0]), float(joint.range[1])) if joint.limited[0] else None
@@ -278,7 +273,6 @@ def _joint(scene: Scene, place: int, sag: float) -> JointFacts:
         force=float(model.actuator_forcerange[motor, 1]),
         rise=rise,
         overshoot=max(0.0, float(gone.max()) - 1.0),
-        sag=sag,
     )
 
 
@@ -292,19 +286,6 @@ def _step_response(scene: Scene, place: int, step: float) -> F64:
         mujoco.mj_step(scene.model, data)
         gone[moment] = (data.qpos[scene.arm_q[place]] - begin) / step
     return gone
-
-
-def _sags(scene: Scene) -> tuple[F64, float]:
-    """How far off home each joint comes to rest under the load (arm,) [rad], and how far the hand sinks [m]."""
-    model, data = scene.model, at_home(scene)
-    ee, load = data.site_xpos[scene.ee_site].copy(), np.zeros(model.nv)
-    body = int(model.site_bodyid[scene.ee_site])
-    mujoco.mj_applyFT(model, data, LOAD * model.opt.gravity, np.zeros(3), ee, body, load)
-    data.qfrc_applied[:] = load
-    mujoco.mj_step(model, data, round(_SECONDS / model.opt.timestep))
-    mujoco.mj_kinematics(model, data)
-    sunk = float(ee[2] - data.site_xpos[scene.ee_site][2])
-    return np.abs(data.qpos[scene.arm_q] - np.asarray(scene.robot.home)), sunk
 
 
 def _with_episodes(

@@ -12,7 +12,7 @@ import numpy as np
 from manip_il.evaluation.figures import Figure, drawing, plain, to_figure
 from manip_il.evaluation.film import encode_picture
 from manip_il.evaluation.report import Report, Section, Still
-from manip_il.evaluation.robot_check import ENOUGH, LOAD, SOLVES, JointFacts, RobotCheck, TaskCheck, at_home, reach_map
+from manip_il.evaluation.robot_check import ENOUGH, SOLVES, JointFacts, RobotCheck, TaskCheck, at_home, reach_map
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, Table
 from manip_il.sim.config import FILM
 from manip_il.sim.render import Line, Overview, marked_picture
@@ -23,7 +23,6 @@ from manip_il.tasks.task import TakesShape
 
 SLOW, USUAL = 0.25, 0.1  # rise of a joint from which on labels run ahead of the arm, and with the gains found [s]
 SWINGS = 0.2  # share of a step by which a joint goes beyond it
-SINKS = 0.005  # of the hand under the load [m]
 _ROOM = 0.13  # of a map around the workspace [m]
 _AXES = ((0.85, 0.12, 0.12, 1.0), (0.10, 0.62, 0.20, 1.0), (0.10, 0.30, 0.90, 1.0))  # x red, y green, z blue
 _SPACE = (0.05, 0.45, 0.75, 1.0)
@@ -84,7 +83,7 @@ def verdict(check: RobotCheck) -> str:
 
 def joint_table(check: RobotCheck) -> Table:
     """Return the joints base to hand: limits, home, gains, and how they move and hold."""
-    columns = ("joint", "limits", "home", "kp", "kv", "force", "rise [ms]", "overshoot", "sag")
+    columns = ("joint", "limits", "home", "kp", "kv", "force", "rise [ms]", "overshoot")
     return Table(columns, tuple(_joint_row(joint) for joint in check.joints))
 
 
@@ -113,14 +112,13 @@ def motors_line(check: RobotCheck) -> str:
     return (
         "Position control drives the joints: torque = kp (target - joint) - kv velocity, at most the force; gravity is "
         "compensated. kp is in N m/rad, kv in N m s/rad, force in N m. "
-        f"Rise and overshoot: of a step of {check.robot.max_joint_step:g} rad from home, the longest of a label. "
-        f"Sag: off home with {LOAD:g} kg in the hand, which sinks by {1000 * check.sag:.1f} mm."
+        f"Rise and overshoot: of a step of {check.robot.max_joint_step:g} rad from home, the longest of a label."
     )
 
 
 def _joint_row(joint: JointFacts) -> tuple[str, ...]:
-    def angle(value: float, digits: int = 0) -> str:
-        return f"{1000 * value:.1f} mm" if joint.slides else f"{math.degrees(value):.{digits}f}°"
+    def angle(value: float) -> str:
+        return f"{1000 * value:.1f} mm" if joint.slides else f"{math.degrees(value):.0f}°"
 
     limits = "free" if joint.limits is None else f"{angle(joint.limits[0])} to {angle(joint.limits[1])}"
     rise = "over 1,000" if joint.rise is None else f"{1000 * joint.rise:.0f}"
@@ -183,10 +181,6 @@ def hand_figure(check: RobotCheck) -> Figure:
 def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML, the arm's first, then for each task that cannot be done."""
     lines = [line for joint in check.joints for line in _of_joint(joint)]
-    if check.sag > SINKS:
-        weakest = max(check.joints, key=lambda joint: joint.sag, default=None)
-        where = f", most of it in {weakest.name}" if weakest else ""
-        lines.append(f"{LOAD:g} kg let the hand sink by {1000 * check.sag:.0f} mm{where}: raise gains, or forces.")
     for one, other in check.overlaps:
         lines.append(f"{one} and {other} overlap however the arm stands: take one of their contacts out of the model.")
     space = check.robot.workspace

@@ -32,30 +32,17 @@ from manip_il.sim.scene import PREFIX, build_scene
 from manip_il.tasks.table import TASKS
 
 from ..tables import every_robot
-from .own import model_of, tree_of, write
+from .own import model_of, write
 
 EVERYWHERE = Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21)))
 
 
 @every_robot
 def test_every_joint_gets_to_its_target_and_stays(robot: str):
-    joints, sag = arm_facts(build_scene(robot, "reach"))
+    joints = arm_facts(build_scene(robot, "reach"))
     assert [joint.name for joint in joints] == list(get_robot(robot).joints)
     assert all(joint.rise is not None and 0.03 < joint.rise < 0.2 for joint in joints)
     assert all(joint.overshoot < 0.1 for joint in joints)
-    assert 0 < sag < 0.005
-
-
-def test_a_joint_with_a_quarter_of_the_gain_sags_four_times_as_far(tmp_path: Path):
-    weak = tree_of() | {"gains": [gain / 4 for gain in tree_of()["gains"]]}
-    (strong, _), (weak, sag) = (
-        arm_facts(build_scene(str(write(tmp_path, name, tree=tree)), "reach"))
-        for name, tree in (("strong", tree_of()), ("weak", weak))
-    )
-    for one, other in zip(strong, weak, strict=True):
-        if one.sag > 1e-4:
-            assert other.sag == pytest.approx(4 * one.sag, rel=0.1)
-    assert sag > 0
 
 
 @every_robot
@@ -125,7 +112,7 @@ def test_starts_are_drawn_until_a_few_find_no_place(own: Robot, monkeypatch: pyt
 
 
 def a_check(own: Robot, *tasks: TaskCheck, table: float = 1.0, half_width: float = 0.12) -> RobotCheck:
-    return RobotCheck("own.yaml", own, (), 0.0, openings(own), (), table, 1.0, half_width, tasks)
+    return RobotCheck("own.yaml", own, (), openings(own), (), table, 1.0, half_width, tasks)
 
 
 def evaluation(solved: int) -> EvalResult:
