@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from manip_il import checks
-from manip_il.mdp import LONGEST_EPISODE
 from manip_il.sim.conditions import NOMINAL, Condition
 
 if TYPE_CHECKING:
@@ -19,8 +17,8 @@ if TYPE_CHECKING:
     from manip_il.sim.config import EnvConfig
 
 Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
-_KEYS = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")  # of every episode
-_HZ, _SUCCESS_STEPS = 20, 5  # of files without them
+# Of every episode, in the order of `EpisodeResult`.
+_KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +70,12 @@ class EpisodeResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
-        """Return the inverse of `to_json`; `ManipError` or `KeyError` if a value is invalid or missing."""
-        data = checks.mapping("an episode", data)
-        return cls(
-            seed=checks.whole("seed", data["seed"], 0, checks.LARGEST_SEED),
-            success=checks.truth("success", data["success"]),
-            success_at_end=checks.truth("success_at_end", data.get("success_at_end", data["success"])),
-            steps=checks.whole("steps", data["steps"], 0, LONGEST_EPISODE),
-            ret=checks.number("return", data["return"]),
-            phase_at_end=checks.text("phase_at_end", data.get("phase_at_end", ""), checks.LONGEST_NAME),
-            detail={key: value for key, value in data.items() if key not in _KEYS},
-        )
+        """Return the inverse of `to_json`; `KeyError` or `TypeError` if a value is missing or of another kind."""
+        known = {"success_at_end": data["success"], "phase_at_end": ""} | {
+            key: data[key] for key in data if key in _KEYS
+        }
+        values = [convert(known[key]) for key, convert in _KEYS.items()]
+        return cls(*values, detail={key: value for key, value in data.items() if key not in _KEYS})
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +90,8 @@ class EvalSettings:
 
     horizon: int
     tolerance: float
-    control_hz: int = _HZ
-    success_steps: int = _SUCCESS_STEPS
+    control_hz: int = 20  # and five steps, in files without them
+    success_steps: int = 5
     suite: str = NOMINAL.name
     conditions: tuple[Condition, ...] = (NOMINAL,)
     hold: int | None = None
@@ -133,22 +126,10 @@ class EvalSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
-        """Return the inverse of `to_json`; `ManipError` or `KeyError` if a value is invalid or missing."""
-        data = checks.mapping("settings", data)
-        given = checks.array("conditions", data.get("conditions", [NOMINAL.to_json()]), 100)
-        named = [dict(checks.mapping("a condition", one)) for one in given]
-        steps = data.get("success_steps", _SUCCESS_STEPS)
-        return cls(
-            horizon=checks.whole("horizon", data["horizon"], 1, LONGEST_EPISODE),
-            tolerance=checks.number("tolerance", data["tolerance"], 0, 1),
-            control_hz=checks.whole("control_hz", data.get("control_hz", _HZ), 1, 1_000),
-            success_steps=checks.whole("success_steps", steps, 1, LONGEST_EPISODE),
-            suite=checks.text("suite", data.get("suite", NOMINAL.name)),
-            conditions=tuple(Condition.from_mapping(one.pop("name"), one) for one in named),
-            hold=None if data.get("hold") is None else checks.whole("hold", data["hold"], 0, LONGEST_EPISODE),
-            object=checks.text("object", data.get("object", ""), checks.LONGEST_NAME),
-            reward=checks.text("reward", data.get("reward", "")),
-        )
+        """Return the inverse of `to_json`; raises as `EpisodeResult.from_json`. Other keys are ignored."""
+        known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
+        named = [dict(one) for one in known.pop("conditions", [NOMINAL.to_json()])]
+        return cls(**known, conditions=tuple(Condition.from_mapping(one.pop("name"), one) for one in named))
 
 
 def _place(given: Any) -> Place | None:

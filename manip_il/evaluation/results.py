@@ -110,17 +110,20 @@ class EvalResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalResult:
-        """Return the inverse of `to_json`: rates and intervals are computed anew from the episodes."""
-        width = data.get("until_width")
+        """Return the inverse of `to_json`: rates and intervals are computed anew from the episodes.
+
+        Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or of another kind.
+        """
         return cls(
-            policy=checks.text("policy", data["policy"]),
+            policy=data["policy"],
+            # names, not paths: a task's path would be code to run
             robot=checks.name("robot", data["robot"]),
             task=checks.name("task", data["task"]),
-            fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
-            episodes=tuple(EpisodeResult.from_json(one) for one in checks.array("episodes", data["episodes"])),
+            fingerprint=data["fingerprint"],
+            episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
             settings=EvalSettings.from_json(data["settings"]),
-            policy_sha256=checks.text("policy_sha256", data.get("policy_sha256", "")),
-            until_width=None if width is None else checks.number("until_width", width, 0, 1),
+            policy_sha256=data.get("policy_sha256", ""),
+            until_width=data.get("until_width"),
         )
 
     def write(self, path: Path) -> None:
@@ -137,14 +140,12 @@ class EvalResult:
         data = checks.read_json(path, f"an {FILE_NAME} of manip-il eval")
         try:
             result = cls.from_json(data)
-        except KeyError as error:
-            raise ManipError(f"{path}: key {error} is missing; expected an {FILE_NAME}") from error
-        except ManipError as error:
-            raise ManipError(f"{path}: not an {FILE_NAME}: {error}") from error
-        stated = data.get("n_episodes", len(result.episodes))
+            stated = int(data.get("n_episodes", len(result.episodes)))
+        except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, ManipError) as error:
+            why = f"key {error} is missing" if isinstance(error, KeyError) else checks.one_line(error)
+            raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
         if stated != len(result.episodes):
-            said = checks.shorten(stated)
-            raise MismatchError(f"{path}: number of episodes", "n_episodes", said, "episodes", len(result.episodes))
+            raise MismatchError(f"{path}: number of episodes", "n_episodes", stated, "episodes", len(result.episodes))
         return result
 
 

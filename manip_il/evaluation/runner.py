@@ -135,7 +135,7 @@ class EpisodeJournal:
         try:
             head, *records = [checks.mapping("a line", checks.parse_json("a line", line)) for line in lines]
             results = [EpisodeResult.from_json(record) for record in records]
-        except (KeyError, ManipError) as error:
+        except (KeyError, TypeError, ValueError, ManipError) as error:
             raise ManipError(
                 f"{path}: a line that is not an episode ({error}); start again with --overwrite=true"
             ) from error
