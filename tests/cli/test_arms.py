@@ -149,4 +149,4 @@ def test_a_study_of_cloning_and_gail_tests_both_and_goes_on(file, tmp_path, caps
     done = Path("s/gail/seed_0/metrics.jsonl").read_bytes()
     assert main([*words, "--resume=true"]) == 0
     assert Path("s/gail/seed_0/metrics.jsonl").read_bytes() == done
-    assert "simulated steps" in Path("s/report.html").read_text()
+    assert "Validation success over steps" in Path("s/report.html").read_text()
