@@ -15,6 +15,7 @@ from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, open_output, require_output
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.errors import MismatchError, UsageError
+from manip_il.evaluation.policy_folder import require_source
 from manip_il.option import option
 from manip_il.seeding import stream_seeds
 
@@ -58,15 +59,14 @@ class CompareOptions:
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        from manip_il.evaluation.arm import require_arm
-        from manip_il.evaluation.rounds import Rule
+        for side in (self.left, self.right):
+            require_source(side)
+        from manip_il.evaluation.rounds import Rule  # here, as what is above needs no statistics
         from manip_il.evaluation.suites import require_suite
 
         Rule.parse(self.checkpoint, self.at)
         if self.eval.n_episodes < 1:
             raise UsageError(f"--eval.n_episodes is {self.eval.n_episodes}; expected at least 1")
-        for side in (self.left, self.right):
-            require_arm(side)
         if self.left.resolve() == self.right.resolve():
             raise UsageError(f"{self.left} is compared with itself; give two different ones")
         common.require_workers(self.workers)

@@ -13,7 +13,7 @@ from manip_il import checks
 from manip_il.collect.workers import Engine
 from manip_il.data.schema import OWN_OBJECT
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.policy_folder import find_policy, hub_hint
+from manip_il.evaluation.policy_folder import EXPECTED, find_policy, require_source
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import History, Round, Rule, history, read_metrics
 from manip_il.evaluation.trial import Progress, Trial
@@ -21,7 +21,6 @@ from manip_il.sim.config import EnvConfig
 
 CONFIG_FILE = "config.yaml"
 _SEED_FOLDER = re.compile(r"seed_(\d+)")
-_EXPECTED = "expected an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
 
 
 @dataclass(frozen=True)
@@ -115,15 +114,9 @@ class Arm:
         return replace(self, members=tuple(map(change, self.members)))
 
 
-def require_arm(path: Path) -> None:
-    """Raise `UsageError` if nothing is at `path`."""
-    if not path.exists():
-        raise UsageError(f"{path} does not exist; {_EXPECTED}{hub_hint(path)}")
-
-
 def read_arm(path: Path) -> Arm:
     """Return what lies at `path`; `UsageError` in one line for what cannot be compared."""
-    require_arm(path)
+    require_source(path)
     folders = [folder for folder in path.iterdir() if folder.is_dir()] if path.is_dir() else []
     seeds = {int(match[1]): folder for folder in folders if (match := _SEED_FOLDER.fullmatch(folder.name))}
     if not seeds:
@@ -196,7 +189,7 @@ def _read_member(path: Path) -> Member:
     try:
         return Member(path, policy=find_policy(path))
     except UsageError:
-        raise UsageError(f"{path} holds nothing to compare; {_EXPECTED}") from None
+        raise UsageError(f"{path} holds nothing to compare; {EXPECTED}") from None
 
 
 def _of_seed(folder: Path, seed: int) -> Member:

@@ -123,15 +123,7 @@ def _joint_row(joint: JointFacts) -> tuple[str, ...]:
     limits = "free" if joint.limits is None else f"{angle(joint.limits[0])} to {angle(joint.limits[1])}"
     rise = "over 1,000" if joint.rise is None else f"{1000 * joint.rise:.0f}"
     numbers = (f"{joint.kp:.4g}", f"{joint.kv:.3g}", f"{joint.force:.3g}")
-    return (
-        joint.name,
-        limits,
-        angle(joint.home),
-        *numbers,
-        rise,
-        f"{100 * joint.overshoot:.0f} %",
-        angle(joint.sag, 2),
-    )
+    return (joint.name, limits, angle(joint.home), *numbers, rise, f"{100 * joint.overshoot:.0f} %")
 
 
 def start_figures(check: RobotCheck) -> tuple[Figure, ...]:

@@ -13,8 +13,6 @@ from manip_il.sim.conditions import Condition, merged
 from manip_il.sim.config import EnvConfig
 from manip_il.sim.shape import draws_shape
 from manip_il.stock.table import STOCK
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import TakesShape
 
 SUITES = {
     "nominal": ("nominal",),
@@ -77,6 +75,9 @@ def read_condition(name: str) -> Condition:
 
 def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
     """What of a condition has an effect in an environment, see `Condition.for_world`."""
+    from manip_il.tasks.table import get_task  # here, as a wrong name needs no simulator
+    from manip_il.tasks.task import TakesShape
+
     if env.task in STOCK:  # which takes none
         return None if condition.ranges else condition
     task = get_task(env.task, env.object)

@@ -13,6 +13,7 @@ from manip_il.evaluation import robot_check
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.robot_check import (
+    JointFacts,
     RobotCheck,
     TaskCheck,
     arm_facts,
@@ -112,7 +113,8 @@ def test_starts_are_drawn_until_a_few_find_no_place(own: Robot, monkeypatch: pyt
 
 
 def a_check(own: Robot, *tasks: TaskCheck, table: float = 1.0, half_width: float = 0.12) -> RobotCheck:
-    return RobotCheck("own.yaml", own, (), openings(own), (), table, 1.0, half_width, tasks)
+    joint = JointFacts("lift", False, (-1.0, 1.0), 0.0, 200.0, 10.0, 50.0, 0.1, 0.02)
+    return RobotCheck("own.yaml", own, (joint,), openings(own), (), table, 1.0, half_width, tasks)
 
 
 def evaluation(solved: int) -> EvalResult:
