@@ -74,7 +74,7 @@ class EpisodeResult:
         known = {"success_at_end": data["success"], "phase_at_end": ""} | {
             key: data[key] for key in data if key in _KEYS
         }
-        values = [convert(known[key]) for key, convert in _KEYS.items()]
+        values: list[Any] = [convert(known[key]) for key, convert in _KEYS.items()]
         return cls(*values, detail={key: value for key, value in data.items() if key not in _KEYS})
 
 

@@ -20,7 +20,7 @@ from manip_il.evaluation.results import EvalResult, write_json
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.robots.gripper import sweep
-from manip_il.robots.reach import Reach, reach_of
+from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
@@ -97,10 +97,14 @@ class TaskCheck:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        episodes = {
-            name: None if one is None else {"successes": one.success.successes, "n": one.success.n, **_details(one)}
-            for name, one in (("clean", self.clean), ("noisy", self.noisy))
-        }
+        episodes: dict[str, Any] = {}
+        for name, one in (("clean", self.clean), ("noisy", self.noisy)):
+            episodes[name] = one and {
+                "successes": one.success.successes,
+                "n": one.success.n,
+                "interval": one.success.interval,
+                "failures": one.failures,
+            }
         starts = {"found": self.found, "drawn": self.drawn} if self.drawn else None
         facts = {"widths": dict(self.widths), "refused": self.refused, "starts": starts}
         return {"task": self.name, "done": self.done} | facts | episodes
@@ -228,12 +232,9 @@ def reach_map(robot: Robot, room: float, cells: int = 60) -> tuple[F64, tuple[fl
     """
     reach, (x, y), half = reach_of(robot), robot.workspace.centre, robot.workspace.half_width + room
     offsets = ((np.arange(cells) + 0.5) / cells * 2 - 1) * half
-    rows = [[_kind(reach, (x + dx, y + dy, LOW)) for dx in offsets] for dy in offsets]
-    return np.array(rows), (x - half, x + half, y - half, y + half)
-
-
-def _kind(reach: Reach, at: tuple[float, float, float]) -> float:
-    return 1.0 if reach.has(at) else 0.5 if reach.leaning(at) else 0.0
+    rows = [[(x + dx, y + dy, LOW) for dx in offsets] for dy in offsets]
+    reached = [[(reach.has(at) + reach.leaning(at)) / 2 for at in row] for row in rows]
+    return np.array(reached), (x - half, x + half, y - half, y + half)
 
 
 def _share(robot: Robot, test: Callable[[tuple[float, float, float]], bool], half: float) -> float:
@@ -298,7 +299,3 @@ def _with_episodes(
         job = RolloutJob(env, hold=HOLD, label="last", conditions=(condition,))
         found.append(evaluate(engine, job, seeds, "expert", on_result, suite=condition.name))
     return dataclasses.replace(task, clean=found[0], noisy=found[1])
-
-
-def _details(result: EvalResult) -> dict[str, Any]:
-    return {"interval": result.success.interval, "failures": result.failures}
