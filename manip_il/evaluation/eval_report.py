@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from manip_il.evaluation.failures import (
+    MAX_MARKS,
     evaluation_facts,
     evaluation_verdict,
     failure_maps,
@@ -18,7 +19,10 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.tables import BASELINE, DAGGER, NO_CONDITION, PolicyRow, Table, evaluation_table, policy_table
 from manip_il.sim.conditions import words
 
-MAP_NOTE = "Circles: starts, squares: goals, crosses: where failed episodes ended."
+MAP_NOTE = (
+    "Circles: starts, squares: goals, crosses: where failed episodes ended. "
+    f"Of each outcome {MAX_MARKS} episodes are drawn at most."
+)
 
 
 def eval_report(

@@ -14,7 +14,7 @@ from manip_il.evaluation.tables import BASELINE, CLONING, NO_CONDITION, Table
 from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import NO_PHASE
 
-MAX_MARKS = 600  # of one outcome on a map; more would hide each other
+MAX_MARKS = 200  # of one outcome on a map; more would hide each other
 NOT_RECORDED = "not recorded"
 _NO_PHASE = "not even the expert can continue: an object is off the table, or something is out of reach"
 

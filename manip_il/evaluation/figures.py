@@ -243,8 +243,8 @@ def _map_figure(groups: Sequence[MapGroup], view: Literal["above", "the side"]) 
             goals = [(goal[0], goal[up]) for _, goal, _ in group.places]
             ends = [(end[0], end[up]) for *_, end in group.places if end is not None]
             if group.joined:
-                for a, b in zip(starts, goals, strict=True):
-                    axis.plot(*zip(a, b, strict=True), color=group.colour, lw=0.7, alpha=0.25 if many else 0.5)
+                joins = np.array([(a, b, (np.nan, np.nan)) for a, b in zip(starts, goals, strict=True)])
+                axis.plot(*joins.reshape(-1, 2).T, color=group.colour, lw=0.7, alpha=0.25 if many else 0.5)
             style = {"color": group.colour, "alpha": alpha, "ls": "", "ms": 3 if many else 4.5}
             fill = "full" if group.joined else "none"
             axis.plot(*zip(*starts, strict=True), marker="o", fillstyle=fill, label=plain(group.name), **style)
