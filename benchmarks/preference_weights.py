@@ -31,8 +31,8 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import new_dataset
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult, compare_results
-from manip_il.learn.checkpoint import PRETRAINED_MODEL
 from manip_il.learn.reward import LearnedReward
+from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.preferences.choose import choose_pairs, open_supply
 from manip_il.preferences.fitting import TIE, true_difference

@@ -57,7 +57,7 @@ def test_lerobots_dataset_code_stays_in_the_files_for_it():
 
 @pytest.mark.parametrize(
     "module",
-    ["intervals", "significance", "results", "report", "tables", "comparison", "study", "certificate"],
+    ["intervals", "significance", "results", "report", "tables", "certificate"],
 )
 def test_reading_results_needs_neither_torch_nor_mujoco(module: str):
     code = f"import sys, manip_il.evaluation.{module}; print({{'torch', 'mujoco', 'lerobot'}} & set(sys.modules))"

@@ -10,7 +10,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.trials import varied
 from manip_il.collect.edits import open_source, render_states
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
@@ -23,6 +22,7 @@ from manip_il.data.journal import Journal, read_journal
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder
 from manip_il.errors import MismatchError
+from manip_il.evaluation.suites import varied
 from manip_il.mdp import Episode, State
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig

@@ -8,10 +8,10 @@ from typing import Any
 from matplotlib.ticker import EngFormatter
 
 from manip_il.algorithms.iterations import best_validation
-from manip_il.evaluation.figures import ARMS, DAGGER, Figure, Section, SectionsReport, drawing, to_figure
-from manip_il.evaluation.report_data import PolicyRow
+from manip_il.evaluation.figures import ARMS, CLONING, DAGGER, Figure, drawing, to_figure
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import EvalResult, compare_results
-from manip_il.evaluation.tables import policy_table
+from manip_il.evaluation.tables import PolicyRow, policy_table
 
 Records = Sequence[Mapping[str, Any]]
 _PANELS = (
@@ -28,12 +28,12 @@ _PANELS = (
 
 def adversarial_report(
     title: str, found: Mapping[int, EvalResult], records: Records, command: str, config: Mapping[str, Any]
-) -> SectionsReport:
+) -> Report:
     """Return the report of a run. found: its validations by iteration, not none. records: lines of metrics.jsonl."""
     best, steps = best_validation(dict(found)), {record["iteration"]: record["steps"] for record in records}
     names = {number: _name(number, steps) for number in found}
     shown = sorted({min(found), best, max(found)})
-    rows = [PolicyRow.of(names[number], found[number], kind="dagger" if number else "cloning") for number in shown]
+    rows = [PolicyRow(names[number], found[number], colour=DAGGER if number else CLONING) for number in shown]
     facts = ["The best policy was chosen on these episodes, so they flatter it; measure it by manip-il eval."]
     if 0 in found and best:
         facts.insert(0, compare_results(found[0], found[best], (names[0], names[best])).verdict)
@@ -41,7 +41,7 @@ def adversarial_report(
     if records:
         figures = (_validation_figure(found, steps), _learning_figure(records))
         sections.append(Section("How it learnt", figures=figures, notes=("Over simulated control steps.",)))
-    return SectionsReport(
+    return Report(
         title=title,
         verdict=f"Best {names[best]}: validation success {found[best].success}.",
         command=command,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from manip_il.algorithms.inverse import Carried
 from manip_il.algorithms.inverse_figures import cost_figure, trace_figure
-from manip_il.evaluation.figures import Section, SectionsReport
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
 from manip_il.rewards.paths import cheapest_path, plan
@@ -120,9 +120,7 @@ def open_line(found: Inverse) -> str:
     )
 
 
-def inverse_report(
-    found: Inverse, command: str, config: Mapping[str, Any], timings: Mapping[str, float]
-) -> SectionsReport:
+def inverse_report(found: Inverse, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
     """Return the report of what was learnt."""
     sections = [
         Section(
@@ -143,7 +141,7 @@ def inverse_report(
     if found.learnt.draws is not None:
         figure = trace_figure(found.learnt.draws, FEATURES)
         sections.append(Section("The chains", figures=(figure,), notes=("Weights over that of length, draw by draw.",)))
-    return SectionsReport(
+    return Report(
         title="What the demonstrations care about",
         verdict=_verdict(found),
         command=command,

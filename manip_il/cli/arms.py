@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
 from manip_il.cli.adversarial import AdversarialOptions, AirlOptions, DatasetGroup, GailOptions
-from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
+from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.learning import LearningOptions
-from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.parsing import from_layers
 from manip_il.cli.ppo import PpoOptions
 from manip_il.errors import MismatchError, UnknownName, UsageError
@@ -68,7 +67,7 @@ def learning_env(arm: str, env: EnvConfig) -> EnvConfig:
     return env
 
 
-def begun(options: ArmOptions, folder_of: Callable[[str], Path]) -> ArmOptions:
+def with_start_policy(options: ArmOptions, folder_of: Callable[[str], Path]) -> ArmOptions:
     """Return a learning arm's options with the demonstrations and policy of the run in place of its arm's name."""
     if isinstance(options, DaggerOptions):
         return options
@@ -80,13 +79,13 @@ def begun(options: ArmOptions, folder_of: Callable[[str], Path]) -> ArmOptions:
     return options
 
 
-def charged(options: ArmOptions, own: History, run: Path) -> History:
+def with_start_cost(options: ArmOptions, own: History, run: Path) -> History:
     """Return a learning arm's rounds with the costs of what it begins with: round 0 in `run`, its fit with `init`."""
-    from manip_il.evaluation.rounds import history
+    from manip_il.evaluation.rounds import history, read_metrics
 
     if isinstance(options, DaggerOptions):
         return own
-    records = read_jsonl(run / METRICS_FILE)
+    records = read_metrics(run)
     start = history(records, str(run))[0]
     fitted = start.seconds if options.init is not None else float(records[0]["seconds"]["collect"])
     return tuple(one.after(start, fitted=fitted) for one in own)

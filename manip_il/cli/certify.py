@@ -8,7 +8,8 @@ from typing import ClassVar, Literal
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policy, find_policy
-from manip_il.cli.outputs import open_output, require_new
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE, open_output, require_new
 from manip_il.cli.progress import progress, say
 from manip_il.errors import UsageError
 from manip_il.option import option
@@ -23,7 +24,7 @@ class VisitorGroup:
 
 @dataclass
 class CertifyOptions:
-    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json."""
+    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json and a report."""
 
     example: ClassVar[str] = "manip-il certify --policy.path=runs/dagger --output_dir=runs/certificate"
     robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
@@ -61,18 +62,23 @@ class CertifyOptions:
         if checkpoint is not None:
             check_policy(checkpoint, env, draw=self.engine == "local", trust=self.trust)
         from manip_il.collect.workers import Engine
-        from manip_il.evaluation.certificate import FILE_NAME, summary_lines
+        from manip_il.evaluation.certificate import FILE_NAME, certificate_report
         from manip_il.evaluation.certify import certify, count_episodes
+        from manip_il.evaluation.tables import print_table
         from manip_il.seeding import stream_seeds
 
         stream_seeds("certificate", self.cases, self.seed)  # refuses numbers out of range before a folder is made
-        engine = Engine(self.workers, self.engine)
-        count = count_episodes(env, self.cases, policy)
+        engine, count = Engine(self.workers, self.engine), count_episodes(env, self.cases, policy)
         with open_output(self) as folder:
             with progress(count, f"certify {env.robot} {env.task}") as bar, engine:
                 advance = bar.advance
                 certificate = certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)
             certificate.write(folder / FILE_NAME)
-        for line in summary_lines(certificate):
+            report = certificate_report(certificate, command_line("certify", self), to_plain(self))
+            report.write(folder / REPORT_FILE)
+        for table in certificate.tables():
+            print_table(table, empty="-")
+        for line in certificate.facts():
             say(line)
         say(f"result: {folder / FILE_NAME}")
+        say(f"report: {folder / REPORT_FILE}")

@@ -23,6 +23,10 @@ _TRUST = (
     "only on the command line"
 )
 
+_CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras view, clutter, late"
+VARY_HELP = f"how worlds differ from episode to episode: {_CONDITIONS}, or YAMLs of ranges"
+SUITE_HELP = f"nominal, disturbed, randomised, all; one condition of {_CONDITIONS}; or a YAML of ranges"
+
 
 def seed_option() -> Any:
     """Return the field of `--seed`."""
@@ -102,6 +106,13 @@ class MaybeTaskGroup:
 
     def __post_init__(self) -> None:
         self.reward = _reward(self.reward)
+
+
+@dataclass
+class TrialGroup:
+    """`--eval.*` of policies that are compared."""
+
+    n_episodes: int = option(500, "test episodes, the same for both sides")
 
 
 @dataclass

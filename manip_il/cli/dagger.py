@@ -26,7 +26,6 @@ from manip_il.cli.outputs import (
 )
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say, say_policy
-from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import DEFAULTS, FitConfig, check_weights
 from manip_il.option import option, option_of
@@ -34,8 +33,8 @@ from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
-    from manip_il.evaluation.report import RunReport
-    from manip_il.evaluation.report_data import LearningCurve
+    from manip_il.evaluation.figures import Curve
+    from manip_il.evaluation.report import Report
     from manip_il.sim.config import CameraConfig
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
@@ -88,7 +87,7 @@ class DaggerOptions(common.EnvOptions):
     cameras: list[str] = option(list, "any of front, side, wrist, for a policy on images; by default all for cnn")
     image: common.SmallImageGroup = field(default_factory=common.SmallImageGroup)
     redraw: int = option_of(RunConfig, "redraw")
-    vary: list[str] = option(list, VARY_HELP)
+    vary: list[str] = option(list, common.VARY_HELP)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
     steps: int | None = option(None, _STEPS_HELP)
     refit_steps: int | None = option_of(RunConfig, "refit_steps")
@@ -150,6 +149,7 @@ class DaggerOptions(common.EnvOptions):
     def _config(self) -> RunConfig:
         """Return the same before the policy's own configuration is checked, which takes seconds to import."""
         from manip_il.collect.query import parse_query  # which imports numpy
+        from manip_il.evaluation.suites import varied
 
         policy, start = round_policy(self.policy)
         observation, cameras = self._pictures(start)
@@ -209,30 +209,30 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     return results
 
 
-def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> RunReport:
-    from manip_il.evaluation.report import RunReport
-    from manip_il.evaluation.report_data import PolicyRow
+def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> Report:
+    from manip_il.evaluation.eval_report import run_report
     from manip_il.evaluation.results import compare_results
+    from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
 
     best = best_round(results)
     kind = ALGORITHMS[config.method].title
     first = "cloning" if config.start is None else "the policy given"
     names = [f"{first} (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
     rows = [
-        PolicyRow.of(name, result.validation, result.labels, kind="dagger" if result.round else "cloning")
+        PolicyRow(name, result.validation, result.labels, colour=DAGGER if result.round else CLONING)
         for name, result in zip(names, results, strict=True)
     ]
     facts = []
     if best.round > 0:
         comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.round]))
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
-    return RunReport(
+    return run_report(
+        rows,
+        curves=[learning_curve(options.output_dir, kind)],
         title=f"{kind} on {config.env.robot} {config.env.task}",
         verdict=best_verdict(names, results),
         command=command_line("dagger", options),
-        rows=tuple(rows),
         facts=tuple(facts),
-        curve=learning_curve(options.output_dir, kind),
         config=to_plain(options),
         fingerprint=best.validation.fingerprint,
         timings=round_timings(options.output_dir),
@@ -260,16 +260,16 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
     return f"{name} is chosen of {len(results)}, with {found}; no difference from {names[other.round]} is shown."
 
 
-def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:
+def learning_curve(folder: Path, name: str = "DAgger") -> Curve:
     """Return validation success over costs, one point a round. name: of the algorithm."""
-    from manip_il.evaluation.report_data import LearningCurve
-    from manip_il.evaluation.rounds import curve_points, history
+    from manip_il.evaluation.figures import Curve
+    from manip_il.evaluation.rounds import history
 
-    return LearningCurve(dagger=curve_points(history(read_jsonl(folder / METRICS_FILE), str(folder))), name=name)
+    return Curve(name, (history(read_jsonl(folder / METRICS_FILE), str(folder)),))
 
 
-def run_curve(policy: Path | None) -> LearningCurve | None:
-    """Return the learning curve of the DAgger run that a policy lies in; None where it lies in none."""
+def run_curve(policy: Path | None) -> Curve | None:
+    """Return the learning curve of the DAgger run that a policy lies in; None if it lies in none."""
     for folder in [] if policy is None else [policy, *policy.resolve().parents[:5]]:
         if (folder / METRICS_FILE).is_file():
             try:

@@ -1,8 +1,7 @@
-"""Files of evaluations: episodes as they end, one of them again (`manip-il replay`), several files as one (`merge`)."""
+"""`manip-il replay`: one episode of an evaluation again; `manip-il merge`: evaluations of several files as one."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -10,76 +9,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policy, find_policy, require_eval
 from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE, append_jsonl, atomic_write, open_output, read_jsonl, require_new
+from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_new
 from manip_il.cli.progress import say, warn
-from manip_il.cli.trials import Shot
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
     from manip_il.evaluation.results import EpisodeResult, EvalResult
 
-EPISODES_FILE = "episodes.jsonl"
 NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing is loaded
-
-
-@dataclass(frozen=True)
-class EpisodeJournal:
-    """Episodes of an evaluation as they end: `episodes.jsonl`, first what all have in common, then a line for each."""
-
-    path: Path
-
-    @classmethod
-    def open(cls, folder: Path, job: RolloutJob, suite: str) -> EpisodeJournal:
-        """Return the file in `folder`, begun where there is none.
-
-        Raises `MismatchError` where its episodes are those of another policy, environment or version of this program.
-        """
-        journal, common = cls(folder / EPISODES_FILE), _common(job, suite)
-        lines = read_jsonl(journal.path)
-        if not lines:
-            append_jsonl(journal.path, common)
-            return journal
-        for key, now in common.items():
-            before = lines[0].get(key)
-            if before != now:
-                what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
-                raise MismatchError(what, "then", before, "now", now)
-        return journal
-
-    def add(self, result: EpisodeResult) -> None:
-        """Append one, at once."""
-        append_jsonl(self.path, result.to_json())
-
-    def results(self, seeds: Collection[int]) -> dict[int, EpisodeResult]:
-        """Return the results of these seeds that are there. Raises `ManipError` for a line that is not an episode."""
-        from manip_il.evaluation.results import EpisodeResult
-
-        found: dict[int, EpisodeResult] = {}
-        for line in read_jsonl(self.path)[1:]:
-            try:
-                result = EpisodeResult.from_json(line)
-            except (KeyError, ManipError) as error:
-                why = f"{error} is missing" if isinstance(error, KeyError) else error
-                text = f"a line that is not an episode ({why}); start again with --overwrite=true"
-                raise ManipError(f"{self.path}: {text}") from error
-            if result.seed in seeds:
-                found[result.seed] = result
-        return found
-
-
-def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
-    from manip_il.collect.environments import env_fingerprint
-    from manip_il.collect.job import observed_cameras
-    from manip_il.evaluation.results import EvalSettings
-    from manip_il.learn.policy_files import policy_sha256
-
-    return {
-        "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
-        "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
-        "settings": EvalSettings.of(job, suite).to_json(),
-    }
 
 
 @dataclass
@@ -112,25 +51,21 @@ class ReplayOptions:
 
     def run(self) -> None:
         """Run the episode, print what was drawn, film it, compare the outcome."""
+        from manip_il.evaluation.film import Shot, run_states
         from manip_il.evaluation.results import EvalResult
+        from manip_il.evaluation.runner import episode_result, replay_differences
 
         result = EvalResult.read(self.file)
         if not 0 <= self.episode < len(result.episodes):
             raise UsageError(f"--episode is {self.episode}; {self.file} has episodes 0 to {len(result.episodes) - 1}")
         before = result.episodes[self.episode]
         job = self._job(result)
-        from manip_il.evaluation.film import run_states
-        from manip_il.evaluation.runner import episode_result
-
         episode = run_states(job, before.seed)
-        after = episode_result(job, episode)
         say(_text(before))
         if self.video is not None:
-            film, _ = Shot.of(job, episode).film()
-            atomic_write(self.video, film.mp4)
+            atomic_write(self.video, Shot.of(job, episode).film().mp4)
             say(f"video: {self.video}")
-        differences = _differences(before, after)
-        if differences:
+        if differences := replay_differences(before, episode_result(job, episode)):
             raise ManipError(
                 f"episode {self.episode} differs from {self.file}: {'; '.join(differences)}; across "
                 "machines and versions success rates can be compared, single episodes cannot"
@@ -138,7 +73,7 @@ class ReplayOptions:
         say(f"the same as in {self.file}")
 
     def _job(self, result: EvalResult) -> RolloutJob:
-        """Return the rollouts of the evaluation; warn where policy or program have changed since."""
+        """Return the rollouts of the evaluation; warn if policy or program have changed since."""
         from manip_il.collect.drivers import PolicyDriver, driver_of
         from manip_il.collect.environments import env_fingerprint
         from manip_il.collect.job import RolloutJob
@@ -175,12 +110,11 @@ class ReplayOptions:
 
 def _text(result: EpisodeResult) -> str:
     """Seed, condition and outcome, and a line for each number that was drawn."""
-    drawn: dict[str, Any] = dict(result.detail.get("drawn", {}))
     first = result.detail.get("steps_to_success")
     solved = f"success after {first} steps" if first is not None else "success" if result.success else "failure"
     ended = "at the goal at the end" if result.success_at_end else f"ended in phase {result.phase_at_end}"
     lines = [f"seed {result.seed}, {result.detail.get('condition', 'nominal')}: {solved}, {ended}"]
-    return "\n".join(lines + [f"  {name}: {_short(value)}" for name, value in drawn.items()])
+    return "\n".join(lines + [f"  {name}: {_short(value)}" for name, value in result.detail.get("drawn", {}).items()])
 
 
 def _short(value: Any) -> str:
@@ -189,16 +123,6 @@ def _short(value: Any) -> str:
     if isinstance(value, dict):
         return "; ".join(f"{name} {_short(one)}" for name, one in value.items())
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
-    """Return in what two runs of one episode differ; `MismatchError` where they had other conditions."""
-    now = dict(after.detail["drawn"])
-    if before.detail.get("drawn", {}) != now:
-        raise MismatchError("what is drawn for the episode", "then", before.detail.get("drawn"), "now", now)
-    pairs = {name: (getattr(before, name), getattr(after, name)) for name in ("success", "success_at_end", "steps")}
-    pairs |= {"return": (before.ret, after.ret)}
-    return [f"{name} was {was}, is {value}" for name, (was, value) in pairs.items() if was != value]
 
 
 @dataclass
@@ -228,7 +152,6 @@ class MergeOptions:
         from manip_il.data.fingerprint import compare_fingerprints
         from manip_il.evaluation.eval_report import eval_report
         from manip_il.evaluation.results import FILE_NAME, EvalResult, merge_results
-        from manip_il.evaluation.tables import evaluation_lines, evaluation_table, print_table
 
         parts = {str(path): EvalResult.read(path) for path in self.files}
         merged = merge_results(parts)
@@ -237,10 +160,18 @@ class MergeOptions:
             warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
         with open_output(self):
             merged.write(self.output_dir / FILE_NAME)
-            report = eval_report(merged, command=command_line("merge", self), config=to_plain(self))
+            report = eval_report(merged, command_line("merge", self), to_plain(self))
             report.write(self.output_dir / REPORT_FILE)
-        print_table(evaluation_table(merged))
-        for line in evaluation_lines(merged):
-            say(line)
+        say_result(merged)
         say(f"result: {self.output_dir / FILE_NAME}")
         say(f"report: {self.output_dir / REPORT_FILE}")
+
+
+def say_result(result: EvalResult) -> None:
+    """Print an evaluation's table, and the phases that failures ended in."""
+    from manip_il.evaluation.tables import evaluation_table, print_table
+
+    print_table(evaluation_table(result))
+    if result.failures:
+        phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
+        say(f"failures by the phase that they ended in: {phases}")

@@ -6,15 +6,15 @@ import contextlib
 import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import mean, pstdev
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.eval_files import EpisodeJournal
+from manip_il.cli.eval_files import say_result
 from manip_il.cli.inputs import check_policy, find_policy, observation_text
 from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
+from manip_il.cli.outputs import REPORT_FILE, open_output, require_output
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.trials import SUITE_HELP, Pictures, Shot, episode_hold, film_shots, require_suite, suite_conditions
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
 from manip_il.stock.table import ROBOT
@@ -22,7 +22,7 @@ from manip_il.stock.table import ROBOT
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
     from manip_il.collect.workers import Engine
-    from manip_il.evaluation.results import EpisodeResult, EvalResult
+    from manip_il.evaluation.results import EvalResult
 
 EPISODES, MOST_EPISODES = 100, 10_000
 FILMS = "films"
@@ -64,7 +64,7 @@ class EvalOptions:
     task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
     env: common.EnvGroup = field(default_factory=common.EnvGroup)
     eval: EvalGroup = field(default_factory=EvalGroup)
-    suite: str = option("nominal", SUITE_HELP)
+    suite: str = option("nominal", common.SUITE_HELP)
     until_width: float | None = option(None, "stop when the interval is this narrow; 0.02 is 2 points")
     seed: int = common.seed_option()
     engine: Literal["local", "ray"] = common.engine_option()
@@ -90,16 +90,22 @@ class EvalOptions:
         common.require_workers(self.workers)
         if self.policy.path is not None:
             self._check_space(find_policy(self.policy.path))
+        from manip_il.evaluation.suites import require_suite
+
         require_suite(self.suite)
         require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         self.env.config(self.robot.type, self.task.type, shape=self.task.object, reward=self.task.reward)
 
     def run(self) -> None:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
+        from manip_il.cli.dagger import run_curve
         from manip_il.collect.workers import Engine
+        from manip_il.evaluation.eval_report import eval_report
+        from manip_il.evaluation.film import film_outcomes
         from manip_il.evaluation.results import FILE_NAME
+        from manip_il.evaluation.runner import EpisodeJournal, evaluate
 
-        seeds = self._seeds()
+        seeds, name, folder = self._seeds(), str(self.policy.type or self.policy.path), self.output_dir
         engine = Engine(self.workers, self.engine)
         job = self._job(engine, len(seeds))
         with contextlib.ExitStack() as held:
@@ -107,18 +113,23 @@ class EvalOptions:
                 held.enter_context(open_output(self, FREE, may_grow="eval.n_episodes"))
             except OSError as error:
                 raise ManipError(
-                    f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
+                    f"{folder} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
                     'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
                 ) from error
-            journal = EpisodeJournal.open(self.output_dir, job, self.suite)
-            with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
-                result = self._evaluate(job, seeds, engine, journal, stages)
-                result.write(self.output_dir / FILE_NAME)
+            journal = EpisodeJournal.open(folder, job, self.suite)
+            with Stages(f"finished episodes, in {folder}") as stages, engine:
+                stages.start(f"evaluate {name}", len(set(seeds) - set(journal.done)))
+                keep = journal.keep(stages.episode)
+                done, width = journal.done, self.until_width
+                result = evaluate(engine, job, seeds, name, keep, suite=self.suite, done=done, until_width=width)
+                stages.close()
+                result.write(folder / FILE_NAME)
                 self._say(result)
-                pictures = self._film(job, result, engine, stages)
-            self._report(result, pictures)
-        say(f"result: {self.output_dir / FILE_NAME}")
-        say(f"report: {self.output_dir / REPORT_FILE}")
+                films = film_outcomes(engine, job, result, self.eval.films, folder / FILMS, stages)
+            curve = run_curve(self.policy.path)
+            eval_report(result, command_line("eval", self), to_plain(self), *films, curve).write(folder / REPORT_FILE)
+        say(f"result: {folder / FILE_NAME}")
+        say(f"report: {folder / REPORT_FILE}")
         say(f"next: {self._next(result)}")
 
     def _seeds(self) -> range:
@@ -131,6 +142,8 @@ class EvalOptions:
     def _job(self, engine: Engine, episodes: int) -> RolloutJob:
         from manip_il.collect.drivers import PolicyDriver, driver_of
         from manip_il.collect.job import RolloutJob
+        from manip_il.evaluation.suites import suite_conditions
+        from manip_il.evaluation.trial import episode_hold
 
         path = None if self.policy.path is None else find_policy(self.policy.path)
         if episodes > 1:
@@ -146,7 +159,7 @@ class EvalOptions:
             cameras = check_policy(checkpoint, env, draw=self.engine == "local", trust=self.trust)
             if cameras is not None:
                 say(observation_text(cameras, path))
-        conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
+        conditions = suite_conditions(self.suite, env, sees=cameras is not None)
         driver = PolicyDriver((path,), trust=self.trust) if path is not None else driver_of(self.policy.type)
         job = RolloutJob(env, driver, episode_hold(env, self.eval.hold), label="last", conditions=conditions)
         return replace(job, batch=self.eval.batch_size)
@@ -161,65 +174,11 @@ class EvalOptions:
         if (space := Checkpoint.open(path).space) != self.action_space:
             raise MismatchError("action space", str(path), space, "--action_space", self.action_space)
 
-    def _evaluate(
-        self, job: RolloutJob, seeds: range, engine: Engine, journal: EpisodeJournal, stages: Stages
-    ) -> EvalResult:
-        from manip_il.evaluation.runner import evaluate
-
-        done = journal.results(seeds)
-        stages.start(f"evaluate {self._name()}", len(seeds) - len(done))
-
-        def keep(result: EpisodeResult) -> None:
-            journal.add(result)
-            stages.episode(result)
-
-        result = evaluate(
-            engine, job, seeds, self._name(), keep, suite=self.suite, done=done, until_width=self.until_width
-        )
-        stages.close()
-        return result
-
-    def _film(self, job: RolloutJob, result: EvalResult, engine: Engine, stages: Stages) -> Pictures:
-        """Run the first failures and as many successes again and film them, also into `films/`."""
-        outcomes = [[one.seed for one in result.episodes if one.success == good] for good in (False, True)]
-        seeds = [seed for found in outcomes for seed in found[: self.eval.films]]
-        if not seeds:
-            return Pictures()
-        stages.start("films", len(seeds))
-        episodes = {episode.seed: episode for episode in engine.run(job, seeds)}
-        filmed = [episodes[seed] for seed in seeds]
-        pictures = film_shots([Shot.of(job, one) for one in filmed], stages)
-        for film, episode in zip(pictures.films, filmed, strict=False):  # no films without OpenGL
-            outcome = "success" if episode.success else "failure"
-            atomic_write(self.output_dir / FILMS / f"seed_{episode.seed}_{outcome}.mp4", film.mp4)
-        return pictures
-
-    def _report(self, result: EvalResult, pictures: Pictures) -> None:
-        from manip_il.cli.dagger import run_curve
-        from manip_il.evaluation.eval_report import eval_report
-
-        report = eval_report(
-            result,
-            command=command_line("eval", self),
-            config=to_plain(self),
-            films=pictures.films,
-            paths=pictures.paths,
-            pictures_note=pictures.note,
-            curve=run_curve(self.policy.path),
-        )
-        report.write(self.output_dir / REPORT_FILE)
-
-    def _name(self) -> str:
-        return str(self.policy.type or self.policy.path)
-
     def _say(self, result: EvalResult) -> None:
-        from manip_il.evaluation.tables import evaluation_lines, evaluation_table, print_table, return_line
-
-        print_table(evaluation_table(result))
-        for line in evaluation_lines(result):
-            say(line)
+        say_result(result)
         if result.robot == ROBOT:
-            say(return_line(result))
+            returns = [episode.ret for episode in result.episodes]
+            say(f"return: {mean(returns):.2f}, standard deviation {pstdev(returns):.2f}")
         if self.until_width is not None:
             low, high = result.success.interval
             reached = high - low <= self.until_width

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from manip_il.cli.options import Open
 from manip_il.cli.progress import warn
 from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.evaluation.policy_folder import find_policy, hub_hint
 
 if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.algorithms.config import RunConfig
@@ -18,10 +18,6 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.mdp import Observation
     from manip_il.sim.config import CameraConfig, EnvConfig
-
-_POLICY_FOLDERS = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
-_NEWEST_POLICY = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")
-_REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
 
 
 def require_dataset(root: Path) -> None:
@@ -47,29 +43,10 @@ def require_folder(path: Path, what: str) -> None:
         raise UsageError(f"{path} {'is not a folder' if path.exists() else 'does not exist'}; expected {what}")
 
 
-def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull a path that looks like a repo on the Hub; nothing for others. kind: `datasets/`."""
-    if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
-        return ""
-    return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"
-
-
 def _inside(root: Path) -> str:
     """Name the datasets in a folder that is none itself, where it holds some."""
     found = sorted(path.parents[1].name for path in root.glob("*/meta/info.json")) if root.is_dir() else []
     return f"; it holds the datasets {', '.join(found[:3])}{' ...' if len(found) > 3 else ''}" if found else ""
-
-
-def find_policy(path: Path) -> Path:
-    """Return the `pretrained_model` folder in that folder, a checkpoint or a run: the best one, else the newest."""
-    for place in _POLICY_FOLDERS:
-        if (path / place / "config.json").is_file():
-            return path / place
-    for place in _NEWEST_POLICY:
-        if found := sorted(path.glob(f"{place}/config.json")):
-            return found[-1].parent
-    wanted = f"LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
-    raise UsageError(f"no policy in {path}; expected {wanted}")
 
 
 def start_policy(settings: Open) -> Open:

@@ -18,7 +18,6 @@ from manip_il.cli.dagger import FREE, DaggerOptions, learning_curve, round_timin
 from manip_il.cli.options import Open, command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.trials import Pictures, Shot, Trial, film_shots, suite_conditions
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import MLPOptions
 from manip_il.learn.names import MLP
@@ -26,9 +25,10 @@ from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
-    from manip_il.evaluation.report import RunReport
-    from manip_il.evaluation.report_data import Kind, PolicyRow
+    from manip_il.evaluation.report import Film, Report
     from manip_il.evaluation.results import EvalResult
+    from manip_il.evaluation.tables import PolicyRow
+    from manip_il.evaluation.trial import Trial
 
 TIMINGS_FILE = "timings.json"
 SUITES = {"nominal": "nominal", "disturbed": "knocked", "validation": "nominal"}  # by the folder of the evaluations
@@ -115,7 +115,7 @@ class Contestant:
 
     key: str  # its folder
     name: str
-    kind: Kind
+    colour: str
     policy: Path | None = None
     labels: int | None = None
 
@@ -131,8 +131,8 @@ class _Quickstart:
 
     def run(self) -> None:
         """Run every part, then print the table and write the report."""
-        from manip_il.evaluation.report_data import format_seconds
-        from manip_il.evaluation.tables import print_table
+        from manip_il.evaluation.rounds import format_seconds
+        from manip_il.evaluation.tables import policy_table, print_table
 
         with self._timed("demonstrations and DAgger"):
             results = run_rounds(self.config, self.folder / "dagger", self.engine, self.stages)
@@ -141,10 +141,11 @@ class _Quickstart:
         with self._timed("evaluations"):
             measured = self._measure(contestants)
         with self._timed("films"):
-            pictures = self._film(contestants, measured["nominal"])
-        report = self._report(contestants, measured, pictures)
+            films = self._film(contestants, measured["nominal"])
+        rows = self._rows(contestants, measured)
+        report = self._report(contestants, rows, measured, films)
         report.write(self.folder / REPORT_FILE)
-        print_table(report.table, empty="-")
+        print_table(policy_table(rows), empty="-")
         for sentence in (report.verdict, *report.facts):
             say(sentence)
         say(f"took {format_seconds(sum(self.timings.values()))} in all")
@@ -155,26 +156,23 @@ class _Quickstart:
 
     def _contestants(self, results: list[RoundResult]) -> list[Contestant]:
         from manip_il.cli.cloning_baseline import clone_with_labels
+        from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 
         first, best = results[0], best_round(results)
         policy, labels = clone_with_labels(
             self.config, results[-1].labels, self.folder / "dagger", self.folder / "cloning", self.engine, self.stages
         )
         return [
-            Contestant("expert", "expert", "expert"),
-            Contestant("cloned", "cloning", "cloning", first.policy, first.labels),
-            Contestant("cloned_more", "cloning, as many labels", "cloning", policy, labels),
-            Contestant("dagger", f"DAgger (round {best.round})", "dagger", best.policy, best.labels),
+            Contestant("expert", "expert", EXPERT),
+            Contestant("cloned", "cloning", CLONING, first.policy, first.labels),
+            Contestant("cloned_more", "cloning, as many labels", CLONING, policy, labels),
+            Contestant("dagger", f"DAgger (round {best.round})", DAGGER, best.policy, best.labels),
         ]
 
     def _trial(self, folder: str, seeds: range) -> Trial:
-        suite = SUITES[folder]
-        return Trial(
-            self.config.env,
-            seeds,
-            suite,
-            suite_conditions(suite, self.config.env.task, self.config.env.object, sees=False),
-        )
+        from manip_il.evaluation.trial import Trial
+
+        return Trial.of(self.config.env, seeds, SUITES[folder])
 
     def _measure(self, contestants: Sequence[Contestant]) -> dict[str, dict[str, EvalResult]]:
         """Return folder -> policy -> evaluation; those of an interrupted run are read."""
@@ -196,9 +194,9 @@ class _Quickstart:
             }
         return measured
 
-    def _film(self, contestants: Sequence[Contestant], results: Mapping[str, EvalResult]) -> Pictures:
+    def _film(self, contestants: Sequence[Contestant], results: Mapping[str, EvalResult]) -> tuple[list[Film], str]:
         """Film every policy on the first seed on which DAgger succeeds and cloning fails, else the first of all."""
-        from manip_il.evaluation.film import run_states
+        from manip_il.evaluation.film import Shot, film_shots, run_states
 
         won = {episode.seed for episode in results["dagger"].episodes if episode.success}
         lost = [episode.seed for episode in results["cloned"].episodes if not episode.success]
@@ -209,41 +207,52 @@ class _Quickstart:
             job = trial.job(one.policy)
             episode = run_states(job, seed)
             caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
-            shots.append(Shot(job, episode, one.name, caption))
+            shots.append(Shot(job, episode, one.name, caption, stills=6))
         self.stages.start("films", len(shots))
-        return film_shots(shots, self.stages, strips=True)
+        return film_shots(shots, self.stages)
+
+    def _rows(
+        self, contestants: Sequence[Contestant], measured: Mapping[str, Mapping[str, EvalResult]]
+    ) -> list[PolicyRow]:
+        from manip_il.evaluation.tables import PolicyRow
+
+        nominal, disturbed = measured["nominal"], measured["disturbed"]
+        return [PolicyRow(w.name, nominal[w.key], w.labels, disturbed[w.key], w.colour) for w in contestants]
 
     def _report(
-        self, contestants: Sequence[Contestant], measured: dict[str, dict[str, EvalResult]], pictures: Pictures
-    ) -> RunReport:
-        from manip_il.evaluation.report import RunReport
-        from manip_il.evaluation.report_data import CurvePoint, PolicyRow
+        self,
+        contestants: Sequence[Contestant],
+        rows: Sequence[PolicyRow],
+        measured: Mapping[str, Mapping[str, EvalResult]],
+        films: tuple[list[Film], str],
+    ) -> Report:
+        from manip_il.evaluation.eval_report import run_report
+        from manip_il.evaluation.figures import Curve
         from manip_il.evaluation.results import compare_results
+        from manip_il.evaluation.rounds import Round
 
         _, cloned, more, dagger = contestants
         nominal, disturbed = measured["nominal"], measured["disturbed"]
-        rows = [PolicyRow.of(w.name, nominal[w.key], w.labels, disturbed[w.key], w.kind) for w in contestants]
         facts = [
             f"{words}: {compare_results(results[one.key], results[dagger.key], (one.name, dagger.name)).verdict}"
             for words, results in (("Undisturbed", nominal), ("Disturbed", disturbed))
             for one in (cloned, more)
         ]
-        point = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
-        return RunReport(
+        success = measured["validation"][more.key].success
+        beside = Curve(
+            "cloning", ((Round(0, more.labels or 0, 0, 0, 0, 0.0, 0.0, success),),), more.colour, ("labels",)
+        )
+        return run_report(
+            rows,
+            *films,
+            [learning_curve(self.folder / "dagger"), beside],
             title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",
             verdict=quickstart_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
             command=command_line("quickstart", self.options),
-            rows=tuple(rows),
             facts=(
                 *facts,
                 f"{self.config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.",
             ),
-            curve=replace(learning_curve(self.folder / "dagger"), cloning=(point,)),
-            films=pictures.films,
-            strips=pictures.strips,
-            paths=pictures.paths,
-            pictures_note=pictures.note,
-            disturbance=disturbed[dagger.key].settings.disturbance,
             config=to_plain(self.options),
             fingerprint=nominal[dagger.key].fingerprint,
             timings=self.timings | round_timings(self.folder / "dagger"),

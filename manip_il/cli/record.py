@@ -18,7 +18,6 @@ from manip_il.cli.outputs import (
     save_options,
 )
 from manip_il.cli.progress import Stages, progress, say, warn
-from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
@@ -64,7 +63,7 @@ class RecordOptions(common.EnvOptions):
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     cameras: list[str] = option(list, "any of front, side, wrist; by default no pictures")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
-    vary: list[str] = option(list, VARY_HELP)
+    vary: list[str] = option(list, common.VARY_HELP)
     seed: int = common.seed_option()
     engine: Literal["local", "ray"] = common.engine_option()
     workers: int | None = common.workers_option()
@@ -82,6 +81,8 @@ class RecordOptions(common.EnvOptions):
         if not (self.resume and root.is_dir() and any(root.iterdir())):
             require_output(journals, resume=self.resume, overwrite=self.overwrite)
         common.require_pictures(self.robot.type, self.cameras)
+        from manip_il.evaluation.suites import varied
+
         varied(self.vary, self.env_config(), sees=bool(self.cameras))
         self.image.config(self.cameras)
 
@@ -105,6 +106,8 @@ class RecordOptions(common.EnvOptions):
             if self._is_complete(root, journals):
                 say(f"{root} holds its {self.dataset.num_episodes} episodes already")
             else:
+                from manip_il.evaluation.suites import varied
+
                 conditions = varied(self.vary, env, sees=bool(cameras))
                 job = RolloutJob(env, hold=HOLD, cameras=cameras, conditions=conditions)
                 self._record(engine, job, root, journals)

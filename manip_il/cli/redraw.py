@@ -11,7 +11,6 @@ from manip_il.cli.inputs import require_dataset
 from manip_il.cli.outputs import require_new
 from manip_il.cli.progress import progress, say, warn
 from manip_il.cli.record import OwnRobotGroup
-from manip_il.cli.trials import varied
 from manip_il.data.atomic import exclusive
 from manip_il.errors import UsageError
 from manip_il.option import option
@@ -68,6 +67,7 @@ class RedrawOptions:
         from manip_il.collect.edits import Target, open_source, redraw_dataset
         from manip_il.collect.scenes import CHUNK, Scenes
         from manip_il.collect.workers import default_workers
+        from manip_il.evaluation.suites import varied
 
         source, cameras = open_source(self._dataset(), self.robot.type), self.image.config(self.cameras)
         warn(*source.warnings)

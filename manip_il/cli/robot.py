@@ -12,18 +12,16 @@ from manip_il import checks
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import open_output, require_new
-from manip_il.cli.progress import progress, say
-from manip_il.cli.trials import read_condition
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.cli.progress import progress, say, warn
+from manip_il.errors import ManipError, RenderError, UnknownName, UsageError
 from manip_il.option import option
 from manip_il.tasks import NAMES
 
 if TYPE_CHECKING:
-    from manip_il.evaluation.robot_check.check import RobotCheck
+    from manip_il.evaluation.robot_check import RobotCheck
 
 SUFFIXES = (".yaml", ".yml")
 PAGE = "check.html"
-_NOISE = "random_actions"  # of the suites
 
 
 @dataclass
@@ -57,8 +55,7 @@ class RobotNewOptions:
     def run(self) -> None:
         """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
         from manip_il.data.atomic import write_file
-        from manip_il.evaluation.robot_check.advice import advice
-        from manip_il.evaluation.robot_check.page import verdict
+        from manip_il.evaluation.robot_page import advice, verdict
         from manip_il.robots.robot import get_robot
         from manip_il.robots.suggest import found_lines, suggest, yaml_of
 
@@ -92,10 +89,10 @@ def _measure(
     robot: str, tasks: Sequence[str], episodes: int, on_result: Callable[[object], object] = lambda _: None
 ) -> RobotCheck:
     from manip_il.collect.workers import Engine
-    from manip_il.evaluation.robot_check.check import check_robot
+    from manip_il.evaluation.robot_check import check_robot
 
     with Engine(None) as engine:
-        return check_robot(robot, tasks, episodes, read_condition(_NOISE), engine, on_result)
+        return check_robot(robot, tasks, episodes, engine, on_result)
 
 
 @dataclass
@@ -131,15 +128,20 @@ class RobotCheckOptions:
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` where a task cannot be done."""
-        from manip_il.evaluation.robot_check.check import FILE_NAME
-        from manip_il.evaluation.robot_check.page import check_report
+        from manip_il.evaluation.robot_check import FILE_NAME
+        from manip_il.evaluation.robot_page import check_report, looks
 
         tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
         with open_output(self) as folder:
             with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
                 found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
             found.write(folder / FILE_NAME)
-            report = check_report(found, command_line("robot check", self), to_plain(self))
+            try:
+                pictures, no_pictures = looks(self.robot), ""
+            except RenderError as error:
+                pictures, no_pictures = (), str(error)
+                warn(f"the page has no pictures: {error}")
+            report = check_report(found, pictures, no_pictures, command_line("robot check", self), to_plain(self))
             report.write(folder / PAGE)
         self._say(found)
         say(f"page: {folder / PAGE}")
@@ -148,15 +150,12 @@ class RobotCheckOptions:
             raise ManipError(f"{self.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
 
     def _say(self, found: RobotCheck) -> None:
-        from manip_il.evaluation.robot_check.advice import advice
-        from manip_il.evaluation.robot_check.page import home_line, joint_table, motors_line, task_table, verdict
+        from manip_il.evaluation.robot_page import advice, home_line, joint_table, motors_line, task_table, verdict
         from manip_il.evaluation.tables import print_table
 
         print_table(joint_table(found))
         say(motors_line(found))
-        say(f"The gripper opens to {1000 * found.hand.most:.1f} mm. {home_line(found)}")
-        if found.no_pictures:
-            say(f"No pictures: {found.no_pictures}")
+        say(f"The gripper opens to {1000 * found.opening:.1f} mm. {home_line(found)}")
         print_table(task_table(found))
         say(verdict(found))
         for line in advice(found):

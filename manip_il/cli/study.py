@@ -14,27 +14,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.arms import ROUND_0, ArmOptions, begun, charged
-from manip_il.cli.candidates import Source, limit_of, run_finished, run_history
-from manip_il.cli.compare import rule_json
+from manip_il.cli.arms import ROUND_0, ArmOptions, with_start_cost, with_start_policy
+from manip_il.cli.compare import check_policies
 from manip_il.cli.dagger import FREE, METRICS_FILE, DaggerOptions
 from manip_il.cli.options import to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, read_jsonl, require_output, save_options
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.study_file import ExpertTest, Plan, check_same_file, keep_file, read_plan
-from manip_il.cli.trials import Trial, varied
 from manip_il.data.atomic import new_folder
 from manip_il.errors import NoEffect, UsageError
-from manip_il.evaluation.comparison import Arm
-from manip_il.evaluation.results import write_json
-from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
-from manip_il.evaluation.tables import print_table
 from manip_il.option import option
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
+    from manip_il.evaluation.arm import Member
     from manip_il.evaluation.results import EvalResult
+    from manip_il.evaluation.study import Study
+    from manip_il.evaluation.trial import Trial
     from manip_il.sim.config import EnvConfig
 
 # Options on which round 0 (demonstrations and the first fit) does not depend
@@ -72,6 +69,10 @@ class StudyOptions:
 
     def run(self) -> None:
         """Run what is not there yet, test it, print and write the answer."""
+        from manip_il.evaluation.results import write_json
+        from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, table_markdown
+        from manip_il.evaluation.tables import print_table
+
         plan = read_plan(self.file, self.training_seeds, self.trust)
         experts = expert_trials(plan)
         if self.resume:
@@ -80,13 +81,11 @@ class StudyOptions:
             keep_file(folder, plan.file)
             self._learn(plan)
             study = self._test(plan, experts)
-            write_json(folder / FILE_NAME, study.to_json() | {"rule": rule_json(study.rule, study.limit)})
+            write_json(folder / FILE_NAME, study.to_json())
             atomic_write(folder / TABLE_FILE, table_markdown(study))
             self._report(plan, study)
-        print_table(study.results_table())
-        print_table(study.target_table())
-        if study.within:
-            print_table(study.within_table())
+        for table in study.tables():
+            print_table(table)
         for sentence in (study.verdict, *study.facts):
             say(sentence)
         say(f"table: {folder / TABLE_FILE}")
@@ -99,6 +98,8 @@ class StudyOptions:
 
         Raises `UsageError` once a run has no round that the study's rule selects, and not when all have run.
         """
+        from manip_il.evaluation.arm import run_finished
+
         runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
         for number, (name, seed) in enumerate(runs, start=1):
             folder = self._folder(name, seed)
@@ -106,8 +107,8 @@ class StudyOptions:
             if not ((folder / REPORT_FILE).is_file() and run_finished(folder)):
                 say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
                 self._run(plan, name, seed)
-            source = self._source(plan, name, seed)
-            source.select(plan.rule, limit_of(plan.rule, [source]))
+            member = self._member(plan, name, seed)
+            member.select(plan.rule, plan.rule.limit({member.name: member.history}))
 
     def _run(self, plan: Plan, name: str, seed: int) -> None:
         options = self._options(plan, name, seed)
@@ -117,25 +118,25 @@ class StudyOptions:
         options.run()
 
     def _options(self, plan: Plan, name: str, seed: int) -> ArmOptions:
-        own = begun(plan.arms[name], lambda arm: self._folder(arm, seed))
+        own = with_start_policy(plan.arms[name], lambda arm: self._folder(arm, seed))
         own = replace(own, seed=seed, output_dir=self._folder(name, seed), resume=True, overwrite=False)
         own = replace(own, workers=self.workers)
         return replace(own, engine=self.engine) if isinstance(own, DaggerOptions) else own
 
     def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Study:
         from manip_il.collect.workers import Engine
+        from manip_il.evaluation.arm import Arm
+        from manip_il.evaluation.study import Study
 
-        sources = {name: self._sources(plan, name) for name in plan.arms}
-        everything = [source for arm in sources.values() for source in arm]
-        limit = limit_of(plan.rule, everything)
-        policies = {source.name: source.select(plan.rule, limit)[0] for source in everything}
-        trials = {name: self._trial(plan, name, sources[name], policies) for name in plan.arms}
+        seeds = range(plan.file.training_seeds)
+        runs = {name: [self._member(plan, name, seed) for seed in seeds] for name in plan.arms}
+        limit = plan.rule.limit({member.name: member.history for arm in runs.values() for member in arm})
+        chosen = {name: [member.select(plan.rule, limit) for member in arm] for name, arm in runs.items()}
+        trials = {name: self._trial(plan, name, arm) for name, arm in chosen.items()}
         kept = f"every finished run and evaluation, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            arms: list[Arm] = []
-            for name, arm in sources.items():
-                last = (plan.rule, limit, trials[name], self.output_dir, engine, stages)
-                arms.append(Arm(name, tuple(source.measure(*last) for source in arm)))
+            last = (self.output_dir, engine, stages)
+            arms = [Arm(name, tuple(one.measure(trials[name], *last) for one in arm)) for name, arm in chosen.items()]
             solved = {name: self._test_expert(name, tests, engine, stages) for name, tests in experts.items()}
         return Study(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved, plan.within)
 
@@ -147,28 +148,29 @@ class StudyOptions:
         files = {test: trial.file(self.output_dir, None) for test, trial in trials.items()}
         return {test: trial.measure(None, names[test], files[test], engine, stages) for test, trial in trials.items()}
 
-    def _trial(self, plan: Plan, name: str, sources: list[Source], policies: dict[str, Path]) -> Trial:
+    def _trial(self, plan: Plan, name: str, members: Iterable[Member]) -> Trial:
         """The test of an arm's policies, which are checked before any episode runs."""
-        own = {source.name: policies[source.name] for source in sources}
+        from manip_il.evaluation.trial import Trial
+
+        policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
-        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, own.values(), self.trust)
-        trial.check_policies(own, self.output_dir, self.engine)
+        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self.trust)
+        check_policies(policies, trial, self.output_dir, self.engine)
         return trial
 
-    def _sources(self, plan: Plan, name: str) -> list[Source]:
-        return [self._source(plan, name, seed) for seed in range(plan.file.training_seeds)]
+    def _member(self, plan: Plan, name: str, seed: int) -> Member:
+        from manip_il.evaluation.arm import run_member
 
-    def _source(self, plan: Plan, name: str, seed: int) -> Source:
-        folder, start = self._folder(name, seed), self._folder(plan.starts[name] or name, seed)
-        return Source(folder, seed, history=charged(plan.arms[name], run_history(folder), start))
+        start, run = self._folder(plan.starts[name] or name, seed), run_member(self._folder(name, seed), seed)
+        return replace(run, history=with_start_cost(plan.arms[name], run.history, start))
 
     def _folder(self, name: str, seed: int) -> Path:
         return self.output_dir / name / f"seed_{seed}"
 
     def _report(self, plan: Plan, study: Study) -> None:
-        from manip_il.evaluation.study_report import study_report
+        from manip_il.evaluation.compare_report import study_report
 
-        result = study.arms[0].members[0].result
+        result = study.arms[0].members[0].test
         words = ["manip-il", "study", str(self.file), f"--output_dir={self.output_dir}"]
         if self.training_seeds is not None:
             words.append(f"--training_seeds={self.training_seeds}")
@@ -200,6 +202,8 @@ def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
 
 def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
     """Return a test in an arm's environment; None where it would change nothing."""
+    from manip_il.evaluation.suites import varied
+    from manip_il.evaluation.trial import Trial
     from manip_il.robots.robot import get_robot  # here, as help needs no simulator
 
     env = replace(env, robot=test.robot or env.robot)
@@ -208,7 +212,7 @@ def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
     try:
         if test.vary:
             return Trial(env, seeds, "+".join(test.vary), varied(test.vary, env, sees=False))
-        return Trial.of(env, seeds, test.suite, ())
+        return Trial.of(env, seeds, test.suite)
     except NoEffect:
         return None
 

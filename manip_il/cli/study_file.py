@@ -11,19 +11,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il import checks
 from manip_il.cli.arms import ArmOptions, first_arm, learning_env, read_arm
-from manip_il.cli.candidates import require_same_env
+from manip_il.cli.common_options import TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.options import Open, to_plain
 from manip_il.cli.outputs import atomic_write
 from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml
-from manip_il.cli.trials import FOLDER, TrialGroup
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.evaluation.report_data import flatten
-from manip_il.evaluation.rounds import Rule
 from manip_il.option import option
 from manip_il.seeding import MAX_SEED
 
 if TYPE_CHECKING:
+    from manip_il.evaluation.rounds import Rule
     from manip_il.sim.config import EnvConfig
 
 STUDY_FILE = "study.yaml"
@@ -90,6 +88,8 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
 
     Raises `UsageError` in one line for what is not sound.
     """
+    from manip_il.evaluation.rounds import Rule
+
     file = from_yaml(path, StudyFile)
     if training_seeds is not None:
         file = replace(file, training_seeds=training_seeds)
@@ -113,6 +113,8 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
 
 
 def _amount(text: str) -> Rule:
+    from manip_il.evaluation.rounds import Rule
+
     rule = Rule.parse("best", text)
     if rule.amount is None:
         raise UsageError(f"within has {text!r}; expected a cost with an amount, such as steps:20000")
@@ -120,7 +122,9 @@ def _amount(text: str) -> Rule:
 
 
 def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
-    """The arm that others are compared with; None where tasks differ and none is named."""
+    """The arm that others are compared with; None if tasks differ and none is named."""
+    from manip_il.evaluation.arm import require_same_env
+
     if file.baseline is None and len({env.task for env in envs.values()}) > 1:
         return None
     first = next(iter(envs))
@@ -138,6 +142,8 @@ def keep_file(folder: Path, file: StudyFile) -> None:
 
 def check_same_file(folder: Path, file: StudyFile) -> None:
     """Raise `MismatchError` for an option that differs from the study's in `folder`; training seeds may be more."""
+    from manip_il.evaluation.report import flatten
+
     path = folder / STUDY_FILE
     if not path.is_file():
         return
@@ -151,6 +157,8 @@ def check_same_file(folder: Path, file: StudyFile) -> None:
 
 
 def _check_numbers(path: Path, file: StudyFile) -> None:
+    from manip_il.evaluation.trial import FOLDER
+
     if not file.arms:
         raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
     if not 1 <= file.training_seeds <= MAX_SEED:

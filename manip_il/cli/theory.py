@@ -74,13 +74,13 @@ class TheoryOptions:
         say(f"report: {folder / PAGE}")
 
     def _shift(self, run: Path) -> Shift:
-        from manip_il.cli.candidates import common_env, read_candidate  # here, as it needs numpy
         from manip_il.collect.workers import Engine
+        from manip_il.evaluation.arm import common_env, read_arm
         from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.theory.shift import find_rounds, measure_shift
 
         rounds = find_rounds(run)
-        env = common_env(read_candidate(run).sources, common.EnvGroup(), None, common.MaybeTaskGroup())
+        env = common_env(read_arm(run).members, lambda _: common.EnvOptions().env_config())
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
         with progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.advance())

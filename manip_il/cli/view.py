@@ -12,14 +12,14 @@ from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policy, find_policy, observation_text, require_folder
 from manip_il.cli.outputs import require_short_path
 from manip_il.cli.progress import say, warn
-from manip_il.cli.trials import SUITE_HELP, require_suite, suite_conditions
 from manip_il.errors import RenderError, UsageError
 from manip_il.option import option
 from manip_il.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.evaluation.watch import Screen
+    from manip_il.evaluation.rerun_log import RerunLog
+    from manip_il.evaluation.watch import WindowScreen
     from manip_il.sim.config import CameraConfig, EnvConfig
     from manip_il.sim.env import ManipEnv
 
@@ -53,7 +53,7 @@ class ViewOptions:
     robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
     task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
     env: common.EnvGroup = field(default_factory=common.EnvGroup)
-    suite: str = option("nominal", SUITE_HELP)
+    suite: str = option("nominal", common.SUITE_HELP)
     n_episodes: int | None = option(None, f"episodes; by default without end, {IN_A_FILE} in a file")
     seed: int = common.seed_option()
     trust: bool = common.trust_option()
@@ -73,6 +73,8 @@ class ViewOptions:
             require_folder(self.output.parent, f"the folder of --output={self.output}")
         if self.policy.path is not None:
             find_policy(self.policy.path)
+        from manip_il.evaluation.suites import require_suite
+
         require_suite(self.suite)
         if self.robot.type == STOCK:
             raise UsageError(f'--robot.type={STOCK} cannot be viewed; gymnasium shows it: render_mode="human"')
@@ -118,6 +120,7 @@ class ViewOptions:
         """Return the episodes to show; without pictures where no policy looks at any and a window is open."""
         from manip_il.collect.drivers import PolicyDriver, driver_of
         from manip_il.collect.job import RolloutJob
+        from manip_il.evaluation.suites import suite_conditions
         from manip_il.learn.checkpoint import Checkpoint
         from manip_il.mdp import LONGEST_EPISODE
 
@@ -130,7 +133,7 @@ class ViewOptions:
             say(observation_text(cameras, path))
         if cameras is None and not self._in_a_window:
             cameras = self._cameras(env)
-        conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
+        conditions = suite_conditions(self.suite, env, sees=cameras is not None)
         driver = PolicyDriver((path,), trust=self.trust) if path else driver_of(self.policy.type)
         if self.policy.type == "sliders" and not self.env.horizon:
             env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
@@ -155,7 +158,7 @@ class ViewOptions:
             return None
         return cameras
 
-    def _screen(self, env: ManipEnv) -> Screen:
+    def _screen(self, env: ManipEnv) -> WindowScreen | RerunLog:
         from manip_il.evaluation.rerun_log import RerunLog
         from manip_il.evaluation.watch import WindowScreen
 
@@ -163,7 +166,7 @@ class ViewOptions:
             return WindowScreen(env, sliders=self.policy.type == "sliders")
         log = RerunLog(env.config, self.output)
         if log.address:
-            ports = " ".join(f"-L {port}:localhost:{port}" for port in (log.web_port, log.grpc_port))
+            ports = " ".join(f"-L {port}:localhost:{port}" for port in log.ports)
             say(f"open: {log.address}")
             say(f"from another machine first: ssh {ports} {socket.gethostname()}")
         return log

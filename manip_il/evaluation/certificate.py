@@ -1,40 +1,40 @@
 """`certificate.json`: the states from which the expert recovers, and the cost of one wrong action.
 
-The cost of a state is the number of control steps until the task is solved. Where Q*(s, a) is the expert's cost of
-going on after action a in state s, and V*(s) its cost of acting itself, the gap Q*(s, a) - V*(s) is the cost that the
-action a adds. Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest of them, u: a learner that errs
-in a share e of the states it visits within T steps costs at most u T e more than the expert, so linearly in T where a
-mistake can be undone, and not quadratically. Rajaraman et al. (2021) call it mu-recoverability. The largest gap among
-drawn actions, as here, is a lower bound of u: `Row.above_largest` says how much of the draw may lie above it.
+The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the expert's cost of going
+on after action a in state s, and V*(s) its cost of acting itself, the gap Q*(s, a) - V*(s) is what the action a costs.
+Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest of them, u: a learner that errs in a share e
+of the states it visits within T steps costs at most u T e more than the expert, so linearly in T if a mistake can be
+undone, and not quadratically. Rajaraman et al. (2021) call it mu-recoverability. The largest gap among drawn actions,
+as here, is a lower bound of u.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.figures import Bar, Figure, drawing, rates_figure, to_figure
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import write_json
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, EXPERT, INTERVAL, Table
 
 FILE_NAME = "certificate.json"
 Group = Literal["start", "state", "action", "learner"]
-MAX_SEEDS = 6  # of failures in a line
-_NONE = "-"
+_MAX_SEEDS = 6  # of failures in a line
+_COLOURS: dict[Group, str] = {"start": EXPERT, "state": DAGGER, "action": CLONING, "learner": BASELINE}
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
     """One episode. moment: the control step from which the expert is judged.
 
-    steps: until solved from there [control steps]; None where not within a horizon. undisturbed: the same without the
-    perturbation, where known. labelled: whether the expert's last label was valid. Raises `ManipError` for impossible
-    counts.
+    steps: until solved from there [control steps]; None if not within a horizon. undisturbed: the same without the
+    perturbation, if known. labelled: whether the expert's last label was valid.
     """
 
     seed: int
@@ -42,17 +42,6 @@ class Case:
     steps: int | None
     undisturbed: int | None = None
     labelled: bool = True
-
-    def __post_init__(self) -> None:
-        counts = [count for count in (self.steps, self.undisturbed) if count is not None]
-        if self.moment < 0 or any(count < 1 for count in counts):
-            raise ManipError(f"certificate of seed {self.seed}: {self} has impossible step counts")
-
-    def gap(self, horizon: int) -> int | None:
-        """Return Q*(s, a) - V*(s) [control steps]; the whole horizon where the expert did not recover."""
-        if self.undisturbed is None:
-            return None
-        return horizon if self.steps is None else self.steps - self.undisturbed
 
 
 @dataclass(frozen=True)
@@ -81,25 +70,15 @@ class Row:
     horizon: int
     left_out: int = 0
 
-    def __post_init__(self) -> None:
-        longest = max((case.steps or 0 for case in self.cases), default=0)
-        if longest > self.horizon:
-            raise ManipError(f"certificate, {self.words}: solved after {longest} steps of {self.horizon}")
-
     @property
     def success(self) -> Proportion | None:
         """Solved within a horizon from the moment on; None without cases."""
         return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
 
     @property
-    def failed_seeds(self) -> tuple[int, ...]:
-        """Seeds of the cases that were not solved."""
-        return tuple(case.seed for case in self.cases if case.steps is None)
-
-    @property
-    def without_label(self) -> int:
-        """Number of unsolved cases that ended where the expert has no valid label."""
-        return sum(case.steps is None and not case.labelled for case in self.cases)
+    def failed(self) -> list[Case]:
+        """Cases that were not solved."""
+        return [case for case in self.cases if case.steps is None]
 
     @property
     def mean_steps(self) -> float | None:
@@ -108,19 +87,20 @@ class Row:
         return float(np.mean(steps)) if steps else None
 
     @property
-    def gaps(self) -> Gaps | None:
-        """Gaps of the cost-to-go; None where no case has one."""
-        gaps = [gap for case in self.cases if (gap := case.gap(self.horizon)) is not None]
-        if not gaps:
-            return None
-        # A percentile that was seen, the one above where it falls between two.
-        p95, p99 = (int(np.percentile(gaps, share, method="higher")) for share in (95, 99))
-        return Gaps(float(np.mean(gaps)), p95, p99, max(gaps), len(self.failed_seeds))
+    def every_gap(self) -> list[int]:
+        """Q*(s, a) - V*(s) of each case [control steps]; the whole horizon if the expert did not recover."""
+        known = [(case.steps, case.undisturbed) for case in self.cases if case.undisturbed is not None]
+        return [self.horizon if steps is None else steps - undisturbed for steps, undisturbed in known]
 
     @property
-    def above_largest(self) -> float | None:
-        """Share of such draws that may exceed the largest gap seen, at 95 %; exact for independent draws."""
-        return 1 - (1 - CONFIDENCE) ** (1 / len(self.cases)) if self.cases else None
+    def gaps(self) -> Gaps | None:
+        """Gaps of the cost-to-go; None if no case has one."""
+        gaps = self.every_gap
+        if not gaps:
+            return None
+        # A percentile that was seen, the one above if it falls between two.
+        p95, p99 = (int(np.percentile(gaps, share, method="higher")) for share in (95, 99))
+        return Gaps(float(np.mean(gaps)), p95, p99, max(gaps), len(self.failed))
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -133,45 +113,26 @@ class Row:
             "left_out": self.left_out,
             "success_rate": success.rate if success else None,
             "interval": list(success.interval) if success else None,
-            "without_label": self.without_label,
+            "without_label": sum(not case.labelled for case in self.failed),
             "mean_steps": self.mean_steps,
             "gap": asdict(gaps) if gaps and self.group == "action" else None,
             "cases": [[case.seed, case.moment, case.steps, case.undisturbed] for case in self.cases],
         }
 
 
-def pooled(rows: tuple[Row, ...], words: str) -> Row:
-    """Return all cases of some rows of one group as one row. Raises `UsageError` without rows."""
-    if not rows:
-        raise UsageError(f"certificate: no rows to pool as {words!r}")
-    cases = tuple(case for row in rows for case in row.cases)
-    return Row(rows[0].group, "all", words, cases, rows[0].horizon, sum(row.left_out for row in rows))
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the runs. cases: of each kind; horizon: [control steps]; tolerance: to the goal [m]."""
-
-    cases: int
-    seed: int
-    horizon: int
-    control_hz: int
-    tolerance: float
-    success_steps: int
-
-
 @dataclass(frozen=True)
 class Certificate:
     """Recoverability of the expert on one robot and task, one row a kind.
 
-    policy: from whose visited states the expert went on, too; None for none.
+    policy: from whose visited states the expert went on, too; None for none. settings: cases of each kind, seed,
+    horizon [control steps], control_hz, tolerance [m] and success_steps of the runs.
     """
 
     robot: str
     task: str
     policy: str | None
     fingerprint: Mapping[str, Any]
-    settings: Settings
+    settings: Mapping[str, Any]
     rows: tuple[Row, ...]
 
     def of(self, group: Group) -> tuple[Row, ...]:
@@ -181,97 +142,137 @@ class Certificate:
     @property
     def states(self) -> Row:
         """All changed states."""
-        return pooled(self.of("state"), "all changed states")
+        return self._pooled("state", "all changed states")
 
     @property
     def actions(self) -> Row:
         """All wrong actions: their `gaps.largest` is the empirical u of Ross et al. (2011)."""
-        return pooled(self.of("action"), "all wrong actions")
+        return self._pooled("action", "all wrong actions")
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the contents of `certificate.json`.
+    @property
+    def pooled_rows(self) -> tuple[Row, ...]:
+        """All rows; after those of changed states and of wrong actions, all of their cases as one."""
+        parts = (*self.of("start"), *self.of("state"), self.states, *self.of("action"), self.actions)
+        return (*parts, *self.of("learner"))
 
-        robot, task, policy (or null), fingerprint, settings (`Settings`), confidence of every interval, mu (the largest
-        gap of all wrong actions [control steps]), and rows, a list of: group (start, state, action, learner), kind,
-        words, n, left_out, success_rate and interval (null without cases), without_label (failures in which the expert
-        had no sound label at the end), mean_steps until solved, gap (`Gaps`; for wrong actions), and cases, each
-        [seed, moment, steps or null, undisturbed or null].
+    def _pooled(self, group: Group, words: str) -> Row:
+        rows = self.of(group)
+        cases = tuple(case for row in rows for case in row.cases)
+        return Row(group, "all", words, cases, self.settings["horizon"], sum(row.left_out for row in rows))
+
+    def write(self, path: Path) -> None:
+        """Write `certificate.json`, creating its folder.
+
+        robot, task, policy (or null), fingerprint, settings, confidence of every interval, mu (the largest gap of all
+        wrong actions [control steps]), and rows, a list of: group (start, state, action, learner), kind, words, n,
+        left_out, success_rate and interval (null without cases), without_label (failures in which the expert had no
+        sound label at the end), mean_steps until solved, gap (`Gaps`; for wrong actions), and cases, each [seed,
+        moment, steps or null, undisturbed or null].
         """
         gaps = self.actions.gaps
-        rows = [*self.of("start"), *self.of("state"), self.states, *self.of("action"), self.actions]
-        return {
+        content = {
             "robot": self.robot,
             "task": self.task,
             "policy": self.policy,
             "fingerprint": dict(self.fingerprint),
-            "settings": asdict(self.settings),
+            "settings": dict(self.settings),
             "confidence": CONFIDENCE,
             "mu": gaps.largest if gaps else None,
-            "rows": [row.to_json() for row in [*rows, *self.of("learner")]],
+            "rows": [row.to_json() for row in self.pooled_rows],
         }
+        write_json(path, content, indent=None)
 
-    def write(self, path: Path) -> None:
-        """Write `path` whole or not at all, creating its folder."""
-        write_json(path, self.to_json(), indent=None)
+    def tables(self) -> tuple[Table, Table]:
+        """Return the table of recoveries, and that of the costs of wrong actions."""
+        rows, horizon = self.pooled_rows, self._in_seconds(self.settings["horizon"])
+        recoveries = Table(
+            ("the expert continues from", f"solved in {horizon} {INTERVAL}", "mean steps", "cases", "left out"),
+            tuple(
+                (
+                    row.words,
+                    str(row.success or ""),
+                    "" if row.mean_steps is None else f"{row.mean_steps:.1f}",
+                    str(len(row.cases)),
+                    str(row.left_out),
+                )
+                for row in rows
+            ),
+            tuple(_COLOURS[row.group] for row in rows),
+        )
+        costs = tuple(
+            (
+                row.words,
+                f"{gaps.mean:.1f}",
+                *map(self._in_seconds, (gaps.p95, gaps.p99, gaps.largest)),
+                str(gaps.unrecovered),
+                str(len(row.cases)),
+            )
+            for row in [*self.of("action"), self.actions]
+            if (gaps := row.gaps) is not None
+        )
+        head = ("one wrong action costs, in steps", "mean", "95th", "99th", "largest", "never solved", "cases")
+        return recoveries, Table(head, costs)
 
+    def facts(self) -> list[str]:
+        """Return sentences on the largest cost, on the learner's states, and on failures."""
+        gaps, lines = self.actions.gaps, list[str]()
+        if gaps is not None:
+            whole = ", the whole horizon" if gaps.unrecovered else ""
+            largest = self._in_seconds(gaps.largest)
+            # exact for independent draws, none of which cost more
+            above = 1 - (1 - CONFIDENCE) ** (1 / len(self.actions.cases))
+            lines.append(
+                f"mu (the u of Ross et al. 2011) is at least {largest}{whole}; with {CONFIDENCE:.0%} confidence, at "
+                f"most {above:.1%} of such actions cost more."
+            )
+        for row in self.of("learner"):
+            count = row.left_out + len(row.cases)
+            lines.append(f"The policy had solved {row.left_out} of {count} before the expert's turn.")
+        for row in self.rows:
+            seeds = [str(case.seed) for case in row.failed]
+            if seeds:
+                more = ", ..." if len(seeds) > _MAX_SEEDS else ""
+                lines.append(f"Not solved, {row.words}: seeds {', '.join(seeds[:_MAX_SEEDS])}{more}.")
+        return lines
 
-def summary_lines(certificate: Certificate) -> list[str]:
-    """Return the table of recoveries, the table of wrong actions, and sentences on both, as plain lines."""
-    settings, hz = certificate.settings, certificate.settings.control_hz
-    horizon = f"{settings.horizon} steps ({_seconds(settings.horizon, hz)})"
-    head = ("the expert continues from", f"solved in {horizon} [{CONFIDENCE:.0%}]", "mean steps", "cases", "left out")
-    rows = [*certificate.of("start"), *certificate.of("state"), certificate.states, certificate.actions]
-    costs_head = ("one wrong action costs, in steps", "mean", "95th", "99th", "largest", "never solved", "cases")
-    costs = tuple(_costs(row, hz) for row in [*certificate.of("action"), certificate.actions])
-    return [
-        f"expert on {certificate.robot} {certificate.task}: {settings.cases} cases a kind, --seed={settings.seed}",
-        "",
-        *Table(head, tuple(map(_recovery, [*rows, *certificate.of("learner")]))).aligned_lines(),
-        "",
-        *Table(costs_head, costs).aligned_lines(),
-        "",
-        *_sentences(certificate),
-    ]
-
-
-def _recovery(row: Row) -> tuple[str, ...]:
-    steps = _NONE if row.mean_steps is None else f"{row.mean_steps:.1f}"
-    return (row.words, str(row.success or _NONE), steps, str(len(row.cases)), str(row.left_out))
-
-
-def _costs(row: Row, hz: int) -> tuple[str, ...]:
-    gaps = row.gaps
-    if gaps is None:
-        return (row.words, *[_NONE] * 5, "0")
-    steps = (f"{gaps.mean:.1f}", *map(str, (gaps.p95, gaps.p99, gaps.largest)))
-    costs = (f"{text} ({_seconds(float(text), hz)})" for text in steps)
-    return (row.words, *costs, str(gaps.unrecovered), str(len(row.cases)))
-
-
-def _sentences(certificate: Certificate) -> list[str]:
-    lines = [_mu(certificate.actions, certificate.settings.control_hz)] if certificate.actions.cases else []
-    for row in certificate.of("learner"):
-        count = row.left_out + len(row.cases)
-        lines.append(f"the policy had solved {row.left_out} of {count} before the expert's turn")
-    return lines + [_failures(row) for row in certificate.rows if row.failed_seeds]
-
-
-def _mu(actions: Row, hz: int) -> str:
-    gaps = actions.gaps
-    assert gaps is not None
-    mu = f"mu (the u of Ross et al. 2011) is at least {gaps.largest} steps ({_seconds(gaps.largest, hz)})"
-    if gaps.unrecovered:
-        return f"{mu}, the whole horizon, as {gaps.unrecovered} of {len(actions.cases)} were never solved"
-    return f"{mu}; with {CONFIDENCE:.0%} confidence, at most {actions.above_largest:.1%} of such actions cost more"
-
-
-def _failures(row: Row) -> str:
-    seeds = ", ".join(map(str, row.failed_seeds[:MAX_SEEDS])) + (", ..." if len(row.failed_seeds) > MAX_SEEDS else "")
-    line = f"not solved, {row.words}: seeds {seeds}"
-    if not row.without_label:
-        return line
-    return f"{line} ({row.without_label} of {len(row.failed_seeds)} ended where the expert has no valid label)"
+    def _in_seconds(self, steps: int) -> str:
+        return f"{steps} steps ({steps / self.settings['control_hz']:.3g} s)"
 
 
-def _seconds(steps: float, hz: int) -> str:
-    return f"{steps / hz:.3g} s"
+def certificate_report(certificate: Certificate, command: str, config: Mapping[str, Any]) -> Report:
+    """Return the report of a certificate."""
+    recoveries, costs = certificate.tables()
+    name, states = f"{certificate.robot} {certificate.task}", certificate.states
+    changed = f"{states.success} of {len(states.cases):,} changed states" if states.success else "no changed state"
+    rows = [row for row in certificate.pooled_rows if row.name != "all"]
+    bars = [Bar(row.words, (row.success,), _COLOURS[row.group]) for row in rows if row.success]
+    note = (
+        "An episode is perturbed once, at a step drawn from those of the undisturbed one; the expert then has a whole "
+        "horizon. Left out: the perturbation changed nothing, or found no place."
+    )
+    cost_note = "The cost of an action: control steps until solved after it, less those of the undisturbed episode."
+    figure = costs_figure(certificate.of("action"), certificate.settings["control_hz"])
+    return Report(
+        title=f"Certificate of the expert: {name}",
+        verdict=f"The expert on {name} recovers from {changed}.",
+        facts=tuple(certificate.facts()),
+        command=command,
+        sections=(
+            Section("Results", figures=(rates_figure(bars),), tables=(recoveries,), notes=(note,)),
+            Section("What one wrong action costs", figures=(figure,), tables=(costs,), notes=(cost_note,)),
+        ),
+        config=config,
+        fingerprint=certificate.fingerprint,
+    )
+
+
+def costs_figure(rows: Sequence[Row], control_hz: int) -> Figure:
+    """Draw the share of wrong actions of each kind that cost at most so many steps."""
+    with drawing(1, size=(4.2, 3.0)) as (drawn, axes):
+        axis = axes[0, 0]
+        for row, style in zip(rows, ("-", "--", ":", "-."), strict=False):
+            if row.every_gap:
+                axis.ecdf(row.every_gap, label=row.words, ls=style, lw=1.8)
+        axis.set(xlabel=f"cost [control steps of 1/{control_hz} s]", ylabel="share of actions", ylim=(0, 1.02))
+        drawn.legend(loc="outside upper left")
+        return to_figure(drawn, "Share of wrong actions that cost at most so many control steps, by kind")

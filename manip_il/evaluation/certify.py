@@ -21,7 +21,7 @@ from manip_il.collect.query import Query
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.certificate import Case, Certificate, Group, Row, Settings
+from manip_il.evaluation.certificate import Case, Certificate, Group, Row
 from manip_il.mdp import F32, F64, Actor, Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
@@ -60,7 +60,8 @@ def certify(
         rows.append(run.taken_over(policy, trust))
     if engine.given_up:
         _LOG.warning("left out, as each repeatedly killed its worker: seeds %s", engine.given_up)
-    settings = Settings(cases, seed, env.horizon, env.control_hz, env.tolerance, env.success_steps)
+    settings = {"cases": cases, "seed": seed}
+    settings |= {name: getattr(env, name) for name in ("horizon", "control_hz", "tolerance", "success_steps")}
     name = None if policy is None else str(policy)
     return Certificate(env.robot, env.task, name, env_fingerprint(env), settings, tuple(rows))
 

@@ -1,198 +1,161 @@
-"""The tables of a comparison, and its `report.html`: which is better, and in which episodes the two differ."""
+"""`report.html` of a comparison and of a study: which arm is better, where they differ, and what they cost."""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from itertools import chain
 from statistics import fmean
-from typing import Any, ClassVar
+from typing import Any
 
-from manip_il.evaluation.comparison import Comparison, Member
-from manip_il.evaluation.curves import CurveCharts
-from manip_il.evaluation.eval_report import AXES_NOTE
-from manip_il.evaluation.failures import PhaseRow, phase_rows
+from manip_il.evaluation.arm import Arm
+from manip_il.evaluation.comparison import Comparison
+from manip_il.evaluation.eval_report import MAP_NOTE
+from manip_il.evaluation.failures import map_groups, phase_table
+from manip_il.evaluation.figures import ARMS, Bar, Curve, Figure, rates_figure
 from manip_il.evaluation.intervals import format_percent
-from manip_il.evaluation.maps import FailureMap, Outcome, paired_maps
-from manip_il.evaluation.report import Bar, Report
-from manip_il.evaluation.report_data import format_seconds
+from manip_il.evaluation.report import Report, Section, curve_section
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.significance import format_p, format_p_cell, holm, sign_flip_exact
-from manip_il.evaluation.study_report import arm_series
-from manip_il.evaluation.tables import NO_CONDITION, Table
+from manip_il.evaluation.study import Study, arms_table
+from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, NO_CONDITION, Table
 
-KINDS = ("arm arm-1 left", "arm arm-0 right")  # left, right
+_COLOURS = (CLONING, DAGGER)  # left, right
 
 
 def comparison_table(comparison: Comparison) -> Table:
-    """Return two rows a training seed, the paired result on the second."""
-    columns = ("policy", "training seed", "round", "labels", "episodes", "wall-clock", "validation")
-    columns += (f"test [{100 * comparison.confidence:g} % interval]", "difference", "McNemar's exact p")
-    rows: list[tuple[str, ...]] = []
-    members = zip(comparison.left.members, comparison.right.members, comparison.pairs, strict=True)
-    for left, right, pair in members:
-        low, high = (100 * end for end in pair.interval)
-        difference = f"{100 * pair.difference:+.1f} points [{low:+.1f}, {high:+.1f}]"
-        rows += [(*_cells(left), "", ""), (*_cells(right), difference, format_p_cell(pair.p_value))]
-    return Table(columns, tuple(rows), KINDS * len(comparison.pairs))
+    """Return an arm a row, see `arms_table`."""
+    table = arms_table(comparison.arms, {comparison.right.name: comparison})
+    return Table(table.columns, table.rows, _COLOURS)
 
 
 def condition_table(comparison: Comparison) -> Table | None:
-    """Return both arms by condition, all training seeds together; None where there is one condition alone.
-
-    p: exact over test episodes as in `Comparison.p_value`, corrected for the number of conditions (Holm).
-    """
-    parts = comparison.left.members[0].result.by_condition
-    if len(parts) < 2:
-        return None
-    left, right = _outcomes(comparison.left.members), _outcomes(comparison.right.members)
-    seeds = {name: [episode.seed for episode in part.episodes] for name, part in parts.items()}
-    margins = [[sum(right[seed]) - sum(left[seed]) for seed in own] for own in seeds.values()]
-    corrected = holm([sign_flip_exact(one) for one in margins])
+    """Return success of both arms by condition, the mean over training seeds; None if there is one condition alone."""
+    parts = comparison.left.members[0].test.by_condition
     rows: list[tuple[str, ...]] = []
-    for (name, own), p in zip(seeds.items(), corrected, strict=True):
-        rates = [fmean(success for seed in own for success in outcomes[seed]) for outcomes in (left, right)]
-        difference = f"{100 * (rates[1] - rates[0]):+.1f} points"
-        rows.append((name or NO_CONDITION, f"{len(own):,}", *map(format_percent, rates), difference, format_p(p)))
-    return Table(("condition", "episodes", *comparison.names, "difference", "corrected p"), tuple(rows))
+    for name, part in parts.items():
+        left, right = (fmean(m.test.by_condition[name].success.rate for m in arm.members) for arm in comparison.arms)
+        cells = (format_percent(left), format_percent(right), f"{100 * (right - left):+.1f} points")
+        rows.append((name or NO_CONDITION, f"{part.success.n:,}", *cells))
+    return Table(("condition", "episodes", *comparison.names, "difference"), tuple(rows)) if len(parts) > 1 else None
 
 
 def compare_report(
     comparison: Comparison, command: str, facts: Sequence[str] = (), config: Mapping[str, Any] | None = None
-) -> CompareReport:
+) -> Report:
     """Return the report of a comparison. facts: sentences that follow the four counts of paired episodes."""
-    first = comparison.left.members[0].result
-    left, right = (arm.members[0].result.fingerprint for arm in comparison.arms)
-    return CompareReport(
+    first = comparison.left.members[0].test
+    left, right = (arm.members[0].test.fingerprint for arm in comparison.arms)
+    counts = ((pair.n, pair.both, pair.only_right, pair.only_left, pair.neither) for pair in comparison.pairs)
+    n, both, only_right, only_left, neither = map(sum, zip(*counts, strict=True))
+    over = f" of {len(comparison.pairs)} training seeds" if len(comparison.pairs) > 1 else ""
+    a, b = comparison.names
+    paired = (
+        f"Of {n:,} paired episodes{over} both solved {both:,}, only {b} {only_right:,}, only {a} {only_left:,}, and "
+        f"neither {neither:,}."
+    )
+    arms = zip(comparison.arms, _COLOURS, strict=True)
+    curves = [_curve(arm, colour) for arm, colour in arms if all(member.history for member in arm.members)]
+    sections = [_results(comparison, first), *_failures(comparison)]
+    return Report(
         title=f"{' against '.join(comparison.names)}: {first.robot} {first.task}",
         verdict=comparison.verdict,
-        facts=(_paired_fact(comparison), *facts),
+        facts=(paired, *facts),
         command=command,
+        sections=(*sections, *([curve_section(curves)] if curves else [])),
         config=config or {},
         fingerprint=left if left == right else dict(zip(comparison.names, (left, right), strict=True)),
-        comparison=comparison,
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompareReport(Report):
-    """The report of a comparison, made by `compare_report`."""
-
-    template: ClassVar[str] = "compare.html.j2"
-    kinds: ClassVar[tuple[str, str]] = KINDS
-    comparison: Comparison
-
-    @property
-    def _first(self) -> EvalResult:
-        return self.comparison.left.members[0].result
-
-    @property
-    def _several(self) -> bool:
-        return len(self.comparison.pairs) > 1
-
-    @property
-    def bars(self) -> list[Bar]:
-        """Success of both arms."""
-        arms = zip(self.comparison.arms, KINDS, strict=True)
-        return [Bar.of(arm.name, kind, *(member.result.success for member in arm.members)) for arm, kind in arms]
-
-    @property
-    def note(self) -> str:
-        """Number of episodes, the disturbance, meaning of dots."""
-        note = f"Both ran the same {self._first.success.n:,} test episodes."
-        if self._first.settings.disturbance != "none":
-            note += f" Disturbed: {self._first.settings.disturbance}."
-        return note + (" Dots: each training seed; the bar is their mean." if self._several else "")
-
-    @property
-    def table(self) -> Table:
-        """The table without p, which stands beside the counts that it follows from."""
-        table = comparison_table(self.comparison)
-        return replace(table, columns=table.columns[:-1], rows=tuple(row[:-1] for row in table.rows))
-
-    @property
-    def paired_table(self) -> Table:
-        """Counts of paired episodes by who succeeded."""
-        a, b = self.comparison.names
-        rows = [
-            (
-                f"training seed {left.training_seed}" if self._several else "test episodes",
-                *(f"{count:,}" for count in (pair.n, pair.both, pair.only_left, pair.only_right, pair.neither)),
-                format_p_cell(pair.p_value),
-            )
-            for left, pair in zip(self.comparison.left.members, self.comparison.pairs, strict=True)
-        ]
-        columns = ("", "episodes", "both solved", f"only {a}", f"only {b}", "neither", "McNemar's exact p")
-        return Table(columns, tuple(rows))
-
-    @cached_property
-    def condition_table(self) -> Table | None:
-        """Both arms by condition."""
-        return condition_table(self.comparison)
-
-    @cached_property
-    def maps(self) -> list[FailureMap]:
-        """Starts and goals of both arms; empty where episodes lack them."""
-        return paired_maps(self.comparison)
-
-    @property
-    def map_names(self) -> dict[Outcome, str]:
-        """Outcomes in words."""
-        more = " (in more training seeds than the other)" if self._several else ""
-        return {
-            "failed": f"only this one failed{more}",
-            "shared": "failed, and so did the other",
-            "solved": f"solved: {self.maps[0].moving}'s start (circle) and goal (square)",
-        }
-
-    @property
-    def map_note(self) -> str:
-        """Axes of the maps."""
-        return f"Both maps show the same starts and goals. {AXES_NOTE}. {self.maps[0].thinning_note}"
-
-    @cached_property
-    def phases(self) -> tuple[PhaseRow, ...]:
-        """Failed episodes of both arms by phase; empty where none failed or no phase is known."""
-        episodes = [[e for member in arm.members for e in member.result.episodes] for arm in self.comparison.arms]
-        if not any(e.phase_at_end and not e.success for arm in episodes for e in arm):
-            return ()
-        return phase_rows(episodes, self._first.task)
-
-    @property
-    def phases_note(self) -> str:
-        """Order of phases and bars."""
-        seeds = ", all training seeds together" if self._several else ""
-        return f"Failed episodes{seeds}, in the order of the task; the upper bar is {self.comparison.left.name}."
-
-    @cached_property
-    def curves(self) -> CurveCharts | None:
-        """Success against cost of the arms whose policies are all of runs; None without such an arm."""
-        arms = zip(self.comparison.arms, KINDS, strict=True)
-        series = tuple(arm_series(arm, kind) for arm, kind in arms if all(member.history for member in arm.members))
-        return CurveCharts(series) if series else None
+def _results(comparison: Comparison, first: EvalResult) -> Section:
+    bars = [_bar(arm, colour) for arm, colour in zip(comparison.arms, _COLOURS, strict=True)]
+    note = f"Both ran the same {first.success.n:,} test episodes.{_disturbed(first)}{_dots(len(bars[0].successes) > 1)}"
+    tables = filter(None, (comparison_table(comparison), condition_table(comparison)))
+    return Section("Results", figures=(rates_figure(bars),), tables=tuple(tables), notes=(note,))
 
 
-def _paired_fact(comparison: Comparison) -> str:
-    counts = ((pair.n, pair.both, pair.only_right, pair.only_left, pair.neither) for pair in comparison.pairs)
-    n, both, right, left, neither = map(sum, zip(*counts, strict=True))
-    over = f" of {len(comparison.pairs)} training seeds" if len(comparison.pairs) > 1 else ""
+def _failures(comparison: Comparison) -> list[Section]:
+    figures, first = paired_maps(comparison), comparison.left.members[0].test
+    every = [(arm.name, [*chain(*(one.test.episodes for one in arm.members))]) for arm in comparison.arms]
+    table = phase_table(every, first.task)
+    notes = [MAP_NOTE] if figures else []
+    if len(comparison.pairs) > 1:
+        notes.append("Over training seeds, an episode counts for the side that failed in more of them.")
+    if not figures and table is None:
+        return []
+    return [Section("Where they fail", figures=figures, tables=(table,) if table else (), notes=tuple(notes))]
+
+
+def paired_maps(comparison: Comparison) -> tuple[Figure, ...]:
+    """Draw test episodes by who failed in them: neither, both as often, or one side more often than the other."""
+    failed: Counter[int] = Counter()
+    for episode in chain(*(one.test.episodes for arm in comparison.arms for one in arm.members)):
+        failed[episode.seed] += not episode.success
+    episodes = comparison.left.members[0].test.episodes
     a, b = comparison.names
-    only = f"only {b} {right:,}, only {a} {left:,}"
-    return f"Of {n:,} paired episodes{over} both solved {both:,}, {only}, and neither {neither:,}."
+    margins = comparison.margins
+    return map_groups(
+        (
+            ("solved by both", BASELINE, [one for one in episodes if not failed[one.seed]]),
+            ("failed by both", "#5b636d", [one for one in episodes if failed[one.seed] and not margins[one.seed]]),
+            (f"failed by {a}", _COLOURS[0], [one for one in episodes if margins[one.seed] > 0]),
+            (f"failed by {b}", _COLOURS[1], [one for one in episodes if margins[one.seed] < 0]),
+        )
+    )
 
 
-def _cells(member: Member) -> tuple[str, ...]:
-    seed, one, costs = "" if member.training_seed is None else str(member.training_seed), member.chosen, ("",) * 5
-    if one is not None:
-        costs = (str(one.round), f"{one.labels:,}", f"{one.episodes:,}", format_seconds(one.seconds))
-        costs += (format_percent(one.validation.rate),)
-    return (member.name, seed, *costs, str(member.result.success))
+def study_report(study: Study, title: str, command: str, config: Mapping[str, Any] | None = None) -> Report:
+    """Return the report of a study."""
+    colours = arm_colours(study)
+    timings: dict[str, float] = {}
+    for arm in study.arms:
+        for member in arm.members:
+            last, name = member.history[-1], f"{arm.name}, training seed {member.training_seed}"
+            timings |= {f"{name}, collect and fit": last.seconds, f"{name}, validate": last.validating}
+    first = study.arms[0].members[0].test
+    same = "the same " if study.baseline is not None else ""
+    note = f"Every policy ran {same}{first.success.n:,} test episodes, on which nothing was chosen.{_disturbed(first)}"
+    results, *others = (Table(one.columns, one.rows, tuple(colours.values())) for one in study.tables())
+    bars = [_bar(arm, colours[arm.name]) for arm in study.arms]
+    return Report(
+        title=title,
+        verdict=study.verdict,
+        facts=tuple(study.facts),
+        command=command,
+        sections=(
+            Section(
+                "Results",
+                figures=(rates_figure(bars),),
+                tables=(results,),
+                notes=(note + _dots(len(study.training_seeds) > 1),),
+            ),
+            curve_section([_curve(arm, colours[arm.name]) for arm in study.arms], study.target, tuple(others)),
+        ),
+        config=config or {},
+        fingerprint=first.fingerprint,
+        timings=timings,
+    )
 
 
-def _outcomes(members: Sequence[Member]) -> dict[int, list[bool]]:
-    """Test seed -> success of each training seed."""
-    outcomes: defaultdict[int, list[bool]] = defaultdict(list)
-    for episode in (one for member in members for one in member.result.episodes):
-        outcomes[episode.seed].append(episode.success)
-    return outcomes
+def arm_colours(study: Study) -> dict[str, str]:
+    """Return arm -> its colour: the baseline grey, the others in order."""
+    others = [arm.name for arm in study.arms if arm.name != study.baseline]
+    found = {name: ARMS[place % len(ARMS)] for place, name in enumerate(others)}
+    return {arm.name: found.get(arm.name, BASELINE) for arm in study.arms}
+
+
+def _bar(arm: Arm, colour: str) -> Bar:
+    return Bar(arm.name, tuple(member.test.success for member in arm.members), colour)
+
+
+def _curve(arm: Arm, colour: str) -> Curve:
+    return Curve(arm.name, tuple(member.history for member in arm.members), colour)
+
+
+def _disturbed(result: EvalResult) -> str:
+    disturbance = result.settings.disturbance
+    return "" if disturbance == "none" else f" Disturbed: {disturbance}."
+
+
+def _dots(several: bool) -> str:
+    return " In brackets and as dots: each training seed; the bar is their mean." if several else ""

@@ -1,43 +1,24 @@
 """One episode of `eval.json`, and the settings that all its episodes share.
 
-Places, condition and drawn numbers are optional: files of older versions and of other tools may lack them, or hold
-something else under the same name, which is then ignored.
+Places and condition are optional: files of older versions and of other tools may lack them.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from manip_il import checks
-from manip_il.mdp import LONGEST_EPISODE
 from manip_il.sim.conditions import NOMINAL, Condition
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.sim.env import EnvConfig
+    from manip_il.sim.config import EnvConfig
 
 Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
-
-_KEYS = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")  # of every episode
-_HZ, _SUCCESS_STEPS = 20, 5  # of files without them
-_MOST_CONDITIONS = 100  # of a suite
-_UNITS = {
-    "knock": "m",
-    "knock_step": "steps",
-    "joint_noise": "rad",
-    "position_noise": "m",
-    "delay": "steps",
-    "mass": "kg",
-    "size": "m",
-    "camera_shift": "m",
-    "camera_turn": "deg",
-    "light_turn": "deg",
-}
-_COMPONENTS = {name: ("red", "green", "blue") for name in ("colour", "table")}  # of other vectors, the length counts
+# Of every episode, in the order of `EpisodeResult`.
+_KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,13 +39,13 @@ class EpisodeResult:
 
     @property
     def condition(self) -> str:
-        """The condition's name; empty where none is given."""
+        """The condition's name; empty if none is given."""
         name = self.detail.get("condition")
         return name if isinstance(name, str) else ""
 
     @property
     def start(self) -> Place | None:
-        """Start of the object, or of the hand where the task has no object [m]."""
+        """Start of the object, or of the hand if the task has no object [m]."""
         return self._moving_thing("start")
 
     @property
@@ -76,14 +57,6 @@ class EpisodeResult:
     def goal(self) -> Place | None:
         """Goal of the same [m]."""
         return _place(self.detail.get("goal"))
-
-    @property
-    def drawn_numbers(self) -> dict[str, float]:
-        """Every drawn number by its name and unit, `mass [kg]`: components of a colour, lengths of other vectors."""
-        drawn = self.detail.get("drawn")
-        given = drawn.items() if isinstance(drawn, Mapping) else ()
-        numbers = itertools.chain.from_iterable(_numbers(str(key), one, _UNITS.get(str(key))) for key, one in given)
-        return {name: value for name, value in numbers if math.isfinite(value)}
 
     def _moving_thing(self, when: Literal["start", "end"]) -> Place | None:
         places = self.detail.get(when)
@@ -97,30 +70,12 @@ class EpisodeResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
-        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
-        data = checks.mapping("an episode", data)
-        detail = {key: value for key, value in data.items() if key not in _KEYS}
-        if detail.get("steps_to_success") is not None:
-            checks.whole("steps_to_success", detail["steps_to_success"], 0, LONGEST_EPISODE)
-        if "condition" in detail:
-            checks.text("condition", detail["condition"], checks.LONGEST_NAME)
-        if "drawn" in detail:
-            checks.mapping("drawn", detail["drawn"])
-        return cls(
-            seed=checks.whole("seed", data["seed"], 0, checks.LARGEST_SEED),
-            success=checks.truth("success", data["success"]),
-            success_at_end=checks.truth("success_at_end", data.get("success_at_end", data["success"])),
-            steps=checks.whole("steps", data["steps"], 0, LONGEST_EPISODE),
-            ret=checks.number("return", data["return"]),
-            phase_at_end=checks.text("phase_at_end", data.get("phase_at_end", ""), checks.LONGEST_NAME),
-            detail=detail,
-        )
-
-
-def moving_thing(episodes: Sequence[EpisodeResult]) -> Literal["object", "hand"]:
-    """Return what is to reach the goal: the hand where episodes have starts, but none of an object."""
-    starts = [start for one in episodes if isinstance(start := one.detail.get("start"), Mapping)]
-    return "object" if not starts or any(_place(start.get("object")) is not None for start in starts) else "hand"
+        """Return the inverse of `to_json`; `KeyError` or `TypeError` if a value is missing or of another kind."""
+        known = {"success_at_end": data["success"], "phase_at_end": ""} | {
+            key: data[key] for key in data if key in _KEYS
+        }
+        values: list[Any] = [convert(known[key]) for key, convert in _KEYS.items()]
+        return cls(*values, detail={key: value for key, value in data.items() if key not in _KEYS})
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,14 +84,14 @@ class EvalSettings:
 
     horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
     of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
-    where it goes on to the horizon. object: shape and size of what is grasped, reward: of `carry`, empty for the
-    task's own.
+    if it goes on to the horizon. object: shape and size of what is grasped, reward: of `carry`, empty for the task's
+    own.
     """
 
     horizon: int
     tolerance: float
-    control_hz: int = _HZ
-    success_steps: int = _SUCCESS_STEPS
+    control_hz: int = 20  # and five steps, in files without them
+    success_steps: int = 5
     suite: str = NOMINAL.name
     conditions: tuple[Condition, ...] = (NOMINAL,)
     hold: int | None = None
@@ -152,22 +107,15 @@ class EvalSettings:
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """Return the environment that was evaluated in."""
-        from manip_il.sim.env import EnvConfig  # here, as reading results needs no simulator
+        from manip_il.sim.config import EnvConfig
 
         limits = self.tolerance, self.success_steps, self.horizon
         return EnvConfig(robot, task, self.control_hz, *limits, self.object, self.reward)
 
     @property
     def disturbance(self) -> str:
-        """The conditions in words, `none` where all are nominal."""
+        """The conditions in words, `none` if all are nominal."""
         return "; ".join(map(str, self.conditions)) if any(one.ranges for one in self.conditions) else "none"
-
-    def __str__(self) -> str:
-        rate = f"{self.control_hz} Hz, {self.success_steps} steps in a row"
-        ends = "" if self.hold is None else f", ended {self.hold} steps after success"
-        shape = f", object {self.object}" if self.object else ""
-        reward = f", reward {self.reward}" if self.reward else ""
-        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}{shape}{reward}"
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -178,47 +126,16 @@ class EvalSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
-        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
-        data = checks.mapping("settings", data)
-        given = checks.array("conditions", data.get("conditions", [NOMINAL.to_json()]), _MOST_CONDITIONS)
-        named = [checks.mapping("a condition", one) for one in given]
-        ranges = [{key: value for key, value in one.items() if key != "name"} for one in named]
-        steps = data.get("success_steps", _SUCCESS_STEPS)
-        return cls(
-            horizon=checks.whole("horizon", data["horizon"], 1, LONGEST_EPISODE),
-            tolerance=checks.number("tolerance", data["tolerance"], 0, 1),
-            control_hz=checks.whole("control_hz", data.get("control_hz", _HZ), 1, 1_000),
-            success_steps=checks.whole("success_steps", steps, 1, LONGEST_EPISODE),
-            suite=checks.text("suite", data.get("suite", NOMINAL.name)),
-            conditions=tuple(Condition.from_mapping(one["name"], own) for one, own in zip(named, ranges, strict=True)),
-            hold=None if data.get("hold") is None else checks.whole("hold", data["hold"], 0, LONGEST_EPISODE),
-            object=checks.text("object", data.get("object", ""), checks.LONGEST_NAME),
-            reward=checks.text("reward", data.get("reward", "")),
-        )
-
-
-def _numbers(name: str, given: Any, unit: str | None) -> Iterator[tuple[str, float]]:
-    if isinstance(given, Mapping):  # one value a camera
-        for key, value in given.items():
-            yield from _numbers(f"{name} {key}", value, unit)
-    elif _is_number(given):
-        yield name + (f" [{unit}]" if unit else ""), float(given)
-    elif isinstance(given, Sequence) and not isinstance(given, str) and given and all(map(_is_number, given)):
-        components = _COMPONENTS.get(name, ())
-        if len(components) == len(given):
-            yield from ((f"{name}, {part}", float(value)) for part, value in zip(components, given, strict=True))
-        else:
-            yield name + (f" [{unit}]" if unit else ", length"), math.hypot(*given)
+        """Return the inverse of `to_json`; raises as `EpisodeResult.from_json`. Other keys are ignored."""
+        known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
+        named = [dict(one) for one in known.pop("conditions", [NOMINAL.to_json()])]
+        return cls(**known, conditions=tuple(Condition.from_mapping(one.pop("name"), one) for one in named))
 
 
 def _place(given: Any) -> Place | None:
-    if not isinstance(given, Sequence) or isinstance(given, str) or len(given) != 3:
+    if not isinstance(given, list | tuple) or len(given) != 3:
         return None
-    if not all(_is_number(value) and math.isfinite(value) for value in given):
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in given):
         return None
-    x, y, z = given
-    return float(x), float(y), float(z)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    x, y, z = map(float, given)
+    return x, y, z

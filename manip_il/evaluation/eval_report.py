@@ -1,174 +1,119 @@
-"""`report.html` of one evaluation: success, where it fails, films, and what made it."""
+"""`report.html` of one evaluation, and of a run's policies beside each other."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from manip_il.evaluation.failures import (
-    Factor,
-    PhaseRow,
+    MAX_MARKS,
     evaluation_facts,
     evaluation_verdict,
-    factor_table,
-    find_factors,
-    phase_rows,
+    failure_maps,
+    phase_table,
 )
-from manip_il.evaluation.maps import FailureMap, Outcome, failure_map
-from manip_il.evaluation.report import Bar, Report
-from manip_il.evaluation.report_data import Film, LearningCurve, Paths
+from manip_il.evaluation.figures import Bar, Curve, rates_figure
+from manip_il.evaluation.report import Film, Report, Section, curve_section
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.tables import NO_CONDITION, Table, evaluation_table
+from manip_il.evaluation.tables import BASELINE, DAGGER, NO_CONDITION, PolicyRow, Table, evaluation_table, policy_table
 from manip_il.sim.conditions import words
 
-AXES_NOTE = "x leads away from the robot, y to its left"
+MAP_NOTE = (
+    "Circles: starts, squares: goals, crosses: where failed episodes ended. "
+    f"Of each outcome {MAX_MARKS} episodes are drawn at most."
+)
 
 
 def eval_report(
     result: EvalResult,
     command: str,
     config: Mapping[str, Any] | None = None,
-    films: tuple[Film, ...] = (),
-    paths: tuple[Paths, ...] = (),
-    pictures_note: str = "",
-    curve: LearningCurve | None = None,
-) -> EvalReport:
-    """Return the report of an evaluation. curve: of the run that the policy is of."""
-    factors = find_factors(result)
-    return EvalReport(
+    films: Mapping[bool, Sequence[Film]] | None = None,
+    no_films: str = "",
+    curve: Curve | None = None,
+) -> Report:
+    """Return the report of an evaluation.
+
+    films: of failures (False) and successes (True). no_films: why there are none. curve: of the run of the policy.
+    """
+    sections = [_results(result), *([curve_section([curve])] if curve else []), *_failures(result)]
+    return Report(
         title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
         verdict=evaluation_verdict(result),
-        facts=evaluation_facts(result, factors),
+        facts=evaluation_facts(result),
         command=command,
+        sections=(*sections, *film_sections(films or {}, no_films)),
         config=config or {},
         fingerprint=result.fingerprint,
-        films=films,
-        paths=paths,
-        pictures_note=pictures_note,
-        result=result,
-        factors=factors,
-        curve=curve,
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvalReport(Report):
-    """The report of one evaluation, made by `eval_report`."""
+def run_report(
+    rows: Sequence[PolicyRow],
+    films: Sequence[Film] = (),
+    no_films: str = "",
+    curves: Sequence[Curve] = (),
+    **parts: Any,
+) -> Report:
+    """Return the report of policies of a run, one a row. parts: title, verdict and the like, see `Report`."""
+    sizes = sorted({row.success.n for row in rows})
+    episodes = " to ".join(f"{size:,}" for size in dict.fromkeys((sizes[0], sizes[-1])))
+    note = f"Each policy ran {episodes} episodes. Intervals are Wilson's score intervals."
+    if disturbed := next((row.disturbed for row in rows if row.disturbed), None):
+        note += f" Disturbed: {disturbed.settings.disturbance}."
+    bars = [Bar(row.name, (row.success,), row.colour) for row in rows]
+    results = Section("Results", figures=(rates_figure(bars),), tables=(policy_table(rows),), notes=(note,))
+    curve = [curve_section(curves)] if curves else []
+    looks = [Section("How it looks", lead=_no_films(no_films), films=tuple(films))] if films or no_films else []
+    return Report(sections=(results, *curve, *looks), **parts)
 
-    template: ClassVar[str] = "eval.html.j2"
-    result: EvalResult
-    factors: tuple[Factor, ...]
 
-    @property
-    def table(self) -> Table:
-        """All episodes, then each condition, in numbers."""
-        table = evaluation_table(self.result)
-        if len(table.rows) == 1:
-            return replace(table, kinds=("dagger",))
+def film_sections(films: Mapping[bool, Sequence[Film]], no_films: str) -> list[Section]:
+    """Return the films of failures, which are what one can act on, before those of successes."""
+    found = [(name, films[good]) for good, name in ((False, "Failures"), (True, "Successes")) if films.get(good)]
+    if not found:
+        return [Section("How it looks", lead=_no_films(no_films))] if no_films else []
+    parts = [Section(name, films=tuple(some), under=True) for name, some in found]
+    return [Section("How it looks"), *parts]
+
+
+def _no_films(why: str) -> tuple[str, ...]:
+    return (f"No films: {why}",) if why else ()
+
+
+def _results(result: EvalResult) -> Section:
+    settings, parts = result.settings, result.by_condition
+    table = evaluation_table(result)
+    if len(parts) > 1:
         (_, *total), *rows = table.rows
-        rows = (("all conditions", *total), *((row[0].strip(), *row[1:]) for row in rows))
-        return Table(("condition", *table.columns[1:]), rows, ("baseline", *["dagger"] * (len(rows) - 1)))
+        named = (("all conditions", *total), *((row[0].strip(), *row[1:]) for row in rows))
+        table = Table(("condition", *table.columns[1:]), named, (BASELINE, *[DAGGER] * len(rows)))
+        bars = [Bar(name or NO_CONDITION, (part.success,)) for name, part in parts.items()]
+        bars.insert(0, Bar("all conditions", (result.success,), BASELINE))
+    else:
+        table, bars = replace(table, colours=(DAGGER,)), [Bar(result.policy, (result.success,))]
+    ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
+    intervals = "Intervals are Wilson's score intervals."
+    if result.until_width is not None:
+        intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
+    note = (
+        f"{result.success.n:,} episodes of at most {settings.horizon:,} control steps. Success: an error of at most "
+        f"{100 * settings.tolerance:g} cm for {settings.success_steps} control steps in a row{ends}. {intervals}"
+    )
+    drawn = {
+        one.name: ", ".join(f"{name} {words(range_)}" for name, range_ in one.ranges.items()) or "nothing"
+        for one in settings.conditions
+    }
+    ranges = {"What the conditions draw": drawn} if any(one.ranges for one in settings.conditions) else {}
+    return Section("Results", figures=(rates_figure(bars),), tables=(table,), notes=(note,), named=ranges)
 
-    @cached_property
-    def bars(self) -> list[Bar]:
-        """The same success."""
-        parts = self.result.by_condition
-        if len(parts) == 1:
-            return [Bar.of(self.result.policy, "dagger", self.result.success)]
-        bars = [Bar.of(name or NO_CONDITION, "dagger", part.success) for name, part in parts.items()]
-        return [Bar.of("all conditions", "baseline", self.result.success), *bars]
 
-    @property
-    def note(self) -> str:
-        """Number of episodes, meaning of success, method of the intervals."""
-        settings, parts = self.result.settings, self.result.by_condition
-        sizes = sorted({part.success.n for part in parts.values()})
-        each = f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"
-        apart = f", {each} in each condition" if len(parts) > 1 else ""
-        ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
-        intervals = "Intervals are Wilson's score intervals."
-        if self.result.until_width is not None:
-            intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
-        return (
-            f"{self.result.success.n:,} episodes of at most {settings.horizon:,} control steps{apart}. "
-            f"Success means an error of at most {100 * settings.tolerance:g} cm for {settings.success_steps} "
-            f"control steps in a row{ends}. {intervals}"
-        )
-
-    @property
-    def ranges(self) -> dict[str, str]:
-        """Condition -> the numbers it draws and their ranges; empty where none draws any."""
-        drawn = {
-            one.name: ", ".join(f"{name} {words(range_)}" for name, range_ in one.ranges.items())
-            for one in self.result.settings.conditions
-        }
-        return {name: words or "nothing" for name, words in drawn.items()} if any(drawn.values()) else {}
-
-    @property
-    def failed(self) -> int:
-        """Number of failed episodes."""
-        return self.result.success.n - self.result.success.successes
-
-    @cached_property
-    def map(self) -> FailureMap | None:
-        """Starts and goals; None where no episode has them."""
-        return failure_map(self.result)
-
-    @property
-    def map_names(self) -> dict[Outcome, str]:
-        """Outcomes in words."""
-        assert self.map is not None
-        solved = f"solved: {self.map.moving}'s start (circle) and goal (square)"
-        return {"solved": solved, "failed": "failed: from start to goal"}
-
-    @property
-    def map_note(self) -> str:
-        """Number of episodes in the map, and its axes."""
-        assert self.map is not None
-        solved = len(self.map.marks) - self.map.failed
-        return (
-            f"{self.failed:,} failed and {solved:,} solved episodes by where the {self.map.moving} started and was to "
-            f"go. {AXES_NOTE}; z is the height above the table. {self.map.thinning_note}"
-        )
-
-    @cached_property
-    def phases(self) -> tuple[PhaseRow, ...]:
-        """Failed episodes by phase; empty where none failed or no phase is known."""
-        return phase_rows([self.result.episodes], self.result.task) if any(self.result.failures) else ()
-
-    @property
-    def phases_note(self) -> str:
-        """Meaning of the phases."""
-        count = "The one failed episode" if self.failed == 1 else f"The {self.failed:,} failed episodes"
-        return f"{count} by the phase of the task that the expert assigned to the last state, in task order."
-
-    @cached_property
-    def significant(self) -> Table:
-        """Factors that failures are associated with."""
-        return factor_table([factor for factor in self.factors if factor.significant])
-
-    @cached_property
-    def insignificant(self) -> Table:
-        """The other factors."""
-        return factor_table([factor for factor in self.factors if not factor.significant])
-
-    @property
-    def no_factor(self) -> str:
-        """Sentence in place of a table without rows."""
-        if len(self.factors) == 1:
-            return f"Failures are not associated with {self.factors[0].name} beyond chance."
-        return f"Failures are associated with none of the {len(self.factors)} numbers that varied, beyond chance."
-
-    @property
-    def factors_note(self) -> str:
-        """Meaning of the table's numbers."""
-        confidence = f"{100 * self.result.confidence:g} %"
-        count = f"{len(self.factors)} that varied" if len(self.factors) > 1 else "one that varied"
-        return (
-            f"Success with its {confidence} interval (Wilson) in thirds of the episodes by start, goal and what was "
-            "drawn; under it, the values of that third; equal values stay together. p: Fisher's exact test of all "
-            f"three, corrected (Holm) for the {count}. An association with a number does not show that it causes the "
-            "failures."
-        )
+def _failures(result: EvalResult) -> list[Section]:
+    failed = result.success.n - result.success.successes
+    lead = () if failed else (f"No failure in {result.success.n:,} episodes.",)
+    figures, table = failure_maps(result), phase_table([("failed episodes", result.episodes)], result.task)
+    if not figures and table is None and failed:
+        return []
+    notes = (MAP_NOTE,) if figures else ()
+    return [Section("Where it fails", lead, figures=figures, tables=(table,) if table else (), notes=notes)]

@@ -1,18 +1,34 @@
-"""Figures of reports that are more than bars and curves, drawn by matplotlib as SVG in the colours of `report.css`."""
+"""Figures of reports, drawn by matplotlib as SVG: success rates, learning curves, and where episodes fail.
+
+A panel is as wide as a phone, so that its words stay readable there; wide windows show panels side by side.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from statistics import fmean
+from typing import Any, Literal
 
-from manip_il.evaluation.report import Report
-from manip_il.evaluation.tables import Table
+import numpy as np
 
-DAGGER, CLONING, EXPERT, SOFT, RULE = "#0072b2", "#d55e00", "#00835f", "#5b636d", "#e3e5e8"
+from manip_il.errors import ManipError
+from manip_il.evaluation.episodes import Place
+from manip_il.evaluation.intervals import CONFIDENCE, Proportion, format_percent
+from manip_il.evaluation.rounds import COSTS, Cost, History, has_unqueried_steps
+from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
+
+INK, SOFT, RULE = "#1d2126", "#5b636d", "#e3e5e8"
 ARMS = (DAGGER, CLONING, EXPERT, "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
+_MARKERS = "osD^"  # told apart without colour
+_PANEL = (4.4, 3.0)  # of a figure that stands beside others [inches]
+_NAME = 20  # characters of a bar's name in a line
+_LOG_SPAN = 20  # amounts that differ by this factor or more are shown on a logarithmic axis
+_DPI = 96
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same with whatever fonts a machine has
     "svg.hashsalt": "manip_il",  # the same figure is the same bytes
@@ -36,30 +52,11 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture of a report. svg: its file; words: what it shows, for who cannot see it."""
+    """A picture of a report. svg: its file; words: what it shows, for who cannot see it; width: its own [px]."""
 
     svg: bytes
     words: str
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of a report. Empty parts are left out. formulas: one a line; notes: paragraphs under the table."""
-
-    heading: str
-    lead: tuple[str, ...] = ()
-    formulas: tuple[str, ...] = ()
-    figures: tuple[Figure, ...] = ()
-    tables: tuple[Table, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class SectionsReport(Report):
-    """A report of sections, each of words, formulas, figures and tables."""
-
-    template: ClassVar[str] = "sections.html.j2"
-    sections: tuple[Section, ...]
+    width: int = 0
 
 
 @contextmanager
@@ -87,4 +84,177 @@ def to_figure(drawn: Any, words: str) -> Figure:
     """Return a drawn figure as a part of a report; call it while `drawing` is open."""
     content = io.BytesIO()
     drawn.savefig(content, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
-    return Figure(content.getvalue(), words)
+    return Figure(content.getvalue(), words, round(_DPI * drawn.get_figwidth()))
+
+
+def plain(text: str) -> str:
+    """Return text in which matplotlib sees no mathematics, and finds a glyph for every character."""
+    return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
+
+
+def plain_lines(name: str) -> str:
+    """Return a name as `plain` text in at most three short lines, broken at blanks and slashes."""
+    lines = textwrap.wrap(name.replace("/", "/ "), _NAME)
+    return "\n".join(plain(line.replace("/ ", "/")) for line in lines[-3:])
+
+
+@dataclass(frozen=True)
+class Bar:
+    """Success rates of one thing: one with its interval, or those of training seeds, of which the bar is the mean."""
+
+    name: str
+    successes: tuple[Proportion, ...]
+    colour: str = DAGGER
+
+
+def rates_figure(bars: Sequence[Bar]) -> Figure:
+    """Draw success rates as bars from 0 to 100 %, with intervals, or with a dot for each training seed."""
+    names = [plain_lines(bar.name) for bar in bars]
+    height = 0.55 + sum(0.24 + 0.14 * (1 + name.count("\n")) for name in names)
+    with drawing(1, size=(4.4, height)) as (drawn, axes):
+        axis = axes[0, 0]
+        for place, bar in enumerate(bars):
+            rates = [100 * one.rate for one in bar.successes]
+            mean = fmean(rates)
+            axis.barh(place, mean, 0.62, color=bar.colour)
+            if len(rates) == 1:
+                low, high = (100 * end for end in bar.successes[0].interval)
+                error = [[max(0.0, mean - low)], [max(0.0, high - mean)]]
+                for width, colour in ((4.0, "white"), (1.4, INK)):  # the pale one parts the dark one from the bar
+                    axis.errorbar(mean, place, xerr=error, color=colour, lw=width, capsize=3, capthick=width)
+            else:
+                axis.plot(rates, [place] * len(rates), "o", mfc="white", mec=INK, ms=5)
+            axis.text(103, place, format_percent(mean / 100), va="center", weight="bold", color=INK)
+        axis.set_yticks(range(len(bars)), names, color=INK)
+        axis.set_xticks((0, 50, 100), ("0 %", "50 %", "100 %"))
+        axis.set(xlim=(0, 122), ylim=(len(bars) - 0.45, -0.55))
+        axis.grid(visible=False, axis="y")
+        axis.tick_params(length=0)
+        axis.spines[["left", "bottom"]].set_visible(False)
+        return to_figure(drawn, "; ".join(f"{bar.name}: {', '.join(map(str, bar.successes))}" for bar in bars))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Validation success by round of one arm, a run for each training seed. costs: those that its rounds know."""
+
+    name: str
+    runs: tuple[History, ...]
+    colour: str = DAGGER
+    costs: tuple[Cost, ...] = COSTS
+
+    def __post_init__(self) -> None:
+        if not self.runs or not all(self.runs):
+            raise ManipError(f"learning curve of {self.name!r} has a training seed without a round, or none at all")
+
+
+_UNITS = ((3 * 3600.0, 3600.0, "h"), (300.0, 60.0, "min"), (0.0, 1.0, "s"))  # from so many seconds on; in seconds
+
+
+def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple[Figure, ...]:
+    """Draw success over every cost that is known, a figure each. target: drawn as a level, in [0, 1].
+
+    Steps are left out if the expert was queried in each of them, as they are labels then.
+    """
+    rounds = [one for curve in curves for run in curve.runs for one in run]
+    lowest = min([one.validation.interval[0] for one in rounds] + ([] if target is None else [target]))
+    floor = math.floor(10 * lowest) * 10 if lowest > 0.5 else 0  # unlike bars, points may start above 0
+    queried = not any(has_unqueried_steps(run) for curve in curves for run in curve.runs)
+    figures: list[Figure] = []
+    for cost in COSTS:
+        if not any(cost in curve.costs for curve in curves) or (cost == "steps" and queried):
+            continue
+        shown = [curve for curve in curves if cost in curve.costs]
+        with drawing(1, size=_PANEL) as (drawn, axes):
+            _draw_curves(axes[0, 0], shown, cost, floor, target)
+            if len(curves) > 1 or target is not None:
+                drawn.legend(loc="outside upper left", ncols=2)
+            figures.append(to_figure(drawn, f"Validation success over {cost}: {', '.join(one.name for one in shown)}"))
+    return tuple(figures)
+
+
+def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, target: float | None) -> None:
+    amounts = [one.amount(cost) for curve in curves for run in curve.runs for one in run]
+    unit, name = 1.0, {"labels": "expert labels", "steps": "simulated steps"}.get(cost, cost)
+    if cost == "seconds":
+        _, unit, short = next(one for one in _UNITS if max(amounts) >= one[0])
+        name = f"wall-clock [{short}]"
+    for place, curve in enumerate(curves):
+        style: dict[str, Any] = {
+            "color": curve.colour,
+            "marker": _MARKERS[place % len(_MARKERS)],
+            "zorder": 3 + len(curves) - place,
+        }
+        lines = [
+            ([one.amount(cost) / unit for one in run], [100 * one.validation.rate for one in run]) for run in curve.runs
+        ]
+        label = plain(textwrap.shorten(curve.name, 40))
+        if len(lines) == 1:
+            [(x, y)], [run] = lines, curve.runs
+            ends = [[100 * abs(one.validation.rate - one.validation.interval[side]) for one in run] for side in (0, 1)]
+            axis.errorbar(x, y, yerr=ends, capsize=3, ms=5, lw=1.6, label=label, **style)
+            continue
+        for x, y in lines:
+            axis.plot(x, y, color=curve.colour, lw=0.9, alpha=0.4)
+        # Only rounds that every seed has: else the mean would jump where a seed ends.
+        xs, ys = ([*map(fmean, zip(*part, strict=False))] for part in zip(*lines, strict=True))
+        axis.plot(xs, ys, lw=1.8, ms=5, label=label, **style)
+    if target is not None:
+        axis.axhline(100 * target, color=INK, ls="--", lw=1, label=f"target, {format_percent(target)}")
+    if min(amounts) > 0 and max(amounts) / min(amounts) >= _LOG_SPAN:
+        axis.set_xscale("log")
+        name += ", logarithmic"
+    axis.set(xlabel=name, ylim=(floor - 2, 102), ylabel="validation success [%]")
+
+
+def curve_note(curves: Sequence[Curve]) -> str:
+    """Return what the marks of `curve_figures` mean."""
+    if any(len(curve.runs) > 1 for curve in curves):
+        note = "Validation success by round, the mean over training seeds; thin lines are the seeds."
+    else:
+        note = f"Validation success by round; bars are {100 * CONFIDENCE:g} % intervals."
+    return f"{note} Wall-clock is collecting and fitting, without validating."
+
+
+@dataclass(frozen=True)
+class MapGroup:
+    """Episodes of one outcome on a map: (start, goal, end) of what is to reach the goal [m]; end None if not known."""
+
+    name: str
+    colour: str
+    places: tuple[tuple[Place, Place, Place | None], ...]
+    joined: bool = True  # start and goal by a line
+
+
+def map_figures(groups: Sequence[MapGroup]) -> tuple[Figure, ...]:
+    """Draw starts as circles, goals as squares, and ends as crosses, from above and from the side."""
+    return tuple(_map_figure(groups, view) for view in ("above", "the side"))
+
+
+def _map_figure(groups: Sequence[MapGroup], view: Literal["above", "the side"]) -> Figure:
+    up = 1 if view == "above" else 2
+    places = np.array([place for group in groups for one in group.places for place in one[:2]])[:, [0, up]]
+    middle, half = (places.max(axis=0) + places.min(axis=0)) / 2, 0.55 * float(np.ptp(places, axis=0).max()) + 0.01
+    with drawing(1, size=(_PANEL[0], 4.6)) as (drawn, axes):
+        axis = axes[0, 0]
+        for group in groups:
+            many, alpha = len(group.places) > 80, 1.0 if group.joined else 0.5
+            starts = [(start[0], start[up]) for start, *_ in group.places]
+            goals = [(goal[0], goal[up]) for _, goal, _ in group.places]
+            ends = [(end[0], end[up]) for *_, end in group.places if end is not None]
+            if group.joined:
+                joins = np.array([(a, b, (np.nan, np.nan)) for a, b in zip(starts, goals, strict=True)])
+                axis.plot(*joins.reshape(-1, 2).T, color=group.colour, lw=0.7, alpha=0.25 if many else 0.5)
+            style = {"color": group.colour, "alpha": alpha, "ls": "", "ms": 3 if many else 4.5}
+            fill = "full" if group.joined else "none"
+            axis.plot(*zip(*starts, strict=True), marker="o", fillstyle=fill, label=plain(group.name), **style)
+            axis.plot(*zip(*goals, strict=True), marker="s", fillstyle=fill, **style)
+            if ends:
+                axis.plot(*zip(*ends, strict=True), "x", color=INK, ms=4, mew=0.9, alpha=0.6)
+        # Where it is, however far an object rolled away.
+        axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
+        axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]" if up == 1 else "z, height [m]")
+        axis.set_title(f"seen from {view}", loc="left")
+        drawn.legend(loc="outside lower left")
+        counts = ", ".join(f"{len(group.places)} {group.name}" for group in groups)
+        return to_figure(drawn, f"Starts and goals seen from {view}: {counts}")

@@ -1,11 +1,12 @@
-"""Pictures of an episode from its recorded states: films, strips, and paths for machines without OpenGL."""
+"""Films of episodes, from their recorded states."""
 
 from __future__ import annotations
 
 import io
+import logging
 import tempfile
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal
@@ -19,15 +20,21 @@ from PIL import Image
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.collect.edits import render_states
 from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import ManipError
-from manip_il.evaluation.report_data import Film, Paths
+from manip_il.data.atomic import write_file
+from manip_il.errors import ManipError, RenderError
+from manip_il.evaluation.report import Film, Still
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.trial import Progress
 from manip_il.mdp import Episode
+from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.config import FILM, CameraConfig
-from manip_il.sim.env import EnvConfig
 
 AFTER_SUCCESS = 1.0  # filmed after the task is solved [s]
+FILM_EVERY = 2  # control steps a frame of film
+_SIZE = (240, 320)  # height and width [pixels]
+_LOG = logging.getLogger(__name__)
 Frames = Sequence[NDArray[np.uint8]]
 
 
@@ -36,20 +43,69 @@ def run_states(job: RolloutJob, seed: int) -> Episode:
     return next(replace(job, label="last").run([seed]))
 
 
-def film(
-    episode: Episode,
-    env_config: EnvConfig,
-    camera: str = "front",
-    size: tuple[int, int] = (240, 320),
-    every: int = 1,
-) -> list[NDArray[np.uint8]]:
-    """Return one picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
+@dataclass(frozen=True)
+class Shot:
+    """One episode to film. title, caption: beside the film. stills: number of its frames shown as pictures, too."""
 
-    Raises `RenderError` without off-screen OpenGL, `UnknownName` for the camera.
+    job: RolloutJob
+    episode: Episode
+    title: str
+    caption: str = ""
+    stills: int = 0
+
+    @classmethod
+    def of(cls, job: RolloutJob, episode: Episode) -> Shot:
+        """Show an episode with its seed, and the condition if not nominal: `Seed 4000000, knocked`."""
+        condition = draw(job.conditions or (NOMINAL,), episode.seed).condition
+        return cls(job, episode, f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}"))
+
+    def film(self) -> Film:
+        """Return the film, whose poster is its last frame; `RenderError` without off-screen OpenGL."""
+        env, fps = self.job.env, self.job.env.control_hz // FILM_EVERY or 1
+        states = self.episode.columns[schema.SIM_STATE][: filmed_steps(self.episode, env.control_hz) : FILM_EVERY]
+        pictures = render_states(env, CameraConfig(("front",), *_SIZE, FILM), states)
+        frames = list(pictures[schema.IMAGES + "front"])
+        chosen = np.unique(np.linspace(0, len(frames) - 1, self.stills).round().astype(int)) if self.stills else []
+        stills = tuple(Still(f"{one / fps:.1f} s", encode_picture(frames[one], "jpeg")) for one in chosen)
+        return Film(self.title, encode_mp4(frames, fps), self.caption, encode_picture(frames[-1], "jpeg"), stills)
+
+
+def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], str]:
+    """Return every episode as a film; none without OpenGL, and why, which is logged, too."""
+    films: list[Film] = []
+    try:
+        for shot in shots:
+            films.append(shot.film())
+            progress.step()
+    except RenderError as error:
+        _LOG.warning("the report has no films: %s", error)
+        return [], str(error)
+    finally:
+        progress.close()
+    return films, ""
+
+
+def film_outcomes(
+    engine: Engine, job: RolloutJob, result: EvalResult, most: int, folder: Path, progress: Progress
+) -> tuple[dict[bool, list[Film]], str]:
+    """Run up to `most` failures (False) and successes (True) of an evaluation again and film them, into `folder`, too.
+
+    Returns what `film_shots` does, by outcome.
     """
-    states = episode.columns[schema.SIM_STATE][: filmed_steps(episode, env_config.control_hz) : every]
-    pictures = render_states(env_config, CameraConfig((camera,), *size, FILM), states)
-    return list(pictures[schema.IMAGES + camera])
+    outcomes = {good: [one.seed for one in result.episodes if one.success == good][:most] for good in (False, True)}
+    seeds = [seed for found in outcomes.values() for seed in found]
+    if not seeds:
+        return {}, ""
+    progress.start("films", len(seeds))
+    episodes = {episode.seed: episode for episode in engine.run(job, seeds)}
+    films, why = film_shots([Shot.of(job, episodes[seed]) for seed in seeds], progress)
+    found: dict[bool, list[Film]] = {False: [], True: []}
+    for film, seed in zip(films, seeds, strict=False):  # no films without OpenGL
+        good = episodes[seed].success
+        found[good].append(film)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(folder / f"seed_{seed}_{'success' if good else 'failure'}.mp4", film.mp4)
+    return found, why
 
 
 def filmed_steps(episode: Episode, fps: int) -> int:
@@ -58,11 +114,6 @@ def filmed_steps(episode: Episode, fps: int) -> int:
     if not solved.any():
         return len(episode)
     return min(len(episode), int(np.argmax(solved)) + 1 + round(AFTER_SUCCESS * fps))
-
-
-def make_film(policy: str, frames: Frames, fps: int, caption: str = "", success: bool | None = None) -> Film:
-    """Return pictures (height, width, 3) as a film; its poster is the last one."""
-    return Film(policy, encode_mp4(frames, fps), caption, success, encode_picture(frames[-1], "jpeg"))
 
 
 def encode_mp4(frames: Frames, fps: int) -> bytes:
@@ -86,33 +137,8 @@ def encode_mp4(frames: Frames, fps: int) -> bytes:
         return path.read_bytes()
 
 
-def pictures_of(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes], ...]:
-    """Return `count` frames, evenly apart, the first and the last among them: (time [s], PNG)."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    return tuple((index / fps, encode_picture(frames[index], "png")) for index in chosen.tolist())
-
-
 def encode_picture(picture: NDArray[np.uint8], kind: Literal["png", "jpeg"]) -> bytes:
     """Return one picture (height, width, 3) as a file; JPEG has a fifth of the size of PNG."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format=kind, optimize=True, **({"quality": 85} if kind == "jpeg" else {}))
     return buffer.getvalue()
-
-
-def paths(episode: Episode, spec: RobotTaskSpec, policy: str, caption: str = "") -> Paths:
-    """Return positions of hand, object and goal, which not every task has; needs no OpenGL.
-
-    Of several objects the one that moves most; the hand again where there is none.
-    """
-    rows = episode.columns[schema.ENVIRONMENT_STATE][: filmed_steps(episode, spec.fps)].astype(np.float64)
-    names = list(spec.environment_state_names)
-
-    def positions(thing: str) -> NDArray[np.float64]:
-        return rows[:, [names.index(f"{thing}.{axis}") for axis in "xyz"]]
-
-    hand = positions("ee")
-    places = [name.removesuffix(".x") for name in names if name.endswith(".x") and "_from_" not in name]
-    things = [name for name in places if "." not in name and name not in ("ee", "goal") and f"{name}.z" in names]
-    obj = max(map(positions, things), key=lambda rows: float(np.ptp(rows, axis=0).sum()), default=hand)
-    goal = positions("goal")[-1] if "goal" in places else None
-    return Paths(policy, hand, obj, goal, 1 / spec.fps, caption)

@@ -1,15 +1,19 @@
-"""Confidence intervals of a success rate and of a mean over training seeds; standard library only."""
+"""Confidence intervals: of a success rate, of a paired difference of two, and of a mean over training seeds."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist, fmean, stdev
+from typing import cast
+
+import numpy as np
+from scipy import optimize, special, stats
 
 from manip_il.errors import UsageError
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of every interval, and one minus the level of every test
+_EDGE = 1e-12  # as near to 0 and 1 as a rate's likelihood is computed
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,17 +25,15 @@ class Proportion:
 
     successes: int
     n: int
-    confidence: float = CONFIDENCE
     sequential: bool = False
 
     def __post_init__(self) -> None:
         require_counts(self.successes, self.n)
-        require_confidence(self.confidence)
 
     @classmethod
-    def of(cls, outcomes: Sequence[bool], confidence: float = CONFIDENCE, sequential: bool = False) -> Proportion:
+    def of(cls, outcomes: Sequence[bool], sequential: bool = False) -> Proportion:
         """Return the proportion of true values."""
-        return cls(sum(map(bool, outcomes)), len(outcomes), confidence, sequential)
+        return cls(sum(map(bool, outcomes)), len(outcomes), sequential)
 
     @property
     def rate(self) -> float:
@@ -41,8 +43,7 @@ class Proportion:
     @property
     def interval(self) -> tuple[float, float]:
         """Wilson's (low, high), or that of a confidence sequence."""
-        method = confidence_sequence if self.sequential else wilson_interval
-        return method(self.successes, self.n, self.confidence)
+        return (confidence_sequence if self.sequential else wilson_interval)(self.successes, self.n)
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -54,50 +55,67 @@ def format_percent(rate: float) -> str:
     return f"{100 * rate:.1f} %"
 
 
-def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the score interval (low, high) of a binomial proportion, inside [0, 1].
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """Return the score interval (low, high) of a binomial proportion; `UsageError` for impossible counts.
 
-    Wilson (1927), J. Am. Stat. Assoc. 22, 209-212. Raises `UsageError` unless 0 <= successes <= n and n >= 1.
+    Wilson (1927), J. Am. Stat. Assoc. 22, 209-212.
     """
     require_counts(successes, n)
-    require_confidence(confidence)
-    z = NormalDist().inv_cdf((1 + confidence) / 2)
-    rate = successes / n
-    denominator = 1 + z * z / n
-    centre = (rate + z * z / (2 * n)) / denominator
-    half = z / denominator * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    found = stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
     # At the ends the formula gives the rate itself, but for rounding.
-    low = 0.0 if successes == 0 else max(0.0, centre - half)
-    high = 1.0 if successes == n else min(1.0, centre + half)
-    return low, high
+    return (0.0 if successes == 0 else float(found.low)), (1.0 if successes == n else float(found.high))
 
 
-def confidence_sequence(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+def confidence_sequence(successes: int, n: int) -> tuple[float, float]:
     """Return (low, high) of a binomial proportion that holds at every `n` at once, whatever the rule for stopping.
 
     A rate p is left out once the likelihood of the outcomes, averaged over rates drawn from Beta(1/2, 1/2), is
     1 / (1 - confidence) times that of p: under the true rate this ratio is a martingale of mean 1, so with probability
-    `confidence` it stays below that (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). Wider than Wilson's,
+    `CONFIDENCE` it stays below that (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). Wider than Wilson's,
     which holds for an `n` fixed in advance. Raises `UsageError` as `wilson_interval` does.
     """
     require_counts(successes, n)
-    require_confidence(confidence)
     failures = n - successes
-    mixture = _log_beta(successes + 0.5, failures + 0.5) - _log_beta(0.5, 0.5)
+    mixture = special.betaln(successes + 0.5, failures + 0.5) - special.betaln(0.5, 0.5) + math.log1p(-CONFIDENCE)
 
-    def inside(p: float) -> bool:
-        log_likelihood = (successes * math.log(p) if successes else 0.0) + (
-            failures * math.log1p(-p) if failures else 0.0
-        )
-        return mixture - log_likelihood < -math.log1p(-confidence)
+    def excess(p: float) -> float:
+        return float(mixture - special.xlogy(successes, p) - special.xlog1py(failures, -p))
 
-    rate = min(max(successes / n, 1e-12), 1 - 1e-12)  # at 0 and 1 there is no logarithm
-    low = 0.0 if successes == 0 else _bisect(inside, rate, 0.0)
-    high = 1.0 if failures == 0 else _bisect(inside, rate, 1.0)
+    rate = min(max(successes / n, _EDGE), 1 - _EDGE)
+    low = 0.0 if successes == 0 else _root(excess, 1e-300, rate)
+    high = 1.0 if failures == 0 else _root(excess, rate, 1 - 1e-16)
     return low, high
 
 
-def mean_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> tuple[float, float]:
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    return cast(float, optimize.brentq(function, low, high, xtol=1e-15))
+
+
+def paired_difference_interval(both: int, only_first: int, only_second: int, neither: int) -> tuple[float, float]:
+    """Return (low, high) of the rate of the first minus the rate of the second, paired, inside [-1, 1].
+
+    Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: Wilson's limits of both rates, squared and added,
+    less their correlation with a continuity correction.
+    """
+    n = both + only_first + only_second + neither
+    first, second = both + only_first, both + only_second
+    require_counts(min(both, only_first, only_second, neither), n)
+    (l1, u1), (l2, u2) = wilson_interval(first, n), wilson_interval(second, n)
+    p1, p2 = first / n, second / n
+    cross = both * neither - only_first * only_second
+    if cross > 0:  # the correction draws a positive correlation towards none, never past it
+        cross = max(cross - n / 2, 0.0)
+    margins = math.sqrt(first * (n - first) * second * (n - second))
+    phi = cross / margins if margins else 0.0
+
+    def add_squares(a: float, b: float) -> float:
+        return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
+
+    difference = (only_first - only_second) / n
+    return max(-1.0, difference - add_squares(p1 - l1, u2 - p2)), min(1.0, difference + add_squares(u1 - p1, p2 - l2))
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float, float]:
     """Return Student's (low, high) of the mean of independent `values`; `UsageError` for fewer than two.
 
     Student (1908), Biometrika 6, 1-25. With two or three values it is wide: the factor on the standard error is 12.7
@@ -105,51 +123,12 @@ def mean_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> tu
     """
     if len(values) < 2:
         raise UsageError(f"{len(values)} training seed has no interval over training seeds; expected at least 2")
-    half = t_quantile(confidence, len(values) - 1) * stdev(values) / math.sqrt(len(values))
-    return fmean(values) - half, fmean(values) + half
-
-
-def t_quantile(confidence: float, degrees: int) -> float:
-    """Return Student's t with `degrees` of freedom for a two-sided interval of this confidence."""
-    if degrees < 1 or not 0 < confidence < 1:
-        raise UsageError(
-            f"t quantile of {confidence} with {degrees} degrees of freedom; expected 0 to 1 and at least 1"
-        )
-    angle = _bisect(lambda angle: _t_probability(angle, degrees) < confidence, 0.0, math.pi / 2)
-    return math.sqrt(degrees) * math.tan(angle)
+    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * stats.sem(values))
+    mean = float(np.mean(values))
+    return mean - half, mean + half
 
 
 def require_counts(successes: int, n: int) -> None:
     """Raise `UsageError` unless 0 <= successes <= n and n >= 1."""
     if n < 1 or not 0 <= successes <= n:
         raise UsageError(f"{successes} successes of {n} trials; expected 0 <= successes <= n and n >= 1")
-
-
-def require_confidence(confidence: float) -> None:
-    """Raise `UsageError` unless the confidence is between 0 and 1."""
-    if not 0 < confidence < 1:
-        raise UsageError(f"confidence is {confidence}; expected a number between 0 and 1, such as 0.95")
-
-
-def _bisect(inside: Callable[[float], bool], within: float, outside: float) -> float:
-    """Find where `inside` ends between a value that is inside and one that is not; neither is evaluated."""
-    for _ in range(60):  # halves the error each time: to the last bit
-        middle = (within + outside) / 2
-        within, outside = (middle, outside) if inside(middle) else (within, middle)
-    return (within + outside) / 2
-
-
-def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
-
-
-def _t_probability(angle: float, degrees: int) -> float:
-    """P(|T| <= t) where tan(angle) = t / sqrt(degrees): Abramowitz & Stegun (1964), 26.7.3 and 26.7.4."""
-    sine, cosine = math.sin(angle), math.cos(angle)
-    odd = degrees % 2
-    term = cosine if odd else 1.0
-    series = 0.0 if degrees == 1 else term
-    for k in range(3 if odd else 2, degrees, 2):
-        term *= cosine * cosine * (k - 1) / k
-        series += term
-    return 2 / math.pi * (angle + sine * series) if odd else sine * series

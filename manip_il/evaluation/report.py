@@ -1,76 +1,81 @@
-"""`report.html`: one file that needs no network and no scripts, rendered from the templates beside this module."""
+"""`report.html`: one file that needs no network and no scripts, rendered from the template beside this module."""
 
 from __future__ import annotations
 
 import base64
-import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
-from manip_il.evaluation.curves import CurveCharts
-from manip_il.evaluation.intervals import Proportion, format_percent
-from manip_il.evaluation.maps import draw_paths
-from manip_il.evaluation.report_data import Film, LearningCurve, Paths, PolicyRow, Strip, flatten, format_seconds
-from manip_il.evaluation.tables import Table, policy_table
+from manip_il.evaluation.figures import Curve, Figure, curve_figures, curve_note
+from manip_il.evaluation.rounds import format_seconds
+from manip_il.evaluation.tables import Table
 
-# Failures first: they are what one can act on.
-_OUTCOMES: tuple[tuple[bool | None, str], ...] = ((None, ""), (False, "Failures"), (True, "Successes"))
-_MOST_COLUMNS = 8  # of a picture strip
 _INTERVAL = re.compile(r"(.*?) ([\[(].*)", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class Bar:
-    """A success rate as a bar, with its interval or with the rates of training seeds as dots.
+class Still:
+    """A picture with its caption. media_type: such as `image/jpeg`."""
 
-    kind: CSS class of its colour.
+    caption: str
+    content: bytes
+    media_type: str = "image/jpeg"
+
+
+@dataclass(frozen=True)
+class Film:
+    """One episode as an MP4 (H.264). title: in bold before the caption. poster: a JPEG shown until it plays.
+
+    stills: some of its frames, for where no film plays, each with its time as a caption.
     """
 
-    name: str
-    kind: str
-    rate: float
-    words: str
-    interval: tuple[float, float] | None = None
-    dots: tuple[float, ...] = ()
+    title: str
+    mp4: bytes
+    caption: str = ""
+    poster: bytes = b""
+    stills: tuple[Still, ...] = ()
 
-    @classmethod
-    def of(cls, name: str, kind: str, *successes: Proportion) -> Bar:
-        """Return the bar of one success rate, or of the mean over training seeds."""
-        if len(successes) == 1:
-            [success] = successes
-            return cls(name, kind, success.rate, str(success), success.interval)
-        rates = tuple(success.rate for success in successes)
-        mean = sum(rates) / len(rates)
-        words = f"{format_percent(mean)}, training seeds {', '.join(map(format_percent, rates))}"
-        return cls(name, kind, mean, words, dots=rates)
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a report. Empty parts are left out.
+
+    formulas: one a line; notes: paragraphs under the tables; named: names and values, folded away under a heading;
+    under: another heading within the section before, for parts that belong to it.
+    """
+
+    heading: str
+    lead: tuple[str, ...] = ()
+    formulas: tuple[str, ...] = ()
+    figures: tuple[Figure, ...] = ()
+    tables: tuple[Table, ...] = ()
+    notes: tuple[str, ...] = ()
+    stills: tuple[Still, ...] = ()
+    films: tuple[Film, ...] = ()
+    named: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
+    under: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """The parts that every report has. Empty parts are left out of the page.
+    """A page: the verdict, which is the first sentence with its numbers, further facts, sections, how it was made.
 
-    verdict: the first sentence, with its numbers. facts: further sentences. command: that made it. curve: of a run.
-    pictures_note: such as why there are paths and no films. timings: by name [s]. config, fingerprint: nested mappings.
+    command: that made it. timings: by name [s]. config, fingerprint: nested mappings.
     """
 
-    template: ClassVar[str] = "report.html.j2"
     title: str
     verdict: str
     command: str
+    sections: tuple[Section, ...]
     facts: tuple[str, ...] = ()
-    curve: LearningCurve | None = None
-    films: tuple[Film, ...] = ()
-    strips: tuple[Strip, ...] = ()
-    paths: tuple[Paths, ...] = ()
-    pictures_note: str = ""
     config: Mapping[str, Any] = field(default_factory=dict[str, Any])
     fingerprint: Mapping[str, Any] = field(default_factory=dict[str, Any])
     timings: Mapping[str, float] = field(default_factory=dict[str, float])
@@ -80,28 +85,9 @@ class Report:
             if not getattr(self, what).strip():
                 raise ManipError(f"report {self.title!r}: {what} is empty")
 
-    @cached_property
-    def pictures(self) -> list[tuple[str, list[Film], list[Strip], list[Paths]]]:
-        """Pictures by outcome, each outcome under its heading, those of unknown outcome first and without one."""
-        found = [
-            (
-                heading,
-                [one for one in self.films if one.success is success],
-                [one for one in self.strips if one.success is success],
-                [one for one in self.paths if one.success is success],
-            )
-            for success, heading in _OUTCOMES
-        ]
-        return [group for group in found if any(group[1:])]
-
-    @cached_property
-    def curves(self) -> CurveCharts | None:
-        """Success against cost; None without a curve."""
-        return CurveCharts.of(self.curve) if self.curve else None
-
     def render(self) -> str:
         """Return the page as one string of HTML."""
-        return _environment().get_template(self.template).render(report=self)
+        return _environment().get_template("report.html.j2").render(report=self)
 
     def write(self, path: Path) -> None:
         """Write the page to `path`, whole or not at all, creating its folder."""
@@ -109,53 +95,54 @@ class Report:
         write_file(path, self.render().encode())
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunReport(Report):
-    """The report of a run: its policies. disturbance: meaning of the disturbed column."""
-
-    template: ClassVar[str] = "run.html.j2"
-    rows: tuple[PolicyRow, ...]
-    disturbance: str = ""
-
-    def __post_init__(self) -> None:
-        if not self.rows:
-            raise ManipError(f"report {self.title!r} has no policy to show")
-        super().__post_init__()
-
-    @property
-    def table(self) -> Table:
-        """The policies in numbers."""
-        return policy_table(self.rows)
-
-    @property
-    def bars(self) -> list[Bar]:
-        """Their success."""
-        return [Bar.of(row.name, row.kind, row.success) for row in self.rows]
-
-    @property
-    def note(self) -> str:
-        """Number of episodes, method of the intervals, and the disturbance."""
-        sizes = sorted({row.success.n for row in self.rows})
-        episodes = f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"
-        note = f"Each policy ran {episodes} episodes. Intervals are Wilson's score intervals."
-        return note + (f" Disturbed: {self.disturbance}." if self.disturbance else "")
+def curve_section(curves: Sequence[Curve], target: float | None = None, tables: tuple[Table, ...] = ()) -> Section:
+    """Return success over every cost, with the numbers of each point folded away."""
+    points = {
+        f"{curve.name}, run {number}, {one.name}" if len(curve.runs) > 1 else f"{curve.name}, {one.name}": one
+        for curve in curves
+        for number, run in enumerate(curve.runs)
+        for one in run
+    }
+    numbers = {
+        name: f"{one.labels:,} labels, {format_seconds(one.seconds)}: {one.validation}" for name, one in points.items()
+    }
+    return Section(
+        "Success against cost",
+        figures=curve_figures(curves, target),
+        tables=tables,
+        notes=(curve_note(curves),),
+        named={"The curves in numbers": numbers},
+    )
 
 
-def keep_together(sentence: str) -> str:
-    """Return a sentence in which a number keeps its unit, and a comparison its sign, on one line."""
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return a nested mapping as `policy.hidden -> 256`: the names that the command line takes."""
+    flat: dict[str, str] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = _plain(value)
+    return flat
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value)) or "(empty)"
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    return "(empty)" if isinstance(value, Mapping) else str(value)
+
+
+def _keep_together(sentence: str) -> str:
+    """A sentence in which a number keeps its unit, and a comparison its sign, on one line."""
     return re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", sentence)
 
 
-def split_interval(cell: str) -> tuple[str, str]:
-    """Return a table cell as its number, and what follows in brackets; empty where nothing does."""
+def _split_interval(cell: str) -> tuple[str, str]:
+    """A table cell as its number, and what follows in brackets; empty if nothing does."""
     match = _INTERVAL.fullmatch(cell)
     return (match.group(1), match.group(2)) if match else (cell, "")
-
-
-def strip_columns(frames: int) -> int:
-    """Return the number of columns, at most 8, in which the last row of a strip is full or nearly so."""
-    rows = math.ceil(frames / _MOST_COLUMNS) or 1
-    return math.ceil(frames / rows) or 1
 
 
 @cache
@@ -168,16 +155,11 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
     )
     filters: dict[str, Any] = {
-        "prose": keep_together,
-        "split_interval": split_interval,
+        "prose": _keep_together,
+        "split_interval": _split_interval,
         "base64": lambda content: base64.b64encode(content).decode("ascii"),
-        "percent": lambda value: f"{value:.2f}%",
-        "px": lambda value: f"{value:.1f}",
-        "rate": format_percent,
         "durations": lambda timings: {name: format_seconds(seconds) for name, seconds in timings.items()},
         "flatten": flatten,
-        "strip_columns": strip_columns,
-        "draw_paths": draw_paths,
     }
     environment.filters.update(filters)
     return environment

@@ -19,7 +19,7 @@ from manip_il.evaluation.significance import PairedComparison, compare_paired
 FILE_NAME = "eval.json"
 WILSON = "Wilson's score interval"
 ANYTIME = "confidence sequence: holds whenever one stops"
-_EQUAL_IN_PARTS = ("policy_sha256", "robot", "task", "settings", "confidence")
+_EQUAL_IN_PARTS = ("policy_sha256", "robot", "task", "settings")
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,6 @@ class EvalResult:
     fingerprint: Mapping[str, Any]
     episodes: tuple[EpisodeResult, ...]
     settings: EvalSettings
-    confidence: float = CONFIDENCE
     policy_sha256: str = ""
     until_width: float | None = None
 
@@ -63,7 +62,7 @@ class EvalResult:
         return self._proportion([episode.success_at_end for episode in self.episodes])
 
     def _proportion(self, outcomes: Sequence[bool]) -> Proportion:
-        return Proportion.of(outcomes, self.confidence, self.until_width is not None)
+        return Proportion.of(outcomes, self.until_width is not None)
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
@@ -91,7 +90,7 @@ class EvalResult:
         return {
             "success_rate": self.success.rate,
             "interval": list(self.success.interval),
-            "confidence": self.confidence,
+            "confidence": CONFIDENCE,
             "interval_method": WILSON if self.until_width is None else ANYTIME,
             "n_episodes": len(self.episodes),
             "success_at_end_rate": self.success_at_end.rate,
@@ -111,18 +110,20 @@ class EvalResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalResult:
-        """Return the inverse of `to_json`: rates and intervals are computed anew from the episodes."""
-        width = data.get("until_width")
+        """Return the inverse of `to_json`: rates and intervals are computed anew from the episodes.
+
+        Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or of another kind.
+        """
         return cls(
-            policy=checks.text("policy", data["policy"]),
+            policy=data["policy"],
+            # names, not paths: a task's path would be code to run
             robot=checks.name("robot", data["robot"]),
             task=checks.name("task", data["task"]),
-            fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
-            episodes=tuple(EpisodeResult.from_json(one) for one in checks.array("episodes", data["episodes"])),
+            fingerprint=data["fingerprint"],
+            episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
             settings=EvalSettings.from_json(data["settings"]),
-            confidence=checks.number("confidence", data.get("confidence", CONFIDENCE), 0.5, 0.9999),
-            policy_sha256=checks.text("policy_sha256", data.get("policy_sha256", "")),
-            until_width=None if width is None else checks.number("until_width", width, 0, 1),
+            policy_sha256=data.get("policy_sha256", ""),
+            until_width=data.get("until_width"),
         )
 
     def write(self, path: Path) -> None:
@@ -139,14 +140,12 @@ class EvalResult:
         data = checks.read_json(path, f"an {FILE_NAME} of manip-il eval")
         try:
             result = cls.from_json(data)
-        except KeyError as error:
-            raise ManipError(f"{path}: key {error} is missing; expected an {FILE_NAME}") from error
-        except ManipError as error:
-            raise ManipError(f"{path}: not an {FILE_NAME}: {error}") from error
-        stated = data.get("n_episodes", len(result.episodes))
+            stated = int(data.get("n_episodes", len(result.episodes)))
+        except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, ManipError) as error:
+            why = f"key {error} is missing" if isinstance(error, KeyError) else checks.one_line(error)
+            raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
         if stated != len(result.episodes):
-            said = checks.shorten(stated)
-            raise MismatchError(f"{path}: number of episodes", "n_episodes", said, "episodes", len(result.episodes))
+            raise MismatchError(f"{path}: number of episodes", "n_episodes", stated, "episodes", len(result.episodes))
         return result
 
 
@@ -162,7 +161,7 @@ def compare_results(left: EvalResult, right: EvalResult, names: tuple[str, str] 
     shared = sorted(ours.keys() & theirs.keys())
     if not shared:
         raise ManipError(f"{names[0]} and {names[1]} share no seed; evaluate both with the same --seed=")
-    return compare_paired([ours[seed] for seed in shared], [theirs[seed] for seed in shared], names, left.confidence)
+    return compare_paired([ours[seed] for seed in shared], [theirs[seed] for seed in shared], names)
 
 
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:

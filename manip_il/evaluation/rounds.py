@@ -1,21 +1,22 @@
-"""The rounds of a run, read from `metrics.jsonl`, and the choice of one for a comparison."""
+"""The rounds of a run and their costs, read from `metrics.jsonl`, and the choice of one for a comparison."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.report_data import COSTS, Cost, CurvePoint, format_amount
 
+Cost = Literal["labels", "episodes", "steps", "seconds"]
+COSTS: tuple[Cost, ...] = ("labels", "episodes", "steps", "seconds")
+METRICS_FILE = "metrics.jsonl"
 END = "end"
 ENOUGH = 0.95  # share of an amount that a run must have reached to be compared at it: rounds are not that fine
-UNEQUAL = 1.05  # factor from which on the costs of chosen rounds are said to differ
-_MOST = 10**12  # labels, episodes
 
 
 @dataclass(frozen=True)
@@ -67,75 +68,42 @@ class Round:
 History = tuple[Round, ...]
 
 
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Return the lines of a run's `metrics.jsonl`, without one that a kill cut short; none if there is no file."""
+    path = folder / METRICS_FILE
+    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+    whole = [line for line in lines if line.endswith(b"\n")]
+    return [checks.mapping(str(path), checks.parse_json(str(path), line, nan_is_none=True)) for line in whole]
+
+
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
-    """Return a run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` where they are not a run's.
+    """Return a run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` if they are not a run's.
 
     Of `manip-il gail`, `airl` and `ppo` those iterations are rounds that were validated.
     """
-    if not records:
-        raise ManipError(f"{name} has no finished round yet; continue it with --resume=true")
-    unit = "iteration" if "iteration" in records[0] else "round"
-    records = sorted(records, key=lambda record: _number(record, unit))
-    first = min(1, max(0, _number(records[0], unit))) if unit == "iteration" else 0
+    unit: Literal["round", "iteration"] = "iteration" if records and "iteration" in records[0] else "round"
     rounds: list[Round] = []
     seconds = validating = 0.0
-    for number, record in enumerate(records, start=first):
-        if _number(record, unit) != number:
-            raise ManipError(f"{name}: metrics.jsonl has no {unit} {number}; expected one line {_a(unit)}")
-        try:
-            times = checks.mapping("seconds", record["seconds"])
-            seconds += sum(checks.number(part, times[part], 0) for part in ("collect", "fit"))
-            validating += checks.number("validate", times["validate"], 0)
-            if unit == "round" or record["validation_success"] is not None:
-                rounds.append(_round(record, number, seconds, validating, unit))
-        except (KeyError, ManipError) as error:
-            why = f"no {error}, {unit} {number}" if isinstance(error, KeyError) else f"{unit} {number}: {error}"
-            raise ManipError(f"{name}: metrics.jsonl was not written by a run of manip-il ({why})") from error
+    try:
+        for record in sorted(records, key=lambda record: record[unit]):
+            times, n = record["seconds"], record["validation_episodes"]
+            seconds += times["collect"] + times["fit"]
+            validating += times["validate"]
+            if record["validation_success"] is None:
+                continue
+            labels = record["labels"] if unit == "round" else 0  # reinforcement learning asks for none
+            queries = record.get("queries", labels)
+            costs = (labels, queries, record["episodes"], record.get("steps", queries), seconds, validating)
+            validation = Proportion(round(record["validation_success"] * n), n)
+            rounds.append(Round(record[unit], *costs, validation, unit))
+    except (KeyError, TypeError, UsageError) as error:
+        raise ManipError(f"{name}: metrics.jsonl was not written by a run of manip-il ({error!r})") from error
     if not rounds:
-        raise ManipError(f"{name} has no validated iteration yet; continue it with --resume=true")
+        raise ManipError(f"{name} has no finished round yet; continue it with --resume=true")
     return tuple(rounds)
 
 
-def _round(
-    record: Mapping[str, Any], number: int, seconds: float, validating: float, unit: Literal["round", "iteration"]
-) -> Round:
-    count = checks.whole("validation_episodes", record["validation_episodes"], 1, _MOST)
-    success = checks.number("validation_success", record["validation_success"], 0, 1)
-    labels = checks.whole("labels", record["labels"], 0, _MOST) if unit == "round" else 0  # which asks for none
-    queries = checks.whole("queries", record.get("queries", labels), 0, _MOST)
-    return Round(
-        round=number,
-        labels=labels,
-        queries=queries,
-        episodes=checks.whole("episodes", record["episodes"], 0, _MOST),
-        steps=checks.whole("steps", record.get("steps", queries), 0, _MOST),
-        seconds=seconds,
-        validating=validating,
-        validation=Proportion(round(success * count), count),
-        unit=unit,
-    )
-
-
-def _number(record: Mapping[str, Any], unit: str) -> int:
-    """Number of a line's round; -1 where it has none."""
-    number = record.get(unit)
-    return number if isinstance(number, int) else -1
-
-
-def _a(unit: str) -> str:
-    return f"{'an' if unit == 'iteration' else 'a'} {unit}"
-
-
-def curve_points(rounds: History) -> tuple[CurvePoint, ...]:
-    """Return a run's learning curve, with all costs; without steps where the expert was queried in each of them."""
-    steps = [one.steps if unasked(rounds) else None for one in rounds]
-    return tuple(
-        CurvePoint(one.labels, one.validation, one.name, one.episodes, one.seconds, count)
-        for one, count in zip(rounds, steps, strict=True)
-    )
-
-
-def unasked(rounds: History) -> bool:
+def has_unqueried_steps(rounds: History) -> bool:
     """Return whether steps were simulated in which the expert was not queried, so that they are a cost of their own."""
     return any(one.steps != one.queries for one in rounds)
 
@@ -172,69 +140,53 @@ class Rule:
     def __str__(self) -> str:
         return self.axis if self.amount is None else f"{self.axis}:{self.amount:g}"
 
-    @property
-    def words(self) -> str:
-        """Return the cost and its amount, `20,000 steps`."""
-        return self.axis if self.axis == END or self.amount is None else format_amount(self.axis, self.amount)
+    def limit(self, histories: Mapping[str, History]) -> float | None:
+        """Return how much of the axis every run (name -> rounds) may use: as given, or the most that all reached.
 
+        None for no limit. Raises `UsageError` if one has no rounds, or ended before nearly what is given.
+        """
+        if self.axis == END:
+            return None
+        for name, rounds in histories.items():
+            if not rounds:
+                raise UsageError(f"--at={self}: {name} has no rounds; give a run of manip-il dagger")
+        reached = min(rounds[-1].amount(self.axis) for rounds in histories.values())
+        if self.amount is not None and reached < ENOUGH * self.amount:
+            raise UsageError(
+                f"--at={self}: not every run got that far, one ended at {format_amount(self.axis, reached)}; "
+                f"--at={self.axis} takes the most that all reached"
+            )
+        return reached if self.amount is None else self.amount
 
-def budget(rule: Rule, histories: Sequence[History]) -> float | None:
-    """Return how much of `rule.axis` every run may use: as given, or the most that all reached; None for no limit.
+    def within(self, rounds: History, limit: float | None) -> History:
+        """Return the rounds that ended within `limit` of the rule's cost; all without a limit."""
+        axis = self.axis
+        return rounds if axis == END or limit is None else tuple(one for one in rounds if one.amount(axis) <= limit)
 
-    Raises `UsageError` where a run ended before the share `ENOUGH` of what is given.
-    """
-    if rule.axis == END:
-        return None
-    reached = min(rounds[-1].amount(rule.axis) for rounds in histories)
-    if rule.amount is not None and reached < ENOUGH * rule.amount:
-        raise UsageError(
-            f"--at={rule}: not every run got that far, one ended at {format_amount(rule.axis, reached)}; "
-            f"--at={rule.axis} takes the most that all reached"
-        )
-    return reached if rule.amount is None else rule.amount
+    def select(self, rounds: History, limit: float | None, name: str) -> Round:
+        """Return the round of one run that the rule chooses; `UsageError` if none ended within `limit`."""
+        within = self.within(rounds, limit)
+        if not within and self.axis != END and limit is not None:
+            raise UsageError(
+                f"--at={self}: {name} has no round within {format_amount(self.axis, limit)}; "
+                f"its first took {format_amount(self.axis, rounds[0].amount(self.axis))}"
+            )
+        if self.checkpoint == "last":
+            return within[-1]
+        return max(within, key=lambda one: (one.validation.rate, one.round))
 
+    def fact(self, limit: float | None) -> str:
+        """Return a sentence on the rule."""
+        which = "last round" if self.checkpoint == "last" else "round that was best on validation"
+        words = f"Of every run the {which}, chosen before the test"
+        if self.axis == END or limit is None:
+            return f"{words}."
+        source = "given" if self.amount is not None else "the most that every run reached"
+        return f"{words}, within {format_amount(self.axis, limit)} ({source})."
 
-def rounds_within(rule: Rule, rounds: History, limit: float | None) -> History:
-    """Return the rounds that ended within `limit` of the rule's cost; all without a limit."""
-    axis = rule.axis
-    return rounds if axis == END or limit is None else tuple(one for one in rounds if one.amount(axis) <= limit)
-
-
-def select_round(rule: Rule, rounds: History, limit: float | None, name: str) -> Round:
-    """Return the round of one run that `rule` chooses; `UsageError` where none ended within `limit`."""
-    within, axis = rounds_within(rule, rounds, limit), rule.axis
-    if not within and axis != END and limit is not None:
-        raise UsageError(
-            f"--at={rule}: {name} has no round within {format_amount(axis, limit)}; "
-            f"its first took {format_amount(axis, rounds[0].amount(axis))}"
-        )
-    if rule.checkpoint == "last":
-        return within[-1]
-    return max(within, key=lambda one: (one.validation.rate, one.round))
-
-
-def rule_facts(rule: Rule, limit: float | None, chosen: Sequence[Round]) -> list[str]:
-    """Return sentences on the rule, and on costs of the chosen rounds that are not the same."""
-    which = "last round" if rule.checkpoint == "last" else "round that was best on validation"
-    words = f"Of every run the {which}, chosen before the test"
-    if rule.axis == END or limit is None:
-        return [f"{words}."]
-    source = "given" if rule.amount is not None else "the most that every run reached"
-    facts = [f"{words}, within {format_amount(rule.axis, limit)} ({source})."]
-    amounts = [one.amount(rule.axis) for one in chosen]
-    low, high = min(amounts), max(amounts)
-    if high > UNEQUAL * low:
-        spent = f"{format_amount(rule.axis, low).removesuffix(f' {rule.axis}')} to {format_amount(rule.axis, high)}"
-        facts.append(
-            f"The rounds taken had used {spent}: the best one may come early, and a round that would have gone over "
-            "the limit does not count."
-        )
-    return facts
-
-
-def first_reaching(rounds: History, target: float) -> Round | None:
-    """Return the first round with at least this validation success; None where none got there."""
-    return next((one for one in rounds if one.validation.rate >= target), None)
+    def to_json(self, limit: float | None) -> dict[str, Any]:
+        """Return the rule as `compare.json` and `study.json` hold it."""
+        return {"checkpoint": self.checkpoint, "at": str(self), "limit": limit}
 
 
 def largest_dip(rounds: History) -> float:
@@ -243,3 +195,18 @@ def largest_dip(rounds: History) -> float:
     for one in rounds:
         dip, best = max(dip, best - one.validation.rate), max(best, one.validation.rate)
     return dip
+
+
+def format_seconds(seconds: float) -> str:
+    """Return a duration as `4.2 s`, `3 min 20 s` or `1 h 05 min`."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def format_amount(cost: Cost, amount: float) -> str:
+    """Return `8,012 labels`, `150 episodes`, `8,012 steps` or `3 min 20 s`."""
+    return format_seconds(amount) if cost == "seconds" else f"{amount:,.0f} {cost}"

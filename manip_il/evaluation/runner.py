@@ -1,18 +1,24 @@
-"""Evaluate one policy on given seeds."""
+"""Evaluate one policy on given seeds: each finished episode is kept at once, and any can be run again alone."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from manip_il import checks
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.errors import UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.positions import positions
@@ -24,6 +30,7 @@ from manip_il.sim.conditions import NOMINAL, draw
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
 CHECK_EVERY = 100  # episodes after which the width of the interval is checked
+EPISODES_FILE = "episodes.jsonl"
 
 
 def evaluate(
@@ -99,3 +106,74 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
             "end": {name: at for name, at in end.items() if name != "goal"},
         },
     )
+
+
+@dataclass(frozen=True)
+class EpisodeJournal:
+    """Episodes of an evaluation as they end: first a line of what they have in common, then a line for each.
+
+    done: seed -> result of those that were there when it was opened.
+    """
+
+    path: Path
+    done: Mapping[int, EpisodeResult] = field(default_factory=dict[int, EpisodeResult])
+
+    @classmethod
+    def open(cls, folder: Path, job: RolloutJob, suite: str) -> EpisodeJournal:
+        """Return the journal in `folder`, begun if there is none. A last line that a kill cut short is dropped.
+
+        Raises `MismatchError` if its episodes are those of another policy, environment or version of this program,
+        `ManipError` for a line that is not an episode.
+        """
+        path, common = folder / EPISODES_FILE, _common(job, suite)
+        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+        if lines and not lines[-1].endswith(b"\n"):
+            lines.pop()
+            os.truncate(path, sum(map(len, lines)))
+        if not lines:
+            journal = cls(path)
+            journal._append(common)
+            return journal
+        try:
+            head, *records = [checks.mapping("a line", checks.parse_json("a line", line)) for line in lines]
+            results = [EpisodeResult.from_json(record) for record in records]
+        except (KeyError, TypeError, ValueError, ManipError) as error:
+            raise ManipError(
+                f"{path}: a line that is not an episode ({error}); start again with --overwrite=true"
+            ) from error
+        for key, now in common.items():
+            if (before := head.get(key)) != now:
+                what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
+                raise MismatchError(what, "then", before, "now", now)
+        return cls(path, {result.seed: result for result in results})
+
+    def keep(self, on_result: Callable[[EpisodeResult], object]) -> Callable[[EpisodeResult], None]:
+        """Return a callback that appends a result at once, and hands it on."""
+
+        def add(result: EpisodeResult) -> None:
+            self._append(result.to_json())
+            on_result(result)
+
+        return add
+
+    def _append(self, record: Mapping[str, Any]) -> None:
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record, allow_nan=False) + "\n")
+
+
+def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
+    return {
+        "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
+        "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
+        "settings": EvalSettings.of(job, suite).to_json(),
+    }
+
+
+def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
+    """Return in what two runs of one episode differ; `MismatchError` if they had other conditions."""
+    now = dict(after.detail["drawn"])
+    if before.detail.get("drawn", {}) != now:
+        raise MismatchError("what is drawn for the episode", "then", before.detail.get("drawn"), "now", now)
+    pairs = {name: (getattr(before, name), getattr(after, name)) for name in ("success", "success_at_end", "steps")}
+    pairs |= {"return": (before.ret, after.ret)}
+    return [f"{name} was {was}, is {value}" for name, (was, value) in pairs.items() if was != value]

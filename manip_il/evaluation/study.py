@@ -9,11 +9,11 @@ from statistics import fmean
 from typing import Any
 
 from manip_il.errors import ManipError, UnknownName
-from manip_il.evaluation.comparison import Arm, Comparison, Member, seeds_facts
-from manip_il.evaluation.intervals import format_percent
-from manip_il.evaluation.report_data import COSTS, Cost, format_amount
+from manip_il.evaluation.arm import Arm, Member
+from manip_il.evaluation.comparison import Comparison, seeds_facts
+from manip_il.evaluation.intervals import Proportion, format_percent
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.rounds import Round, Rule, first_reaching, largest_dip, rounds_within, rule_facts, unasked
+from manip_il.evaluation.rounds import COSTS, Cost, Round, Rule, format_amount, has_unqueried_steps, largest_dip
 from manip_il.evaluation.tables import Table
 
 FILE_NAME, TABLE_FILE = "study.json", "table.md"
@@ -51,7 +51,7 @@ class Study:
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
-        """Arm -> its comparison with the baseline, for every other arm; empty where there is no baseline."""
+        """Arm -> its comparison with the baseline, for every other arm; empty if there is no baseline."""
         if self.baseline is None:
             return {}
         [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
@@ -59,7 +59,7 @@ class Study:
 
     @property
     def verdict(self) -> str:
-        """The first sentence: success of the best arm, and of the baseline, or of the second where that is best.
+        """The first sentence: success of the best arm, and of the baseline, or of the second if that is best.
 
         Of arms without a baseline: how many reach the target, and the worst.
         """
@@ -68,49 +68,73 @@ class Study:
             reach, worst = sum(arm.test_rate >= self.target for arm in ranked), ranked[-1]
             least = f"the last, {worst.name}, solves {format_percent(worst.test_rate)}"
             return f"{reach} of {len(ranked)} solve {100 * self.target:g} % of their unseen starts; {least}."
-        best, count, seeds = ranked[0], ranked[0].members[0].result.success.n, len(self.training_seeds)
+        best, seeds = ranked[0], len(self.training_seeds)
         over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
         other = next((arm for arm in ranked[1:] if best.name == self.baseline or arm.name == self.baseline), None)
         behind = f"; {other.name} {format_percent(other.test_rate)}" if other else ""
-        return f"{best.name} solves {format_percent(best.test_rate)} of {count:,} unseen starts{over}{behind}."
+        return f"{best.name} solves {format_percent(best.test_rate)} of {best.episodes:,} unseen starts{over}{behind}."
 
     @property
     def facts(self) -> list[str]:
         """Sentences after the verdict: comparisons with the baseline, how rounds were chosen, meaning of wall-clock."""
-        chosen = [_chosen(member) for arm in self.arms for member in arm.members]
         return [
             *(comparison.verdict for comparison in self.comparisons.values()),
             *(seeds_facts(len(self.training_seeds)) if self.comparisons else []),
-            *rule_facts(self.rule, self.limit, chosen),
+            self.rule.fact(self.limit),
             "Wall-clock is what collecting and fitting took; validating is not counted.",
         ]
 
-    def reached(self, arm: Arm) -> list[Round | None]:
-        """Return the round of each training seed in which validation first reached the target."""
-        return [first_reaching(member.history, self.target) for member in arm.members]
+    def tables(self) -> tuple[Table, ...]:
+        """Return an arm a row: costs and success; costs to the target; success within given costs, if any."""
+        return (self.results_table(), self.target_table(), *([self.within_table()] if self.within else []))
 
     def results_table(self) -> Table:
-        """Return an arm a row: the expert's success, costs, success, difference from the baseline, largest dip."""
-        columns = ("arm", *self._tests, *("wall-clock" if cost == "seconds" else cost for cost in self._costs))
-        columns += ("validation", "test", f"test, against {self.baseline}")
-        return Table((*columns, "largest dip [points]"), tuple(self._row(arm) for arm in self.arms))
+        """Return an arm a row, see `arms_table`; the expert's success first, the largest dip last."""
+        tests = list(dict.fromkeys(test for found in self.experts.values() for test in found))
+        table = arms_table(self.arms, self.comparisons)
+        rows: list[tuple[str, ...]] = []
+        for arm, (name, *cells) in zip(self.arms, table.rows, strict=True):
+            found = self.experts.get(arm.name, {})
+            experts = (format_percent(found[test].success.rate) if test in found else "" for test in tests)
+            dip = 100 * max(largest_dip(member.history) for member in arm.members)
+            rows.append((name, *experts, *cells, f"{dip:.1f}"))
+        return Table((table.columns[0], *tests, *table.columns[1:], "largest dip [points]"), tuple(rows))
 
     def target_table(self) -> Table:
-        """Return an arm a row: labels, episodes, steps and wall-clock when validation first reached the target."""
-        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {100 * self.target:g} %" for cost in self._costs]
-        rows = [
-            (arm.name, *(self._to_target(arm, cost) for cost in self._costs), self._fewer(arm)) for arm in self.arms
-        ]
-        return Table(("arm, validation", *columns, f"labels of {self.baseline} / of this arm"), tuple(rows))
+        """Return an arm a row: its mean costs when validation first reached the target in each training seed."""
+        rows: list[tuple[str, ...]] = []
+        for arm in self.arms:
+            first = self.reached(arm)
+            missed = f"not in {first.count(None)} of {len(first)} seeds"
+            costs = (missed if None in first else _mean_cost(cost, first) for cost in _costs(self.arms))
+            rows.append((arm.name, *costs))
+        head = (f"{_head(cost)} to {100 * self.target:g} %" for cost in _costs(self.arms))
+        return Table(("arm, validation", *head), tuple(rows))
 
     def within_table(self) -> Table:
         """Return an arm a row: the best validation success up to each of the costs `within`, empty before the first."""
-        columns = [f"within {rule.words}" for rule in self.within]
-        rows = [(arm.name, *(_within(arm, rule) for rule in self.within)) for arm in self.arms]
-        return Table(("arm, validation", *columns), tuple(rows))
+
+        def best(arm: Arm, rule: Rule) -> str:
+            rounds = [rule.within(member.history, rule.amount) for member in arm.members]
+            best = [max((one.validation for one in own), key=lambda one: one.rate) for own in rounds if own]
+            return _rates(best) if len(best) == len(rounds) else ""
+
+        columns = [
+            f"within {format_amount(one.axis, one.amount)}" for one in self.within if one.axis != "end" and one.amount
+        ]
+        return Table(
+            ("arm, validation", *columns),
+            tuple((arm.name, *(best(arm, rule) for rule in self.within)) for arm in self.arms),
+        )
+
+    def reached(self, arm: Arm) -> list[Round | None]:
+        """Return the round of each training seed in which validation first reached the target."""
+        return [
+            next((one for one in member.history if one.validation.rate >= self.target), None) for member in arm.members
+        ]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the contract of `study.json`."""
+        """Return the contents of `study.json`."""
         return {
             "verdict": self.verdict,
             "facts": self.facts,
@@ -118,6 +142,7 @@ class Study:
             "target": self.target,
             "training_seeds": self.training_seeds,
             "arms": {arm.name: self._arm_json(arm) for arm in self.arms},
+            "rule": self.rule.to_json(self.limit),
         }
 
     def _arm_json(self, arm: Arm) -> dict[str, Any]:
@@ -136,70 +161,38 @@ class Study:
             ],
         }
 
-    @property
-    def _costs(self) -> list[Cost]:
-        """Costs in the tables."""
-        steps = any(unasked(member.history) for arm in self.arms for member in arm.members)
-        return [cost for cost in COSTS if cost != "steps" or steps]
 
-    @property
-    def _tests(self) -> list[str]:
-        """Names of the expert's tests, in the order of the first arm that has them."""
-        return list(dict.fromkeys(test for tests in self.experts.values() for test in tests))
+def arms_table(arms: Sequence[Arm], comparisons: Mapping[str, Comparison]) -> Table:
+    """Return an arm a row: mean costs and validation of its runs' rounds, test success, difference from the baseline.
 
-    def _expert(self, arm: str, test: str) -> str:
-        result = self.experts.get(arm, {}).get(test)
-        return "" if result is None else format_percent(result.success.rate)
-
-    def _row(self, arm: Arm) -> tuple[str, ...]:
-        chosen = [_chosen(member) for member in arm.members]
-        costs = [_plain(cost, fmean(one.amount(cost) for one in chosen)) for cost in self._costs]
-        validation = _rates([one.validation.rate for one in chosen])
-        test = _rates([member.result.success.rate for member in arm.members])
-        comparison = self.comparisons.get(arm.name)
-        dip = max(largest_dip(member.history) for member in arm.members)
-        experts = [self._expert(arm.name, test) for test in self._tests]
-        return (
-            arm.name,
-            *experts,
-            *costs,
-            validation,
-            test,
-            comparison.numbers if comparison else "",
-            f"{100 * dip:.1f}",
+    comparisons: arm -> its comparison with the baseline. In brackets each training seed, of one alone the interval.
+    """
+    costs, baseline = _costs(arms), next((one.left.name for one in comparisons.values()), "")
+    rows: list[tuple[str, ...]] = []
+    for arm in arms:
+        chosen = [member.chosen for member in arm.members if member.chosen]
+        known = (
+            [*(_mean_cost(cost, chosen) for cost in costs), _rates([one.validation for one in chosen])]
+            if chosen
+            else []
         )
-
-    def _to_target(self, arm: Arm, cost: Cost) -> str:
-        """Mean cost where all training seeds reached the target, else each: its cost, or more than its whole cost."""
-        reached = self.reached(arm)
-        if all(reached):
-            return _plain(cost, fmean(one.amount(cost) for one in reached if one))
-        each = zip(arm.members, reached, strict=True)
-        return ", ".join(("" if at else "> ") + _plain(cost, (at or m.history[-1]).amount(cost)) for m, at in each)
-
-    def _fewer(self, arm: Arm) -> str:
-        """Labels of the baseline over this arm's, to the target; a lower bound where the baseline missed it."""
-        if self.baseline in (None, arm.name):
-            return ""
-        ours = [one.labels for one in self.reached(arm) if one]
-        if len(ours) < len(arm.members):
-            return "not reached"
-        baseline = self.comparisons[arm.name].left
-        reached = self.reached(baseline)
-        theirs = [(at or member.history[-1]).labels for member, at in zip(baseline.members, reached, strict=True)]
-        return f"{'' if all(reached) else '> '}{sum(theirs) / sum(ours):.1f}"
+        tests = _rates([member.test.success for member in arm.members])
+        against = comparisons[arm.name].numbers if arm.name in comparisons else ""
+        rows.append((arm.name, *(known or [""] * (len(costs) + 1)), tests, against))
+    return Table(("arm", *map(_head, costs), "validation", "test", f"test, against {baseline}"), tuple(rows))
 
 
 def table_markdown(study: Study) -> str:
-    """Return both tables, for the documentation."""
-    tables = [study.results_table(), study.target_table(), *([study.within_table()] if study.within else [])]
-    count = study.arms[0].members[0].result.success.n
-    tests = {test: len(one.episodes) for tests in study.experts.values() for test, one in tests.items()}
-    experts = "".join(f"- {test}: {count:,} test episodes.\n" for test, count in tests.items())
+    """Return the tables and facts, for the documentation."""
     seeds = ", ".join(map(str, study.training_seeds))
-    episodes = f"{count:,} test episodes; training seeds {seeds}, in brackets where each is told."
-    facts = "".join(f"- {fact}\n" for fact in [episodes, *study.facts])
-    return "".join(f"{table.filled().markdown()}\n" for table in tables) + facts + experts
+    tests = {test: len(one.episodes) for found in study.experts.values() for test, one in found.items()}
+    lines = [
+        f"{study.arms[0].episodes:,} test episodes; training seeds {seeds}, in brackets where each is told.",
+        *study.facts,
+        *(f"{test}: {count:,} test episodes." for test, count in tests.items()),
+    ]
+    tables = "".join(f"{table.filled().markdown()}\n" for table in study.tables())
+    return tables + "".join(f"- {line}\n" for line in lines)
 
 
 def _expert_json(result: EvalResult) -> dict[str, Any]:
@@ -207,22 +200,27 @@ def _expert_json(result: EvalResult) -> dict[str, Any]:
     return {"success_rate": success.rate, "interval": list(success.interval), "n_episodes": success.n}
 
 
-def _within(arm: Arm, rule: Rule) -> str:
-    """The best validation success of every training seed up to a cost."""
-    rounds = [rounds_within(rule, member.history, rule.amount) for member in arm.members]
-    return _rates([max(one.validation.rate for one in own) for own in rounds]) if all(rounds) else ""
-
-
 def _chosen(member: Member) -> Round:
     assert member.chosen is not None
     return member.chosen
 
 
-def _plain(cost: Cost, amount: float) -> str:
-    """The amount without the unit that the column's head has."""
-    return format_amount(cost, amount).removesuffix(f" {cost}")
+def _head(cost: Cost) -> str:
+    return "wall-clock" if cost == "seconds" else cost
 
 
-def _rates(rates: Sequence[float]) -> str:
-    each = f" ({', '.join(f'{100 * rate:.1f}' for rate in rates)})" if len(rates) > 1 else ""
-    return f"{format_percent(fmean(rates))}{each}"
+def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:
+    """The mean amount without the unit that the column's head has."""
+    return format_amount(cost, fmean(one.amount(cost) for one in rounds if one)).removesuffix(f" {cost}")
+
+
+def _costs(arms: Sequence[Arm]) -> list[Cost]:
+    """Costs in the tables; steps if they are not all labelled."""
+    steps = any(has_unqueried_steps(member.history) for arm in arms for member in arm.members)
+    return [cost for cost in COSTS if cost != "steps" or steps]
+
+
+def _rates(found: Sequence[Proportion]) -> str:
+    if len(found) == 1:
+        return str(found[0])
+    return f"{format_percent(fmean(one.rate for one in found))} ({', '.join(f'{100 * one.rate:.1f}' for one in found)})"

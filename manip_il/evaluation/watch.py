@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,23 +14,6 @@ from manip_il.sim.env import ManipEnv
 from manip_il.sim.window import Window
 
 F64 = NDArray[np.float64]
-
-
-class Screen(Protocol):
-    """Interface of what shows episodes as they happen."""
-
-    @property
-    def act(self) -> Act | None:
-        """Driver of what it shows, where somebody drives by it."""
-        ...
-
-    def add(self, step: Transition) -> bool:
-        """Show a step; returns whether to go on."""
-        ...
-
-    def close(self) -> None:
-        """Close it."""
-        ...
 
 
 class WindowScreen:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from manip_il.evaluation.figures import CLONING, DAGGER, RULE, Figure, Section, SectionsReport, drawing, to_figure
+from manip_il.evaluation.figures import CLONING, DAGGER, RULE, Figure, drawing, to_figure
 from manip_il.evaluation.intervals import format_percent
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.learn.preference.fitting import BY_CHANCE
 from manip_il.preferences.answers import Answers
@@ -67,12 +68,12 @@ def fit_report(
     command: str,
     config: Mapping[str, Any],
     timings: Mapping[str, float],
-) -> SectionsReport:
+) -> Report:
     """Return the report of a reward. who: answered, one name a file."""
     sources = tuple((source.root, f"{source.episodes:,}", f"{source.frames:,}") for source in clips.pairs.sources)
     first, *facts = summary_lines(found, answers)
     best = found.true or found.answered
-    return SectionsReport(
+    return Report(
         title=f"A reward from preferences, {clips.pairs.robot} {clips.pairs.task}",
         verdict=f"On pairs that it did not learn from, the reward agrees with "
         f"{'true progress' if found.true is not None else 'the answers'} in {format_percent(best.rate)} of {best.n:,}.",

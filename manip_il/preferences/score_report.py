@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.evaluation.figures import CLONING, DAGGER, EXPERT, Figure, Section, SectionsReport, drawing, to_figure
+from manip_il.evaluation.figures import CLONING, DAGGER, EXPERT, Figure, drawing, to_figure
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.preferences.scores import BELOW, Scores, episode_scores
 
@@ -45,13 +46,11 @@ def fact_lines(scores: Scores) -> list[str]:
     return lines
 
 
-def score_report(
-    scores: Scores, command: str, config: Mapping[str, Any], timings: Mapping[str, float]
-) -> SectionsReport:
+def score_report(scores: Scores, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
     """Return the report of a dataset's scores."""
     low = scores.worst(1)[0]
     episode = scores.data.episodes[scores.data.firsts[low]]
-    return SectionsReport(
+    return Report(
         title=f"Scores of {scores.root}",
         verdict=f"Of {len(scores.episodes):,} episodes, number {episode} has the lowest score: "
         f"{scores.episodes[low]:.2f}.",

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from manip_il.evaluation.figures import Section, SectionsReport
 from manip_il.evaluation.intervals import format_percent
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.theory.bounds import DRAWS, ERROR, Curve
 from manip_il.theory.figures import clouds_figure, errors_figure, linear_figure, theorem_figure
@@ -61,9 +61,7 @@ def slope_table(theory: Theory) -> Table:
     )
 
 
-def theory_report(
-    theory: Theory, command: str, config: Mapping[str, Any], timings: Mapping[str, float]
-) -> SectionsReport:
+def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
     """Return the report of all that was found."""
     sections = [_theorems(theory), _numbers(theory), _linear(theory)]
     facts = [
@@ -73,7 +71,7 @@ def theory_report(
     if theory.shift is not None:
         sections = [*_arm(theory.shift), *sections]
         facts.append(_shift_fact(theory.shift))
-    return SectionsReport(
+    return Report(
         title="What is proved of imitation, seen",
         verdict=_verdict(theory),
         facts=tuple(facts),

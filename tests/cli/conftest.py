@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.errors import RenderError
-from manip_il.evaluation import runner
+from manip_il.evaluation import runner, trial
 
 from .made_runs import make_policy
 
@@ -49,7 +49,8 @@ def evaluated(monkeypatch) -> list[str]:
         names.append(name)
         return real(engine, job, seeds, name, *rest, **named)
 
-    monkeypatch.setattr(runner, "evaluate", counted)
+    for module in (runner, trial):
+        monkeypatch.setattr(module, "evaluate", counted)
     return names
 
 

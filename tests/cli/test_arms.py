@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from manip_il.cli.adversarial import AirlOptions, GailOptions
-from manip_il.cli.arms import begun, charged
+from manip_il.cli.arms import with_start_cost, with_start_policy
 from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.ppo import PpoOptions
@@ -51,7 +51,9 @@ def file(tmp_path, monkeypatch) -> Path:
 def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
     plan = read_plan(file, None)
     assert plan.starts == {"cloning": None, "dagger": None, "gail": "cloning", "scratch": "cloning", "ppo": "cloning"}
-    gail, scratch, ppo = (begun(plan.arms[name], Path("s/seed_3").joinpath) for name in ("gail", "scratch", "ppo"))
+    gail, scratch, ppo = (
+        with_start_policy(plan.arms[name], Path("s/seed_3").joinpath) for name in ("gail", "scratch", "ppo")
+    )
     start = Path("s/seed_3/cloning/round_000")
     assert isinstance(gail, GailOptions)
     assert (gail.dataset.root, gail.init, gail.steps) == ([start / "dataset"], start / "policy", 300)
@@ -119,7 +121,7 @@ def test_a_run_is_charged_for_the_demonstrations_it_begins_with_and_for_the_fit_
     run = make_run(tmp_path / "cloning", policy, 0, (0.2,))
     start = history(read_jsonl(run / "metrics.jsonl"), "x")[0]
     own, plan = history(lines(0.2, 0.5), "x"), read_plan(file, None)
-    gail, scratch, dagger = (charged(plan.arms[name], own, run) for name in ("gail", "scratch", "dagger"))
+    gail, scratch, dagger = (with_start_cost(plan.arms[name], own, run) for name in ("gail", "scratch", "dagger"))
     assert dagger == own
     for found, seconds in ((gail, start.seconds), (scratch, 1.0)):
         last = found[-1]
@@ -147,4 +149,4 @@ def test_a_study_of_cloning_and_gail_tests_both_and_goes_on(file, tmp_path, caps
     done = Path("s/gail/seed_0/metrics.jsonl").read_bytes()
     assert main([*words, "--resume=true"]) == 0
     assert Path("s/gail/seed_0/metrics.jsonl").read_bytes() == done
-    assert "simulated steps" in Path("s/report.html").read_text()
+    assert "Validation success over steps" in Path("s/report.html").read_text()

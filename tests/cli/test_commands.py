@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.cli import trials
 from manip_il.cli.dagger import DaggerOptions, best_verdict
 from manip_il.cli.main import load, main
 from manip_il.cli.options import command_line, options_of
@@ -27,8 +26,9 @@ from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.parsing import from_yaml, parse
 from manip_il.cli.quickstart import quickstart_verdict
 from manip_il.data.dataset import Dataset
-from manip_il.evaluation.report_data import PolicyRow
+from manip_il.evaluation import film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.tables import PolicyRow
 
 from ..damage import edit_table
 from .made_runs import files
@@ -166,7 +166,7 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
 
 @pytest.mark.slow
 def test_the_quickstart_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(trials, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
+    monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
     sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
     words = ["quickstart", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
     assert main(words) == 0
@@ -213,7 +213,7 @@ def test_the_best_round_of_few_episodes_is_not_said_to_be_better(successes, n, v
 
 
 def test_the_quickstart_says_where_nothing_is_shown():
-    rows = [PolicyRow.of(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
+    rows = [PolicyRow(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
     assert quickstart_verdict(rows, significant=False).endswith(
         "no difference between DAgger and cloning with as many labels."
     )

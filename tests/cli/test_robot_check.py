@@ -10,7 +10,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.errors import RenderError
-from manip_il.evaluation.robot_check import check
+from manip_il.evaluation import robot_page
 from manip_il.robots.reach import Reach, keep_reach
 from manip_il.robots.robot import get_robot
 
@@ -34,18 +34,18 @@ def no_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise RenderError("no off-screen OpenGL")
 
-    monkeypatch.setattr(check, "looks", refuse)
+    monkeypatch.setattr(robot_page, "looks", refuse)
 
 
 def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: None, capsys):
     out = tmp_path / "out"
     assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=0", f"--output_dir={out}"]) == 0
-    said = capsys.readouterr().out
-    assert "No pictures: no off-screen OpenGL" in said
-    assert "own has starts for reach; the expert was not asked." in said
+    said = capsys.readouterr()
+    assert "the page has no pictures: no off-screen OpenGL" in said.err
+    assert "own has starts for reach; the expert was not asked." in said.out
     page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
     assert "No pictures: no off-screen OpenGL" in page
-    assert "data:image" not in page
+    assert "data:image/jpeg" not in page
     assert [joint["name"] for joint in found["joints"]] == tree_of()["joints"]
     assert found["tasks"] == [
         {
@@ -53,7 +53,7 @@ def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: N
             "done": True,
             "widths": {},
             "refused": "",
-            "starts": {"found": 50, "drawn": 50, "why": ""},
+            "starts": {"found": 50, "drawn": 50},
             "clean": None,
             "noisy": None,
         }
@@ -67,7 +67,7 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     words = ["--quiet", "robot", "check", str(path), "--tasks=reach,lift", "--episodes=0", f"--output_dir={out}"]
     assert main(words) == 1
     said = capsys.readouterr()
-    assert "narrow cannot do lift; it has starts for the other one, the expert was not asked." in said.out
+    assert "narrow has starts for 1 of 2 tasks; the expert was not asked; it cannot do lift." in said.out
     assert "--task.object=box:0.025" in said.out
     assert "cannot do 1 of 2 tasks: lift" in said.err
     assert (out / "check.html").is_file()

@@ -102,7 +102,7 @@ def test_the_answer_is_printed_and_written(here, runs, capsys):
     assert data["arms"]["cloning"]["training_seeds"][1]["first_at_target"] is None
     assert "| dagger | 300 | 6 |" in (here / "s" / "table.md").read_text()
     page = (here / "s" / "report.html").read_text()
-    assert page.count('class="curve"') == 3
+    assert page.count('alt="Validation success over') == 3
     assert "dagger, training seed 1, collect and fit" in page
 
 

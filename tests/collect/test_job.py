@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from kept import written
 
-from manip_il.cli.trials import suite_conditions
 from manip_il.collect.drivers import ExpertDriver, NoisyExpertDriver, PolicyDriver, RandomDriver
 from manip_il.collect.environments import env_spec
 from manip_il.collect.expert import Expert
@@ -18,6 +17,7 @@ from manip_il.collect.query import Query
 from manip_il.data.episodes import parts
 from manip_il.data.schema import fitted_columns
 from manip_il.errors import UsageError
+from manip_il.evaluation.suites import suite_conditions
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
@@ -36,7 +36,7 @@ JOBS = {
     "noisy expert": {"driver": NoisyExpertDriver(NOISE)},
     "random": {"driver": RandomDriver()},
     "mixture": {"beta": 0.5},
-    "policy of chunks": {"conditions": suite_conditions("all", "pick_place", sees=False), "batch": 3},
+    "policy of chunks": {"conditions": suite_conditions("all", EnvConfig(), sees=False), "batch": 3},
     "probability": {"query": Query("probability", 0.3)},
     "takeover": {"label": "takeover", "query": ONE},
     "branch": {"label": "branch", "query": ONE, "branch_steps": 4},

@@ -10,9 +10,9 @@ from pathlib import Path
 import boto3
 import pytest
 
-from manip_il.cli import trials
 from manip_il.cli.main import load
 from manip_il.cli.parsing import parse
+from manip_il.evaluation import film
 from manip_il.tasks.table import TASKS
 
 from ..store.hub_server import TOKEN, Hub, clean_environment, hub_server, talk_to
@@ -92,7 +92,7 @@ def workplace(
     for name, value in (servers | {"HF_TOKEN": TOKEN, "HF_ENDPOINT": running_hub.url}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(trials, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the quickstart's time
+    monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the quickstart's time
     talk_to(running_hub.url, monkeypatch.setattr)
     return Workplace(tmp_path, stock, lerobot)
 

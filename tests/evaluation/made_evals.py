@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.evaluation.comparison import Arm, Comparison, Member
+from manip_il.evaluation.arm import Arm, Member
+from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
-from manip_il.evaluation.film import make_film
-from manip_il.evaluation.report_data import Film
+from manip_il.evaluation.film import encode_mp4, encode_picture
+from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.rounds import Rule, history, select_round
+from manip_il.evaluation.rounds import History, Rule, history
 
 from .test_rounds import records
 
@@ -62,24 +63,23 @@ def made_comparison(left: Fails, right: Fails, seeds: int = 1) -> Comparison:
     return Comparison(_arm("runs/cloning", left, seeds, (0.3, 0.5, 0.6)), _arm("runs/dagger", right, seeds, (0.5, 0.9)))
 
 
-def small_film(number: int, success: bool | None) -> Film:
+def small_film(number: int) -> Film:
     """A second of a square that wanders."""
     frames = np.full((12, 48, 64, 3), 230, dtype=np.uint8)
     for index, frame in enumerate(frames):
         frame[10:30, 4 * index : 4 * index + 14] = (200, 40 * number % 255, 60)
-    return make_film("policy", list(frames), 12, f"seed {FIRST_SEED + number}", success)
+    poster = encode_picture(frames[-1], "jpeg")
+    return Film("policy", encode_mp4(list(frames), 12), f"seed {FIRST_SEED + number}", poster)
 
 
 def _arm(name: str, fails: Fails, seeds: int, successes: tuple[float, ...]) -> Arm:
     run = history(records(successes), name)
-    return Arm(
-        name,
-        tuple(
-            Member(f"{name}/seed_{seed}", made_eval(name, fails=fails), Path("e.json"), seed, Path("p"),
-                     select_round(Rule(), run, None, name), run)
-            for seed in range(seeds)
-        ),
-    )  # fmt: skip
+    return Arm(name, tuple(_member(name, seed, made_eval(name, fails=fails), run) for seed in range(seeds)))
+
+
+def _member(name: str, seed: int, result: EvalResult, run: History) -> Member:
+    path, chosen = Path(name) / f"seed_{seed}", Rule().select(run, None, name)
+    return Member(path, seed, Path("p"), run, chosen=chosen, result=result, file=Path("e.json"))
 
 
 def _detail(rng: np.random.Generator, condition: str) -> dict[str, Any]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from html.parser import HTMLParser
 
 from manip_il.evaluation.report import Report
 
 VOID = {"meta", "link", "img", "br", "hr", "input"}
-EVIL = '<script>alert("x")</script>&'
+EVIL = '<script>alert("x")</script>&$'
 
 
 class Page(HTMLParser):
@@ -27,9 +28,6 @@ class Page(HTMLParser):
         if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
     def handle_endtag(self, tag: str) -> None:
         assert self.open, f"</{tag}> closes nothing"
         assert self.open.pop() == tag
@@ -42,11 +40,10 @@ class Page(HTMLParser):
     def text(self) -> str:
         return " ".join(" ".join(self.words).replace("\u00a0", " ").split())
 
-    def count(self, css_class: str) -> int:
-        return sum(attributes.get("class") == css_class for _, attributes in self.tags)
-
-    def bar_widths(self, kind: str) -> list[str | None]:
-        return [a["width"] for tag, a in self.tags if tag == "rect" and re.match(f"bar {kind}", a.get("class") or "")]
+    @property
+    def figures(self) -> list[str]:
+        """What each figure shows, in words."""
+        return [a["alt"] or "" for tag, a in self.tags if tag == "img" and "svg" in (a["src"] or "")]
 
 
 def page_of(report: Report) -> Page:
@@ -60,9 +57,11 @@ def page_of(report: Report) -> Page:
     for tag, attributes in page.tags:
         assert tag != "script"
         assert not any(name.startswith("on") for name in attributes)
-        for name in ("src", "href", "srcset", "poster", "xlink:href"):
-            assert (attributes.get(name) or "data:").startswith("data:"), (tag, attributes)
-    headings = re.findall(r"<h[12]>(.*?)</h[12]>", html)
-    assert headings[1] == "Results"
+        for name in ("src", "href", "srcset", "poster"):
+            source = attributes.get(name) or "data:"
+            assert source.startswith("data:"), (tag, attributes)
+            if source.startswith("data:image/svg"):
+                assert b"<script" not in base64.b64decode(source.partition(",")[2])
+    assert re.findall(r"<h[12]>(.*?)</h[12]>", html)[1] == report.sections[0].heading
     assert report.verdict in page.text
     return page

@@ -7,29 +7,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from manip_il.evaluation.compare_report import compare_report
-from manip_il.evaluation.eval_report import eval_report
-from manip_il.evaluation.film import encode_picture
-from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.maps import FailureMap, failure_map, paired_maps
-from manip_il.evaluation.report import Report, RunReport
-from manip_il.evaluation.report_data import CurvePoint, LearningCurve, PolicyRow, Strip
-from manip_il.evaluation.study_report import study_report
+from manip_il.evaluation.certificate import certificate_report
+from manip_il.evaluation.compare_report import compare_report, study_report
+from manip_il.evaluation.eval_report import eval_report, run_report
+from manip_il.evaluation.figures import Curve
+from manip_il.evaluation.report import Report
+from manip_il.evaluation.tables import CLONING, PolicyRow
 
 from .browser import HEIGHT, Opened, chromium, opened
 from .made_evals import far_corner, made_comparison, made_eval, small_film
+from .test_certificate import ACTIONS, certificate, row
+from .test_rounds import RUN
 from .test_study import STUDY
 
 pytestmark = pytest.mark.slow
 
-
-CURVE = LearningCurve(
-    tuple(CurvePoint(400 * i, Proportion(9 * i, 40), f"round {i}", 20 * i, 60.0 * i) for i in (1, 2, 3, 4))
-)
+CURVE = Curve("DAgger", (RUN,))
 RESULT = made_eval("runs/a_policy_with_a_name_that_is_rather_long/round_004/policy/pretrained_model", n=200)
 COMPARISON = made_comparison(far_corner, lambda number, _: number % 37 == 0, seeds=2)
 PLAY = """async (video) => {
@@ -49,34 +45,23 @@ POSTER = """async (video) => {
 
 @dataclass(frozen=True)
 class Case:
-    """A report, and its films in the order of the page. films: their outcomes, None where not known."""
+    """A report, and the captions of its films in the order of the page."""
 
     report: Report
-    films: tuple[bool | None, ...] = ()
     captions: tuple[str, ...] = ()
 
 
 def eval_case() -> Case:
-    films = tuple(small_film(number, success) for number, success in enumerate((True, False, False, True)))
+    films = {False: [small_film(1), small_film(2)], True: [small_film(3)]}
     report = eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films, curve=CURVE)
-    ordered = sorted(films, key=lambda film: bool(film.success))
-    return Case(report, tuple(film.success for film in ordered), tuple(film.caption for film in ordered))
+    return Case(report, tuple(film.caption for some in films.values() for film in some))
 
 
 def quickstart_case() -> Case:
-    films = tuple(small_film(number, None) for number in range(3))
-    picture = encode_picture(np.full((48, 64, 3), 90, dtype=np.uint8), "png")
-    report = RunReport(
-        title="panda pick_place",
-        verdict="DAgger solves 95.0 % of 200 unseen starts.",
-        command="manip-il quickstart",
-        rows=(PolicyRow.of("DAgger", RESULT, 4000), PolicyRow.of("cloning", RESULT, 4000, RESULT, "cloning")),
-        curve=CURVE,
-        films=films,
-        strips=(Strip("DAgger", tuple((0.1 * i, picture) for i in range(6))),),
-        timings={"training": 65.0},
-    )
-    return Case(report, (None,) * 3, tuple(film.caption for film in films))
+    films, rows = [small_film(number) for number in range(3)], [PolicyRow("DAgger", RESULT, 4000)]
+    rows.append(PolicyRow("cloning", RESULT, 4000, RESULT, CLONING))
+    report = run_report(rows, films, curves=[CURVE], title="t", verdict="DAgger solves 95.0 %.", command="manip-il x")
+    return Case(report, tuple(film.caption for film in films))
 
 
 CASES = {
@@ -84,6 +69,7 @@ CASES = {
     "compare": lambda: Case(compare_report(COMPARISON, "manip-il compare a b")),
     "quickstart": quickstart_case,
     "study": lambda: Case(study_report(STUDY, "Study", "manip-il study x.yaml")),
+    "certify": lambda: Case(certificate_report(certificate(row("action", ACTIONS)), "manip-il certify", {})),
 }
 
 
@@ -124,8 +110,8 @@ def test_it_opens_quietly_and_fits_the_window(
 def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path):
     with opened(browser, file, 1280) as window:
         films = window.page.query_selector_all("video")
-        assert len(films) == len(case.films)
-        for film, success, caption in zip(films, case.films, case.captions, strict=True):
+        assert len(films) == len(case.captions)
+        for film, caption in zip(films, case.captions, strict=True):
             assert film.is_visible()
             played = film.evaluate(PLAY)
             assert played["error"] is None
@@ -133,8 +119,6 @@ def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path)
             assert played["at"] >= 0.2
             assert played["width"] == 64
             assert caption in film.evaluate("film => film.closest('figure').innerText")
-            heading = film.evaluate("film => film.closest('.films').previousElementSibling?.innerText")
-            assert success is None or heading == ("Successes" if success else "Failures")
         assert (window.console, window.requests) == ([], [])
 
 
@@ -157,43 +141,6 @@ def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, c
         assert any("Content Security Policy" in line for line in window.console)
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-def test_the_failure_map_shows_the_marks_of_the_data(browser: Browser, tmp_path: Path, width: int):
-    eval_case().report.write(tmp_path / "report.html")
-    with opened(browser, tmp_path / "report.html", width) as window:
-        for index in range(2):
-            assert marks_in(window, index) == counted(failure_map(RESULT))
-
-
-def test_the_maps_of_a_comparison_show_what_one_side_alone_failed_in(browser: Browser, tmp_path: Path):
-    CASES["compare"]().report.write(tmp_path / "report.html")
-    with opened(browser, tmp_path / "report.html", 1280) as window:
-        for arm, map_of_arm in enumerate(paired_maps(COMPARISON)):
-            assert marks_in(window, 2 * arm) == marks_in(window, 2 * arm + 1) == counted(map_of_arm)
-        assert marks_in(window, 0)["failed"] > 0 == marks_in(window, 2)["failed"]
-
-
-def counted(given: FailureMap) -> dict[str, int]:
-    return {kind: sum(mark.outcome == kind for mark in given.marks) for kind in ("failed", "shared", "solved")}
-
-
-def marks_in(window: Opened, index: int) -> dict[str, int]:
-    """How many marks of each kind one map has, all of them inside its frame and large enough to be visible."""
-    return window.evaluate(
-        """(index) => {
-            const map = document.querySelectorAll('svg.map')[index], frame = map.getBoundingClientRect();
-            const inside = (mark) => {
-                const box = mark.querySelector('circle').getBoundingClientRect();
-                return box.width > 2 && box.left >= frame.left && box.right <= frame.right
-                    && box.top >= frame.top && box.bottom <= frame.bottom;
-            };
-            const count = (kind) => [...map.querySelectorAll('.mark-' + kind)].filter(inside).length;
-            return {failed: count('failed'), shared: count('shared'), solved: count('solved')};
-        }""",
-        index,
-    )
-
-
 def first_words(window: Opened) -> str:
     """The first heading's words, which must stand in the first window without scrolling."""
     words, bottom = window.evaluate(
@@ -211,7 +158,7 @@ def too_wide(window: Opened) -> list[str]:
     return window.evaluate(
         """() => {
             const main = document.querySelector('main').getBoundingClientRect();
-            const parts = 'h1, h2, h3, p, li, td, th, dd, dt, summary, video, svg.map, .bar-line';
+            const parts = 'h1, h2, h3, p, li, td, th, dd, dt, summary, video, .figure';
             return [...document.querySelectorAll(parts)]
                 .filter(one => one.getBoundingClientRect().right > main.right + 1 && one.offsetParent !== null
                     && !one.closest('thead'))

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from manip_il.cli.trials import suite_conditions
 from manip_il.collect.drivers import PolicyDriver, RandomDriver
 from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
@@ -17,6 +16,7 @@ from manip_il.errors import UsageError
 from manip_il.evaluation import runner
 from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.runner import episode_result, evaluate
+from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.sim.env import EnvConfig, ManipEnv
@@ -26,7 +26,7 @@ from ..learn.tiny_policies import write_checkpoint
 
 SEEDS = stream_seeds("certificate", 12)
 ENV = EnvConfig("fetch", horizon=12)
-ALL = suite_conditions("all", "pick_place", sees=False)
+ALL = suite_conditions("all", EnvConfig(), sees=False)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """Tests agree with published examples and with counting every table or every flip of signs."""
 
 import itertools
-from math import comb
 
 import pytest
 from hypothesis import given
@@ -10,16 +9,12 @@ from hypothesis import strategies as st
 from manip_il.errors import ManipError
 from manip_il.evaluation.significance import (
     compare_paired,
-    fisher_exact,
     format_p,
-    holm,
     mcnemar_exact,
-    paired_difference_interval,
     sign_flip_exact,
 )
 
 outcomes = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=60)
-confidences = st.sampled_from([0.5, 0.8, 0.9, 0.95, 0.99])
 few = st.lists(st.integers(-3, 3), max_size=9)
 
 
@@ -43,29 +38,10 @@ def test_mcnemar_survives_counts_beyond_floating_point():
     assert 0 < mcnemar_exact(1_000, 1_100) < 1  # 2 to the 2100: a float ends at 2 to the 1024
 
 
-@pytest.mark.parametrize(
-    ("table", "low", "high"),
-    [
-        # Fagerland, Lydersen, Laake (2014), Statistics in Medicine 33, 2850-2875: both worked examples
-        ((1, 1, 7, 12), -0.507, -0.026),
-        ((59, 6, 16, 80), -0.1186, -0.0046),
-        # Altman et al. (2000), Statistics with Confidence, table 6.2
-        ((14, 5, 0, 22), 0.011, 0.226),
-    ],
-)
-def test_newcombes_paired_interval_agrees_with_worked_examples(
-    table: tuple[int, int, int, int], low: float, high: float
-):
-    digits = 5e-5 if round(low, 3) != low else 5e-4
-    assert paired_difference_interval(*table) == pytest.approx((low, high), abs=digits)
-
-
-@given(outcomes, confidences)
-def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(
-    pairs: list[tuple[bool, bool]], confidence: float
-):
+@given(outcomes)
+def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(pairs: list[tuple[bool, bool]]):
     a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    forward, backward = compare_paired(a, b, confidence=confidence), compare_paired(b, a, confidence=confidence)
+    forward, backward = compare_paired(a, b), compare_paired(b, a)
     low, high = forward.interval
     assert -1 <= low <= forward.difference <= high <= 1
     assert backward.interval == pytest.approx((-high, -low), abs=1e-12)
@@ -89,7 +65,7 @@ def test_without_a_significant_difference_the_verdict_says_so():
 def test_unpaired_lengths_are_refused_with_both():
     with pytest.raises(ManipError, match=r"2 episodes of A with 1 of B"):
         compare_paired([True, False], [True])
-    with pytest.raises(ManipError, match="no episodes"):
+    with pytest.raises(ManipError, match="0 episodes"):
         compare_paired([], [])
 
 
@@ -117,43 +93,3 @@ def test_the_test_counts_every_way_to_flip_the_signs(differences: list[int]):
 @given(few)
 def test_training_seeds_that_agree_in_every_episode_are_no_further_evidence(differences: list[int]):
     assert sign_flip_exact([3 * d for d in differences]) == sign_flip_exact(differences)
-
-
-def tables(successes: tuple[int, ...], sizes: tuple[int, ...]) -> float:
-    """The same p by whole numbers: every table with these sums that is no likelier."""
-    total, (a, b, c) = sum(successes), sizes
-    ways = {
-        (i, j): comb(a, i) * comb(b, j) * comb(c, total - i - j)
-        for i in range(a + 1)
-        for j in range(b + 1)
-        if 0 <= total - i - j <= c
-    }
-    return sum(way for way in ways.values() if way <= ways[successes[:2]]) / sum(ways.values())
-
-
-@st.composite
-def counts(draw: st.DrawFn) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    sizes = tuple(draw(st.integers(0, 12)) for _ in range(3))
-    return tuple(draw(st.integers(0, size)) for size in sizes), sizes
-
-
-@given(counts())
-def test_the_exact_test_counts_every_table(case: tuple[tuple[int, ...], tuple[int, ...]]):
-    assert fisher_exact(*case) == pytest.approx(tables(*case), abs=1e-9)
-
-
-def test_of_two_groups_it_is_fishers_exact_test():
-    assert fisher_exact((8, 1), (10, 6)) == pytest.approx(0.034965034965)  # R: fisher.test
-
-
-def test_what_is_no_table_is_refused():
-    with pytest.raises(ManipError, match="2 counts of 3 groups"):
-        fisher_exact((1, 2), (3, 3, 3))
-    with pytest.raises(ManipError, match=r"successes \[4, 1\] of \[3, 3\]"):
-        fisher_exact((4, 1), (3, 3))
-
-
-def test_holm_asks_the_smallest_p_for_the_most():
-    assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
-    assert holm([0.5, 0.9]) == [1.0, 1.0]
-    assert holm([]) == []

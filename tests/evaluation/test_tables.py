@@ -6,15 +6,13 @@ import pytest
 from rich.console import Console
 
 from manip_il.errors import ManipError
-from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.report_data import PolicyRow
-from manip_il.evaluation.tables import Table, evaluation_lines, evaluation_table, policy_table, print_table
+from manip_il.evaluation.tables import CLONING, EXPERT, PolicyRow, Table, evaluation_table, policy_table, print_table
 
 from .made_evals import made_eval
 
 ROWS = [
-    PolicyRow("Expert", Proportion(199, 200), kind="expert"),
-    PolicyRow("BC [mlp]", Proportion(171, 200), 1234, Proportion(160, 200), 70.5, kind="cloning"),
+    PolicyRow("Expert", made_eval(fails=lambda *_: False), colour=EXPERT),
+    PolicyRow("BC [mlp]", made_eval(), 1234, colour=CLONING),
 ]
 
 
@@ -29,19 +27,20 @@ def test_a_pipe_gets_plain_lines_one_a_policy_without_empty_columns():
     text = printed(policy_table(ROWS), terminal=False, width=40)
     assert "\x1b" not in text
     line = next(line for line in text.splitlines() if "BC [mlp]" in line)
-    for number in (str(ROWS[1].success), "1,234", "70.5"):
+    for number in (str(ROWS[1].success), "1,234"):
         assert number in line
     assert "disturbed" not in text
     expert = [cell.strip() for cell in text.splitlines()[3].strip("|").split("|")]
-    assert expert == ["Expert", "-", str(ROWS[0].success), "-", "-"]
+    assert expert[:3] == ["Expert", "-", str(ROWS[0].success)]
 
 
 @pytest.mark.parametrize("width", [80, 140])
 def test_a_terminal_gets_colour_and_whole_numbers(width: int):
     out = printed(policy_table(ROWS), terminal=True, width=width)
     assert "\x1b[" in out
-    assert "85.5 %" in out
-    assert "[80.0, 89.7]" in out
+    rate, _, interval = str(ROWS[1].success).partition(" [")
+    assert rate in out
+    assert interval in out
 
 
 def test_an_evaluation_has_a_row_for_each_condition_after_that_of_all():
@@ -51,8 +50,6 @@ def test_an_evaluation_has_a_row_for_each_condition_after_that_of_all():
     assert table.rows[0][1:4] == ("120", str(result.success), str(result.success_at_end))
     assert table.rows[2][2] == str(result.by_condition["knocked"].success)
     assert len(evaluation_table(made_eval(conditions=("nominal",))).rows) == 1
-    assert evaluation_lines(result)[0].startswith("failures by the phase that they ended in: descend ")
-    assert evaluation_lines(made_eval(fails=lambda *_: False)) == []
 
 
 def test_a_table_in_markdown_escapes_what_would_break_it():

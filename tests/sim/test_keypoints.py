@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.cli.trials import read_condition
+from manip_il.evaluation.suites import read_condition
 from manip_il.robots.robot import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, Look

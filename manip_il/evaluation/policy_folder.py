@@ -1,0 +1,41 @@
+"""Where a policy lies: in the folder itself, in a checkpoint, or in a run."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from manip_il.errors import UsageError
+
+_PLACES = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
+_NEWEST = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")
+EXPECTED = "expected an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
+_REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
+
+
+def find_policy(path: Path) -> Path:
+    """Return the `pretrained_model` folder in that folder, a checkpoint or a run: the best one, else the newest.
+
+    Raises `UsageError` if there is none.
+    """
+    for place in _PLACES:
+        if (path / place / "config.json").is_file():
+            return path / place
+    for place in _NEWEST:
+        if found := sorted(path.glob(f"{place}/config.json")):
+            return found[-1].parent
+    wanted = f"LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
+    raise UsageError(f"no policy in {path}; expected {wanted}")
+
+
+def require_source(path: Path) -> None:
+    """Raise `UsageError` if nothing is at `path` that could be compared."""
+    if not path.exists():
+        raise UsageError(f"{path} does not exist; {EXPECTED}{hub_hint(path)}")
+
+
+def hub_hint(path: Path, kind: str = "") -> str:
+    """Return how to pull a path that looks like a repo on the Hub; nothing for others. kind: `datasets/`."""
+    if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
+        return ""
+    return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"

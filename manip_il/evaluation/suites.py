@@ -1,0 +1,97 @@
+"""Suites of conditions that evaluations run under, and what of a condition has an effect on a task."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import manip_il
+from manip_il import checks
+from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
+from manip_il.sim.conditions import Condition, merged
+from manip_il.sim.config import EnvConfig
+from manip_il.sim.shape import draws_shape
+from manip_il.stock.table import STOCK
+
+SUITES = {
+    "nominal": ("nominal",),
+    "disturbed": ("knocked", "sensing", "late"),
+    "randomised": ("object", "view", "clutter", "dynamics"),
+    "all": ("nominal", "knocked", "sensing", "late", "object", "view", "clutter", "dynamics"),
+}
+CONDITIONS = (*SUITES["all"], "random_actions")
+_YAML = (".yaml", ".yml")
+
+
+def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
+    """Return the conditions of a suite, in the order in which seeds take turns.
+
+    Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera; with
+    sizes that the task can take. Raises `UnknownName` for a suite, `UsageError` for a file that is not one or if
+    nothing is left.
+    """
+    asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
+    left = [one for condition in asked if (one := _for_task(condition, env, sees=sees)) is not None]
+    if not left:
+        blind = "" if sees else " and a policy without cameras"
+        raise NoEffect(f"--suite={suite} changes nothing for {env.task}{blind}; choose another suite")
+    return tuple(left)
+
+
+def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
+    """Return what `--vary` names as one condition, from which every episode draws; none for no names.
+
+    Raises `UnknownName` for another name, `UsageError` for what is no YAML of ranges or changes nothing here.
+    """
+    if not names:
+        return ()
+    if odd := next((name for name in names if name not in CONDITIONS[1:] and not name.endswith(_YAML)), None):
+        raise UnknownName("--vary", odd, CONDITIONS[1:])
+    kept = _for_task(merged([read_condition(name) for name in names]), env, sees=sees)
+    if kept is None:
+        raise NoEffect(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
+    return (kept,)
+
+
+def require_suite(suite: str) -> None:
+    """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; nothing is read."""
+    if suite.endswith(_YAML):
+        if not Path(suite).is_file():
+            raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")
+    elif suite not in (*SUITES, *CONDITIONS):
+        raise UnknownName("suite", suite, [*SUITES, *CONDITIONS[1:]])
+
+
+def read_condition(name: str) -> Condition:
+    """Return a condition by its name, or a YAML of ranges by its path; `UsageError` names what is wrong with it."""
+    require_suite(name)
+    path = Path(name) if name.endswith(_YAML) else _suites_folder() / f"{name}.yaml"
+    tree = checks.read_yaml(path, "a YAML of ranges")
+    if not isinstance(tree, dict | None):
+        raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
+    return Condition.from_mapping(path.stem, tree or {})
+
+
+def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
+    """What of a condition has an effect in an environment, see `Condition.for_world`."""
+    from manip_il.tasks.table import get_task  # here, as a wrong name needs no simulator
+    from manip_il.tasks.task import TakesShape
+
+    if env.task in STOCK:  # which takes none
+        return None if condition.ranges else condition
+    task = get_task(env.task, env.object)
+    if "shape" in condition.ranges and isinstance(task, TakesShape) and not draws_shape(env.object):
+        raise UsageError(
+            f"{condition.name}: shape is drawn if --task.object is any, not {env.object or 'a cube'}; say so"
+        )
+    return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes, shape=env.object)
+
+
+def _suites_folder() -> Path:
+    """The suites' folder: beside the package in a checkout, else where an installation puts data."""
+    places = (Path(manip_il.__file__).parents[1] / "configs", Path(sys.prefix) / "share" / "manip_il")
+    for place in places:
+        if (place / "suites" / "nominal.yaml").is_file():
+            return place / "suites"
+    raise ManipError(f"the suites' YAML files are missing; looked in {' and '.join(map(str, places))}; install again")

@@ -1,0 +1,202 @@
+"""Every page says first how good, then why, escapes what it is given, and says no less if nothing or all fails."""
+
+import base64
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from manip_il.errors import ManipError
+from manip_il.evaluation.arm import Arm
+from manip_il.evaluation.compare_report import arm_colours, compare_report, condition_table, paired_maps, study_report
+from manip_il.evaluation.comparison import Comparison
+from manip_il.evaluation.eval_report import eval_report, run_report
+from manip_il.evaluation.figures import Bar, Curve, curve_figures, rates_figure
+from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.report import Film, Report, Section, Still, flatten
+from manip_il.evaluation.rounds import format_seconds, history
+from manip_il.evaluation.tables import BASELINE, CLONING, PolicyRow
+from manip_il.sim.conditions import Condition
+
+from .made_evals import far_corner, made_comparison, made_eval, without_detail
+from .page import EVIL, Page, page_of
+from .test_rounds import RUN, records
+from .test_study import STUDY
+
+COMMAND = "manip-il eval --policy.path=runs/a/best --suite=all"
+MP4, JPEG = b"\0\0\0\x18ftypisom" + b"\0" * 20, b"\xff\xd8\xff\xe0" + b"\0" * 20
+FILMS = {True: [Film("Seed 5", MP4)], False: [Film("Seed 3", MP4, poster=JPEG), Film("Seed 4", MP4)]}
+RESULT = made_eval()
+REPORT = eval_report(RESULT, COMMAND, {"eval": {"n_episodes": 120}}, FILMS, curve=Curve("DAgger", (RUN,)))
+SELDOM = made_comparison(far_corner, lambda number, _: number % 37 == 0)
+
+
+@pytest.fixture(scope="module")
+def page() -> Page:
+    return page_of(REPORT)
+
+
+def test_the_verdict_has_success_and_the_main_phase():
+    phase, count = next(iter(RESULT.failures.items()))
+    failed = 120 - RESULT.success.successes
+    assert REPORT.verdict == (
+        f"runs/a/best succeeds in {RESULT.success} of 120 unseen episodes of panda pick_place; "
+        f"{count} of its {failed} failures end in the phase {phase}."
+    )
+
+
+def test_the_parts_stand_in_the_order_of_what_one_asks():
+    assert re.findall(r"<h2>(.*?)</h2>", REPORT.render()) == [
+        *("Results", "Success against cost", "Where it fails", "How it looks", "How it was made"),
+    ]
+
+
+def test_every_condition_is_in_the_table_and_the_figure(page: Page):
+    for name, part in RESULT.by_condition.items():
+        assert f"{name} {part.success.n} {part.success}" in page.text
+        assert f"{name}: {part.success}" in page.figures[0]
+
+
+def test_the_map_counts_what_it_shows(page: Page):
+    failed, solved = 120 - RESULT.success.successes, RESULT.success.successes
+    maps = [words for words in page.figures if "Starts and goals" in words]
+    assert [words.partition(" seen from ")[2] for words in maps] == [
+        f"{view}: {solved} solved, {failed} failed, from start to goal" for view in ("above", "the side")
+    ]
+
+
+def test_failures_are_shown_before_successes_and_none_is_lost(page: Page):
+    places = [page.text.index(word) for word in ("Failures", "Seed 3", "Seed 4", "Successes", "Seed 5")]
+    assert places == sorted(places)
+    video = [attributes for tag, attributes in page.tags if tag == "video"]
+    assert len(video) == 3
+    assert {"controls", "muted", "autoplay", "loop", "playsinline"} <= set(video[0])
+    assert video[0]["src"] == "data:video/mp4;base64," + base64.b64encode(MP4).decode()
+
+
+def test_if_nothing_or_everything_failed_the_page_says_so():
+    good = eval_report(made_eval(fails=lambda *_: False), COMMAND)
+    assert good.verdict.startswith("runs/a/best succeeds in all 120 unseen episodes")
+    text = page_of(good).text
+    assert "No failure in 120 episodes." in text
+    assert "Phase that it ended in" not in text
+    bad = eval_report(made_eval(fails=lambda *_: True), COMMAND)
+    assert bad.verdict.startswith("runs/a/best fails in all 120 unseen episodes of panda pick_place: 0.0 % [")
+
+
+def test_a_file_with_success_alone_still_has_its_page():
+    page = page_of(eval_report(without_detail(made_eval()), COMMAND))
+    assert not any("Starts and goals" in words for words in page.figures)
+    assert "not recorded" in page.text
+
+
+def test_the_page_says_what_conditions_draw_why_it_has_no_films_and_which_interval_it_has():
+    conditions = (Condition(), Condition("knocked", knock=(0.05, 0.08)))
+    made = replace(RESULT, settings=replace(RESULT.settings, conditions=conditions), until_width=0.1)
+    text = page_of(eval_report(made, COMMAND, no_films="no OpenGL here")).text
+    assert "What the conditions draw nominal nothing knocked knock 0.05 to 0.08, knock_step 5 to 24" in text
+    assert "No films: no OpenGL here" in text
+    assert "confidence sequence" in text
+
+
+def test_a_run_has_its_policies_their_curves_and_how_it_was_made():
+    rows = [PolicyRow("DAgger", RESULT, 1234, RESULT), PolicyRow("cloning", RESULT, 400, colour=CLONING)]
+    beside = Curve("cloning", (RUN[:1],), CLONING, ("labels",))
+    film = Film("DAgger", MP4, stills=(Still("0.4 s", JPEG),))
+    page = page_of(
+        run_report(
+            rows, [film], curves=[Curve("DAgger", (RUN,)), beside], title="t", verdict="DAgger wins.", command="c",
+            config={"policy": {"hidden": 256, "name": None}}, timings={"training": 200.0},
+        )
+    )  # fmt: skip
+    for words in ("1,234", "policy.hidden 256 policy.name none", "training 3 min 20 s", "DAgger, round 2", "0.4 s"):
+        assert words in page.text
+    curves = [words for words in page.figures if "Validation" in words]
+    assert curves[0] == "Validation success over labels: DAgger, cloning"
+    assert [words.partition(": ")[2] for words in curves[1:]] == ["DAgger"] * (len(curves) - 1)
+
+
+def test_a_comparison_tells_the_four_counts_and_each_condition():
+    [pair] = SELDOM.pairs
+    page = page_of(compare_report(SELDOM, COMMAND, ["Of every run the last round."]))
+    assert SELDOM.verdict.startswith("runs/dagger is better than runs/cloning by ")
+    assert (
+        f"Of 120 paired episodes both solved {pair.both}, only runs/dagger {pair.only_right}, "
+        f"only runs/cloning {pair.only_left}, and neither {pair.neither}. Of every run the last round."
+    ) in page.text
+    knocked = made_comparison(lambda _, detail: detail["condition"] == "knocked", lambda *_: False)
+    rows = {row[0]: row[1:] for row in condition_table(knocked).rows}
+    assert rows["knocked"] == ("40", "0.0 %", "100.0 %", "+100.0 points")
+    assert rows["nominal"] == ("40", "100.0 %", "100.0 %", "+0.0 points")
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_the_maps_of_a_comparison_show_who_failed_in_what(seeds: int):
+    made = made_comparison(lambda number, _: number < 30, lambda number, _: 20 <= number < 35, seeds)
+    for figure in paired_maps(made):
+        assert figure.words.endswith(
+            "85 solved by both, 10 failed by both, 20 failed by runs/cloning, 5 failed by runs/dagger"
+        )
+
+
+def test_without_histories_and_details_the_numbers_alone_are_left():
+    bare = [
+        Arm(arm.name, tuple(replace(m, history=(), chosen=None, result=without_detail(m.test)) for m in arm.members))
+        for arm in SELDOM.arms
+    ]
+    report = compare_report(Comparison(*bare), COMMAND)
+    assert [section.heading for section in report.sections] == ["Results"]
+    assert "Both ran the same 120 test episodes." in page_of(report).text
+
+
+def test_both_fingerprints_are_there_if_they_differ():
+    result = replace(made_eval(fails=lambda *_: False), fingerprint={"mujoco": "9"})
+    other = replace(SELDOM.right.members[0], result=result)
+    text = page_of(compare_report(Comparison(SELDOM.left, Arm("runs/dagger", (other,))), COMMAND)).text
+    assert "runs/dagger.mujoco 9" in text
+    assert "runs/cloning.mujoco 3.11.0" in text
+
+
+def test_a_study_has_a_curve_a_cost_and_its_baseline_is_grey():
+    page = page_of(study_report(STUDY, "t", "manip-il study x.yaml", {"at": "end"}))
+    assert sum("Validation success over" in words for words in page.figures) == 3
+    assert "dagger, training seed 0, collect and fit" in page.text
+    colours = arm_colours(STUDY)
+    assert colours["cloning"] == BASELINE
+    assert len(set(colours.values())) == 3
+
+
+def test_whatever_comes_from_outside_is_escaped():
+    made = made_eval(EVIL, phases=(EVIL,), conditions=(EVIL, f"{EVIL}2"))
+    evil = replace(made, robot=EVIL, task=EVIL, fingerprint={EVIL: EVIL})
+    assert (
+        page_of(eval_report(evil, EVIL, {EVIL: EVIL}, {True: [Film(EVIL, MP4, EVIL)]}, EVIL)).text.count("alert") > 20
+    )
+    arms = [
+        Arm(f"{EVIL}{side}", tuple(replace(one, path=Path(EVIL), result=evil) for one in arm.members))
+        for side, arm in zip("lr", SELDOM.arms, strict=True)
+    ]
+    assert page_of(compare_report(Comparison(*arms), EVIL, (EVIL,))).text.count("alert") > 20
+
+
+def test_a_figure_is_the_same_bytes_and_starts_above_0_only_if_nothing_is_left_out():
+    bars = [Bar("a $name_of$ many words that is rather long", (Proportion(3, 4),)), Bar("b", (Proportion(1, 4),) * 2)]
+    assert rates_figure(bars).svg == rates_figure(bars).svg
+    assert rates_figure(bars).width <= 480  # or it would not be readable on a phone
+    seeds = Curve("two", (RUN, history(records((0.5, 0.6)), "x")))
+    assert len(curve_figures([seeds], target=0.9)) == 3
+    with pytest.raises(ManipError, match="without a round"):
+        Curve("a", ((),))
+
+
+def test_a_page_without_its_first_sentence_is_refused():
+    with pytest.raises(ManipError, match="verdict is empty"):
+        Report(title="t", verdict=" ", command="c", sections=(Section("Results"),))
+
+
+def test_settings_and_durations_read_as_on_the_command_line():
+    assert flatten({"a": {"b": True, "c": []}, "d": {}, "e": [1, None]}) == {
+        **{"a.b": "true", "a.c": "(empty)", "d": "(empty)", "e": "1, none"}
+    }
+    assert [format_seconds(s) for s in (4.21, 200, 3_900)] == ["4.2 s", "3 min 20 s", "1 h 05 min"]
