@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -196,8 +196,14 @@ def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -
     write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
-def _require_equal(fields: Sequence[str], left: str, one: EvalResult, right: str, other: EvalResult) -> None:
-    for what in fields:
-        ours, theirs = getattr(one, what), getattr(other, what)
+def _require_equal(names: Sequence[str], left: str, one: EvalResult, right: str, other: EvalResult) -> None:
+    """Raise `MismatchError` naming the first field, of the settings too, in which two evaluations differ."""
+    plain = [name for name in names if name != "settings"]
+    sides = [(name, getattr(one, name), getattr(other, name)) for name in plain]
+    if "settings" in names:
+        own = [field.name for field in fields(EvalSettings)]
+        sides += [(name, getattr(one.settings, name), getattr(other.settings, name)) for name in own]
+    for name, ours, theirs in sides:
         if ours != theirs:
-            raise MismatchError(what, left, ours, right, theirs)
+            words = ("; ".join(map(str, side)) if isinstance(side, tuple) else side for side in (ours, theirs))
+            raise MismatchError(name, left, next(words), right, next(words))

@@ -156,7 +156,7 @@ def sides(here: Path, policy: Path) -> None:
         (["run", "policy", "--eval.n_episodes=0"], 2, "expected at least 1"),
         (["two", "three"], 1, "two has 2, three 3, of which 2 are the same"),
         (["two", "elsewhere"], 1, "share no seed"),
-        (["two", "long"], 1, "settings differs"),
+        (["two", "long"], 1, "horizon differs: two has 8, long has 100"),
         (["two", "lift"], 1, "task differs: two has reach, lift has lift"),
         (["three", "run"], 2, "one is evaluated already; give two eval.json, or two policies"),
         (["run", "policy", "--seed=1001"], 2, "seed is 1001"),

@@ -102,7 +102,7 @@ def test_what_is_not_paired_is_refused():
         Comparison(one("A", HARD), one("B", HARD[:50]))
     with pytest.raises(MismatchError, match=r"robot differs: A has panda, B has fetch"):
         Comparison(one("A", HARD), Arm("B", (made_member(HARD, robot="fetch"),)))
-    with pytest.raises(MismatchError, match="settings differs"):
+    with pytest.raises(MismatchError, match=r"tolerance differs: A has 0\.02, B has 0\.05"):
         Comparison(one("A", HARD), Arm("B", (made_member(HARD, settings=EvalSettings(100, 0.05)),)))
     with pytest.raises(UsageError, match="compared with itself"):
         Comparison(one("A", HARD), one("A", EASY))

@@ -181,7 +181,7 @@ def test_unlike_results_are_not_compared():
         compare_results(result([True]), result([True], first_seed=500))
     with pytest.raises(MismatchError, match="task differs: mlp has pick, act has push"):
         compare_results(result([True]), result([True], policy="act", task="push"))
-    with pytest.raises(MismatchError, match="settings"):
+    with pytest.raises(MismatchError, match="suite differs: mlp has nominal, mlp has knocked"):
         compare_results(result([True]), result([True], settings=replace(SETTINGS, suite="knocked")))
 
 
@@ -211,8 +211,8 @@ def test_a_policy_is_the_same_wherever_it_lay():
         ({"policy_sha256": "cd"}, "policy_sha256"),
         ({"robot": "fetch"}, "robot"),
         ({"task": "lift"}, "task"),
-        ({"settings": EvalSettings(100, 0.05)}, "settings"),
-        ({"settings": EvalSettings(100, 0.02, conditions=(Condition("k", mass=(0.1, 0.2)),))}, "settings"),
+        ({"settings": EvalSettings(100, 0.05)}, "horizon"),
+        ({"settings": replace(SETTINGS, conditions=(Condition("k", mass=(0.1, 0.2)),))}, "conditions"),
     ],
 )
 def test_what_differs_is_named_with_both_sides(changes, what):
