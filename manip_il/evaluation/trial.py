@@ -10,7 +10,6 @@ from typing import Protocol
 
 from manip_il.collect.drivers import ExpertDriver, PolicyDriver
 from manip_il.collect.environments import env_fingerprint
-from manip_il.learn.policy_files import policy_cameras, policy_sha256
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.fingerprint import canonical_json
@@ -19,6 +18,7 @@ from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import suite_conditions
+from manip_il.learn.policy_files import policy_cameras, policy_sha256
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import EnvConfig
 from manip_il.stock.table import ROBOT as STOCK

@@ -58,15 +58,10 @@ class PolicyFunction(nn.Module):
 
     def __init__(self, policy: LearnedPolicy) -> None:
         super().__init__()
-        module = policy.module
         self.numbers = [key for key in (STATE, ENVIRONMENT_STATE) if key in policy.checkpoint.numbers]
-        if isinstance(module, MLPNetwork):
-            self.network, self.cameras, self.encoders = module, list[str](), nn.ModuleList()
-        else:
-            from manip_il.learn.cnn.modeling_cnn import CNNPolicy
-
-            assert isinstance(module, CNNPolicy)
-            self.network, self.cameras, self.encoders = module.model, module.cameras, module.encoders
+        self.cameras = sorted(IMAGES + camera for camera in policy.cameras)
+        self.policy: Any = policy.module
+        self.network: MLPNetwork = self.policy.model if self.cameras else self.policy
         self.requires_grad_(False).eval()
 
     @property
@@ -76,9 +71,10 @@ class PolicyFunction(nn.Module):
 
     @override
     def forward(self, observation: dict[str, Tensor]) -> Tensor:
-        pictures = [to_float(observation[key].permute(0, 3, 1, 2)) for key in self.cameras]
-        keypoints = [encoder(picture) for encoder, picture in zip(self.encoders, pictures, strict=True)]
-        return self.network.actions(torch.cat([*(observation[key] for key in self.numbers), *keypoints], dim=1))
+        if not self.cameras:
+            return self.network.actions(torch.cat([observation[key] for key in self.numbers], dim=1))
+        pictures = {key: to_float(observation[key].permute(0, 3, 1, 2)) for key in self.cameras}
+        return self.network.actions(self.policy.network_inputs({**observation, **pictures}))
 
 
 class _InOrder(nn.Module):

@@ -195,7 +195,7 @@ def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
 
 
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
-    """Return weights (n, d) and units (n,) by name of a `pretrained_model` folder; `ManipError` if unreadable."""
+    """Return weights (n, d) and units (n,) by name from a `pretrained_model` folder; raises `ManipError`."""
     path = Path(pretrained_model) / WEIGHTS
     try:
         return {name.removeprefix("model."): tensor for name, tensor in load_file(path).items()}

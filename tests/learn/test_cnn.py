@@ -195,7 +195,7 @@ def test_the_truth_is_read_off_joints_and_keypoints_and_learnt_while_training_on
     used = truth[table["label_valid"][:, 0] != -1]
     scaled = (truth[:20] - used.mean(0)) / np.where(used.std(0) < 1e-4, np.inf, used.std(0))
     with torch.no_grad():
-        read_off = policy._inputs(batch)[:, -6:]
+        read_off = policy.network_inputs(batch)[:, -6:]
         error = (read_off - torch.from_numpy(scaled)).abs().mean(-1) * valid
     more = policy.forward(batch, "none")[0] - unweighted.forward(batch, "none")[0]
     torch.testing.assert_close(more, (0.5 * error).float(), rtol=1e-3, atol=1e-4)

@@ -117,7 +117,8 @@ def test_an_mlp_acts_as_its_checkpoint_on_real_and_random_observations(mlp):
 
 @pytest.mark.parametrize("observation", ["images", "both"])
 def test_a_cnn_acts_as_its_checkpoint_whatever_the_number_of_pictures(observation, spec, tmp_path):
-    checkpoint = write_cnn(tmp_path / "cnn", spec, observation, loss="mixture")
+    size = 6 if observation == "images" else 0  # what is read off the pictures
+    checkpoint = write_cnn(tmp_path / "cnn", spec, observation, loss="mixture", privileged_size=size)
     check_equal(checkpoint, [drawn(spec, 1, pictures=True), drawn(spec, 21, pictures=True)])
 
 

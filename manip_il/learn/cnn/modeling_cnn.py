@@ -150,7 +150,7 @@ class CNNPolicy(MLPPolicy):
         # A convolution's sums depend on the number of pictures: one row at a time. Half precision is for learning.
         with torch.autocast(state.device.type, enabled=False):
             keys = (*self.inputs, *self.cameras)
-            rows = [self._inputs({key: batch[key][i : i + 1] for key in keys}) for i in range(len(state))]
+            rows = [self.network_inputs({key: batch[key][i : i + 1] for key in keys}) for i in range(len(state))]
             return self.model.act(torch.cat(rows))
 
     @torch.no_grad()
@@ -161,7 +161,7 @@ class CNNPolicy(MLPPolicy):
         """
         if self.privileged is None:
             raise UsageError("this cnn reads nothing off its pictures but actions: it learnt without environment_state")
-        found, moves = self._inputs(batch)[:, self.seen_size :], self.truth_scale > 0
+        found, moves = self.network_inputs(batch)[:, self.seen_size :], self.truth_scale > 0
         return self.truth_mean + torch.where(moves, found / self.truth_scale.clamp(min=1e-12), 0.0)
 
     @override
@@ -190,7 +190,8 @@ class CNNPolicy(MLPPolicy):
         self.model = MLPNetwork(self.seen_size + size, n, config.network_shape())
 
     @override
-    def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
+    def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return joint state, keypoints and what is read off them (B, d)."""
         keypoints = [encoder(batch[key]) for encoder, key in zip(self.encoders, self.cameras, strict=True)]
         seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
         if self.privileged is None:

@@ -48,7 +48,7 @@ class MLPPolicy(PreTrainedPolicy):
 
         When it does not train, the mean absolute errors of acting, too: of the arm [rad] and the gripper [m].
         """
-        inputs = self._inputs(batch)
+        inputs = self.network_inputs(batch)
         losses, valid = self._row_losses(inputs, batch), self._of_frames(LABEL_VALID, batch)
         # `where`, as 0 * inf is NaN
         losses = losses if valid is None else torch.where(valid, losses, torch.zeros_like(losses))
@@ -60,7 +60,7 @@ class MLPPolicy(PreTrainedPolicy):
     @override
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """Return one action a row, (B, n): absolute, but of `ee_delta` the motion of the hand."""
-        return self.model.act(self._inputs(batch))
+        return self.model.act(self.network_inputs(batch))
 
     @override
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
@@ -90,7 +90,8 @@ class MLPPolicy(PreTrainedPolicy):
         error = (self.model.act(inputs) - batch[ACTION]).abs().mean(0)
         return {"arm_error": error[ARM].mean().item(), "gripper_error": error[GRIPPER].item()}
 
-    def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
+    def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return the network's inputs (B, d) of a batch of observations."""
         return torch.cat([batch[key] for key in self.inputs], dim=-1)
 
     def _of_frames(self, name: str, batch: dict[str, Tensor]) -> Tensor | None:
