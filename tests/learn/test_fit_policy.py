@@ -221,7 +221,6 @@ def test_an_image_policy_trains_from_the_cache_and_without_it(pictures, tmp_path
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     one = {"observation": "images", "batch_size": 4, "steps": 2, "image_augment": False}
     fit(pictures, tmp_path / "cached", VISION, **one)
-    assert list((tmp_path / "cache").rglob("*"))
     fit(pictures, tmp_path / "loaded", VISION, **one, image_cache_gb=0.0, num_workers=0)
     ours, theirs = ([record["loss"] for record in records(tmp_path / name)] for name in ("cached", "loaded"))
     assert ours == theirs
