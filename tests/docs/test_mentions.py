@@ -79,7 +79,7 @@ def test_every_message_in_a_table_of_remedies_is_one_that_the_program_has(page: 
     table = text.partition("| message | remedy |\n|---|---|\n")[2].partition("\n\n")[0]
     quoted = [text for row in table.splitlines() for text in re.findall(r"`([^`]+)`", row.split(" | ")[0])]
     assert len(quoted) >= 5
-    for text in set(quoted) - _OTHERS:
+    for text in set(quoted) - _NOT_OURS:
         assert any(_says(message, text.split()) for message in _messages()), text
 
 
