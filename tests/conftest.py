@@ -51,7 +51,7 @@ LONG = (
     "store/test_kills.py",
     "lerobot_commands/test_policies.py",
     "store/test_push_pull.py",
-    "doctor/test_doctor_lerobot.py",
+    "doctor/test_planted.py",
     "cli/test_commands.py",
     "faults/test_kills.py",
     "lerobot_commands/test_datasets.py",

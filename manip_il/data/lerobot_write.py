@@ -127,6 +127,7 @@ class TableWriter:
         video = video or VideoConfig()
         films = [key for key, feature in features.items() if feature["dtype"] == "video"]
         self._films = {key: CameraFiles(folder, key, video, int(fps), file_sizes[1]) for key in films}
+        self._source: Dataset | None = None  # of the films that were copied last
         self._pooled = PooledStatistics()
         self._rows: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}  # text -> its number, as they first appear
@@ -151,10 +152,11 @@ class TableWriter:
                 statistics[key] = picture_statistics(columns[key])
         plain = {key: one for key, one in columns.items() if key not in statistics and one.dtype.kind not in "OU"}
         statistics |= column_statistics(plain)
+        another, self._source = bool(films) and films[0] is not self._source, films[0] if films else None
         with _explained(self.root):
             row = self._write_data(columns, list(dict.fromkeys(tasks)))
             for key, film in self._films.items():
-                clip = film.copy(*films[0].clip(key, films[1])) if films else film.write(columns[key])
+                clip = film.copy(*films[0].clip(key, films[1]), again=another) if films else film.write(columns[key])
                 row |= {
                     f"videos/{key}/chunk_index": clip.chunk,
                     f"videos/{key}/file_index": clip.file,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any
@@ -69,7 +70,16 @@ class RobotTaskSpec:
         checks.name("robot", self.robot)
         checks.name("task", self.task)
         checks.whole("fps", self.fps, 1, MOST_FPS)
-        for camera in self.cameras:
+        checks.whole("sim_state_size", self.sim_state_size, 0, sys.maxsize)
+        for what in ("joint_names", "environment_state_names", "phases", "keypoints"):
+            for one in checks.array(what, getattr(self, what)):
+                checks.text(f"a name in {what}", one, checks.LONGEST_NAME)
+        for what in ("instruction", "action_meaning", "object", "robot_type"):
+            checks.text(what, getattr(self, what))
+        checks.truth("video", self.video)
+        for side in checks.array("image_size", self.image_size, 2):
+            checks.whole("a side of image_size", side, 0, sys.maxsize)
+        for camera in checks.array("cameras", self.cameras):
             checks.name("a camera", camera)
         if len(set(self.cameras)) < len(self.cameras):
             raise ManipError(f"cameras are {checks.shorten(self.cameras)}; expected each once")

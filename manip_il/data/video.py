@@ -54,8 +54,10 @@ class CameraFiles:
         self._stream: VideoStream | None = None
         self._copied: dict[Path, tuple[int, int]] = {}  # chunk and file index
 
-    def copy(self, source: Path, first: int, frames: int) -> Clip:
-        """Take frames that another dataset has in a file: it is copied, once."""
+    def copy(self, source: Path, first: int, frames: int, *, again: bool = False) -> Clip:
+        """Take frames that another dataset has in a file: it is copied, once, or `again` once for every dataset."""
+        if again:
+            self._copied.clear()
         if source not in self._copied:
             self.close()
             name, *place = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)

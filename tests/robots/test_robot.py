@@ -211,7 +211,7 @@ def test_a_driven_joint_that_moves_no_finger_is_one_line(tmp_path: Path):
     assert "gripper.joints ('lid') from gripper.closed to gripper.open move none of gripper.fingers" in line
 
 
-@pytest.mark.parametrize("text", ["joints: [", "a: &a [1]\nb: *a\n", "\tjoints: 3", ""])
+@pytest.mark.parametrize("text", ["joints: [", "\tjoints: 3", ""])
 def test_text_that_is_no_yaml_is_one_line(text: str, tmp_path: Path):
     path = write(tmp_path)
     path.write_text(text)
