@@ -22,7 +22,7 @@ DAGGER = (
 )
 EVAL = ("eval", *SIZES, "--eval.n_episodes=16", "--eval.batch_size=2", "--eval.films=0")
 UNEQUAL = ("log", "config.yaml", "report.html")  # they name the folder, and when what happened
-CLOCK = ("seconds", "samples_per_s")
+CLOCK = ("seconds", "samples_per_s", "data_share")
 
 
 @pytest.fixture(scope="module")
