@@ -89,9 +89,6 @@ def test_a_run_leaves_policies_that_act_and_the_best_of_them(config, tmp_path):
     k = policy.checkpoint.numbers["observation.environment_state"]
     assert policy.act(np.zeros((1, 8), np.float32), np.zeros((1, k), np.float32)).shape == (1, 8)
     assert results[-1].steps >= config.steps
-    card = (tmp_path / "checkpoints" / "last" / "pretrained_model" / "README.md").read_text()
-    assert f"PPO, {results[-1].steps:,} simulated control steps, seed 0" in card
-    assert "3 episodes" in card
     assert not list(tmp_path.rglob("*.p[kt]*"))
 
 

@@ -64,7 +64,7 @@ def test_every_page_of_the_docs_is_on_the_map():
     assert {path.name for path in ROOT.glob("docs/*.md")} - {"README.md"} <= on_the_map
 
 
-_OTHERS = {
+_NOT_OURS = {
     "unhealthy",
     "Invalid credentials",
     "401 Unauthorized",
