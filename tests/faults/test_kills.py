@@ -30,7 +30,7 @@ EVAL = (
     "--output_dir={folder}/out",
 )
 UNEQUAL = ("config.yaml", "report.html")  # they name the folder, and when what happened
-CLOCK = ("seconds", "samples_per_s")
+CLOCK = ("seconds", "samples_per_s", "data_share")
 
 
 @dataclass
