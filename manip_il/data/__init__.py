@@ -8,7 +8,7 @@ that a dataset takes of rollouts.
 episode by episode with pyarrow and PyAV. `build.py` makes a dataset of a folder of journals, one of several datasets,
 or one with other numbers in some of its columns. `dataset.py` opens any LeRobot dataset: `info.py` and
 `episode_table.py` parse its `meta/`, `camera.py` finds and decodes its pictures, `statistics.py` has its statistics.
-Around them: LeRobot's paths and Arrow types (`lerobot_layout.py`), its metadata for policies (`lerobot_library.py`),
+Around them: LeRobot's paths and Arrow types (`lerobot_layout.py`), several as one for its policies (`joined.py`),
 parquet (`parquet_files.py`), films and pictures (`video.py` writes, `pictures.py` reads, and nothing else opens a
 picture). `gate.py` tries in a child process what arrives from outside.
 

@@ -70,7 +70,7 @@ def quantile_places(count: int) -> dict[str, int]:
 
 
 class PooledStatistics:
-    """Statistics of all episodes that were added, which have the same columns."""
+    """Statistics of all episodes or datasets that were added, which have the same columns; quantiles may be missing."""
 
     def __init__(self) -> None:
         self._first: Statistics = {}
@@ -78,11 +78,12 @@ class PooledStatistics:
         self._count = 0
 
     def add(self, episode: Statistics) -> None:
-        """Add the statistics of one episode.
+        """Add the statistics of one of them.
 
         Mean and std as in Chan et al. (1979), Updating formulae and a pairwise algorithm, eq. 2.1.
         """
-        new = {name: np.concatenate([one[name].ravel() for one in episode.values()]) for name in _POOLED}
+        names = [name for name in _POOLED if all(name in one for one in episode.values())]
+        new = {name: np.concatenate([one[name].ravel() for one in episode.values()]) for name in names}
         more = int(next(iter(episode.values()))["count"][0])
         old, self._count = self._sums, self._count + more
         if not old:
@@ -91,7 +92,8 @@ class PooledStatistics:
         share = more / self._count
         apart = new["mean"] - old["mean"]
         spread = (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
-        self._sums = {name: old[name] + share * (new[name] - old[name]) for name in ("mean", *QUANTILES)} | {
+        means = [name for name in ("mean", *QUANTILES) if name in old and name in new]
+        self._sums = {name: old[name] + share * (new[name] - old[name]) for name in means} | {
             "min": np.minimum(old["min"], new["min"]),
             "max": np.maximum(old["max"], new["max"]),
             "std": np.sqrt(spread),
@@ -105,7 +107,7 @@ class PooledStatistics:
             shape, size = one["mean"].shape, one["mean"].size
             own = {name: values[start : start + size].reshape(shape) for name, values in self._sums.items()}
             own["count"] = np.array([self._count])
-            statistics[key] = {name: own[name] for name in STAT_NAMES}
+            statistics[key] = {name: own[name] for name in STAT_NAMES if name in own}
             start += size
         return statistics
 

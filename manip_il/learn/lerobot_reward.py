@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
+from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.data.lerobot_library import read_metadata
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
 from manip_il.learn.samples import Pictures, Samples, Windows
@@ -36,7 +36,7 @@ def score_by_lerobot(
             f"{folder} is a reward model of LeRobot's, which loads models by name and may run code that comes with "
             "them; if you trust its source, add --trust=true"
         )
-    meta = read_metadata(root)
+    meta = JoinedDatasets([root])
     config, model, preprocessor = _load(folder, meta)
     features = [key for key in config.input_features if key != "task"]
     if missing := [key for key in features if key not in meta.features]:
@@ -48,8 +48,8 @@ def score_by_lerobot(
     samples = Samples(
         Windows(table[EPISODE_INDEX].reshape(-1), ahead),
         {key: torch.from_numpy(column.copy()) for key, column in table.items()},
-        {key: Pictures.decode([dataset], key) for key in meta.camera_keys if key not in meta.depth_keys},
-        np.array([*map(str, meta.tasks.index)], object),
+        {key: Pictures.decode([dataset], key) for key in meta.camera_keys},
+        np.array(meta.tasks, object),
     )
     found: list[torch.Tensor] = []
     with threads(1), torch.inference_mode():

@@ -18,9 +18,10 @@ from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
 from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, STATS, TASK_INDEX, TIMESTAMP
-from manip_il.data.lerobot_library import learn_actions
 from manip_il.data.schema import ACTION, LABEL_VALID, STATE
+from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, NotFiniteError, UsageError
 
 I64 = NDArray[np.int64]
@@ -164,7 +165,7 @@ class TrainingData:
 def load_data(
     roots: Sequence[Path],
     policy: PreTrainedConfig,
-    meta: Any,
+    meta: JoinedDatasets,
     *,
     eval_split: float,
     seed: int,
@@ -173,9 +174,9 @@ def load_data(
 ) -> TrainingData:
     """Return the samples of datasets, taken as one, for a policy that has its features.
 
-    meta: LeRobot's metadata of the datasets. encode: of actions (N, n) and states (N, n), where others are learnt than
-    the datasets'. on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and what `windows_of`
-    and `Windows.usable` raise.
+    meta: of the datasets; its statistics follow the actions. encode: of actions (N, n) and states (N, n), where others
+    are learnt than the datasets'. on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and
+    what `windows_of` and `Windows.usable` raise.
     """
     features = [*(policy.input_features or {}), ACTION]
     cameras = [key for key in features if key in meta.camera_keys]
@@ -185,20 +186,19 @@ def load_data(
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     require_finite(table, numbers)
     if encode is not None:
-        learn_actions(meta, encode(table[ACTION].astype(np.float32), table[STATE]))
-        table[ACTION] = meta.learnt_actions
+        table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])
+        meta.stats |= column_statistics({ACTION: table[ACTION]})
     episodes = table[EPISODE_INDEX].astype(np.int64)
     windows = windows_of(policy, features, episodes)
     usable = windows.usable(valid_frames(table), getattr(policy, "drop_n_last_frames", 0))
     train, held_out = split_by_episode(episodes[usable], eval_split, seed)
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
-    opened = [Dataset.open(root) for root in roots]
     samples = Samples(
         windows,
         {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)},
-        {key: Pictures.decode(opened, key, on_frames) for key in cameras},
-        np.array([*map(str, meta.tasks.index)], object),
+        {key: Pictures.decode(meta.datasets, key, on_frames) for key in cameras},
+        np.array(meta.tasks, object),
     )
     return TrainingData(samples, usable[train], usable[held_out], table, _digest(roots, table))
 

@@ -24,7 +24,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
-from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
@@ -84,7 +84,7 @@ class Trainer:
         self.accelerator = _accelerator(self.lerobot.policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
         checkpoint = last_checkpoint(output_dir, resume=resume)
-        self.meta: Any = read_metadata(*sources.roots)
+        self.meta: Any = JoinedDatasets(sources.roots)
         self.lerobot.set_features(self.meta.features, input_columns(config, first.root, first.info))
         self._check_widths()
         self.data = load_data(

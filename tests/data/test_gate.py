@@ -16,7 +16,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
-from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.joined import JoinedDatasets
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.store.transfer import open_remote, pull, push
@@ -114,8 +114,8 @@ def test_a_playlist_is_no_video(tmp_path: Path, two: s.RobotTaskSpec, filmed: li
 
 
 def test_a_row_whose_task_has_no_text_is_one_line(root: Path):
-    meta = read_metadata(root, root)
-    own = np.zeros(sum(meta.frames), np.int64)
+    meta = JoinedDatasets([root, root])
+    own = np.zeros(meta.total_frames, np.int64)
     assert meta.joint_tasks(own).tolist() == own.tolist()
     own[-1] = 7
     with pytest.raises(ManipError, match=r"lift: rows have the task 7, which meta/tasks\.parquet does not hold"):
@@ -129,5 +129,4 @@ def test_pandas_metadata_that_names_no_column_is_not_looked_at(
     tasks = pq.read_table(root / layout.TASKS)
     about = json.dumps({"index_columns": ["absent"], "columns": [{"name": 3}], "column_indexes": [7]})
     pq.write_table(tasks.replace_schema_metadata({"pandas": about}), root / layout.TASKS)
-    tasks_read: Any = read_metadata(root).tasks
-    assert list(tasks_read.index) == tasks.column("task").to_pylist()
+    assert JoinedDatasets([root]).tasks == tasks.column("task").to_pylist()

@@ -13,7 +13,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 
-from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion, conversion_for
@@ -230,7 +230,7 @@ def test_what_cannot_be_is_refused_in_one_line(panda):
 
 
 def test_lerobots_own_training_has_no_kinematics(table, sources):
-    meta: Any = read_metadata(*sources.roots)
+    meta: Any = JoinedDatasets(sources.roots)
     with pytest.raises(ManipError, match="train with manip-il train"):
         make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
     policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)

@@ -14,7 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.joined import JoinedDatasets
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
@@ -100,7 +100,7 @@ def test_a_batch_is_that_of_lerobots_loader(settings, observation, write, table,
     sources = write(table, spec=pictured)
     config = FitConfig({**settings, "pretrained_backbone_weights": None}, observation=observation, batch_size=8)
     samples = Trainer(sources, config, tmp_path / "run").data.samples
-    meta = read_metadata(*sources.roots)
+    meta = JoinedDatasets(sources.roots)
     ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in samples.windows.deltas.items()}
     lerobots: Any = LeRobotDataset(meta.repo_id, root=sources.roots[0], delta_timestamps=ahead or None)
     for rows in (np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])):

@@ -1,0 +1,97 @@
+"""One dataset or several learnt from as one, in the words in which LeRobot's factories ask for a dataset's metadata."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data.dataset import Dataset
+from manip_il.data.info import PICTURES
+from manip_il.data.lerobot_layout import TASKS, Features
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
+from manip_il.data.statistics import PooledStatistics, Statistics
+from manip_il.errors import ManipError, MismatchError
+
+I64 = NDArray[np.int64]
+LEARNT = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)  # columns that datasets taken as one must share
+_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # LeRobot's, for every camera
+
+
+class JoinedDatasets:
+    """Datasets in the order in which their frames are numbered.
+
+    features: LeRobot's table of the columns and cameras that all have in one shape, without depth. stats: of all their
+    frames, each counted once; the cameras' are ImageNet's, as `lerobot-train` takes them. tasks: each text once.
+
+    Raises `ManipError` for a folder that is no dataset, `MismatchError` for several of different rates or columns to
+    learn from.
+    """
+
+    def __init__(self, roots: Sequence[Path]):
+        self.datasets = tuple(Dataset.open(root) for root in roots)
+        self.roots, first = tuple(roots), self.datasets[0]
+        for other in self.datasets[1:]:
+            _check_same_nature(first, other)
+        self.repo_id, self.fps = f"local/{first.root.name}", first.fps
+        self.features: Features = {
+            key: {"dtype": one.dtype, "shape": one.shape, "names": one.names}
+            for key, one in first.features.items()
+            if all(_shape(other, key) == one.shape for other in self.datasets)
+            and (one.is_rgb or one.dtype not in PICTURES)
+        }
+        self.camera_keys = [key for key, one in self.features.items() if one["dtype"] in PICTURES]
+        self.total_frames = sum(map(len, self.datasets))
+        self.stats = self._statistics()
+        texts = [_texts(dataset) for dataset in self.datasets]
+        self.tasks = list(dict.fromkeys(text for own in texts for text in own))
+        places = {text: place for place, text in enumerate(self.tasks)}
+        self._numbers = [np.array([places[text] for text in own], np.int64) for own in texts]
+
+    def joint_tasks(self, own: I64) -> I64:
+        """Return the place in `tasks` of every frame's text, (N,), from the number that its dataset has for it, (N,).
+
+        Raises `ManipError` for a number without a text.
+        """
+        found: list[I64] = []
+        pieces = np.split(own, np.cumsum([*map(len, self.datasets)])[:-1])
+        for root, numbers, piece in zip(self.roots, self._numbers, pieces, strict=True):
+            if len(unknown := piece[(piece < 0) | (piece >= len(numbers))]):
+                raise ManipError(f"{root}: rows have the task {unknown[0]}, which {TASKS} does not hold")
+            found.append(numbers[piece])
+        return np.concatenate(found)
+
+    def _statistics(self) -> Statistics:
+        pooled = PooledStatistics()
+        for dataset in self.datasets:
+            numbers = self.features.keys() & dataset.statistics.keys() - {*self.camera_keys}
+            pooled.add({key: dataset.statistics[key] for key in self.features if key in numbers})
+        imagenet = {name: np.array(values, np.float32).reshape(3, 1, 1) for name, values in _IMAGENET.items()}
+        cameras = {key: self.datasets[0].statistics.get(key, {}) | imagenet for key in self.camera_keys}
+        return pooled.result() | cameras
+
+
+def _check_same_nature(left: Dataset, right: Dataset) -> None:
+    """Raise `MismatchError` unless rate and the columns that are learnt from agree."""
+    sides = str(left.root), str(right.root)
+    if left.fps != right.fps:
+        raise MismatchError("rate", sides[0], left.fps, sides[1], right.fps)
+    for key in LEARNT:
+        ours, theirs = _shape(left, key), _shape(right, key)
+        if ours != theirs:
+            raise MismatchError(f"column {key}", sides[0], ours or "none", sides[1], theirs or "none")
+
+
+def _shape(dataset: Dataset, key: str) -> tuple[int, ...]:
+    """A column's shape; () if there is none."""
+    return dataset.features[key].shape if key in dataset.features else ()
+
+
+def _texts(dataset: Dataset) -> list[str]:
+    texts = dataset.tasks
+    if sorted(texts) != list(range(len(texts))):
+        found = f"{dataset.root / TASKS}: task_index holds {sorted(texts)[:9]}"
+        raise ManipError(f"{found}; expected 0 to {len(texts) - 1}, each once")
+    return [texts[number] for number in range(len(texts))]
