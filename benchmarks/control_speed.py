@@ -18,7 +18,7 @@ import numpy as np
 from _machine import describe_machine
 
 from manip_il.collect.expert import Expert
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
 

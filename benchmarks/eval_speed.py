@@ -34,7 +34,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.sources import Sources
 from manip_il.learn.train import fit
 from manip_il.mdp import Episode
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
 

@@ -23,8 +23,7 @@ from manip_il.collect.drivers import driver_of
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
-from manip_il.robots import ik
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS, ik
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.scene import build_scene

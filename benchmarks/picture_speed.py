@@ -23,7 +23,7 @@ from _machine import describe_machine
 
 from manip_il.collect.expert import Expert
 from manip_il.mdp import State
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look

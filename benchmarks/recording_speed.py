@@ -33,7 +33,7 @@ from manip_il.collect.record import collect, provenance
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording
 from manip_il.data.journal import episode_path, list_episodes, read_journal
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pytest
 
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.tasks.table import TASKS
 
 ONE_CUBE = ("reach", "lift", "pick_place")

@@ -140,7 +140,7 @@ class EnvGroup:
         there is one. reward: of `carry`, empty for the task's own.
         """
         from manip_il.data.dataset import UNKNOWN_TASK
-        from manip_il.robots.robot import get_robot
+        from manip_il.robots.table import get_robot
         from manip_il.sim.scene import build_scene
         from manip_il.tasks.table import get_task
 

@@ -56,8 +56,8 @@ class RobotNewOptions:
         """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
         from manip_il.data.atomic import write_file
         from manip_il.evaluation.robot_page import advice, verdict
-        from manip_il.robots.robot import get_robot
         from manip_il.robots.suggest import found_lines, suggest, yaml_of
+        from manip_il.robots.table import get_robot
 
         target = self._target()
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
@@ -122,7 +122,7 @@ class RobotCheckOptions:
             raise UnknownName("task in --tasks:", odd, NAMES)
         require_new(self.output_dir, overwrite=self.overwrite)
         from manip_il.robots.gripper import sweep
-        from manip_il.robots.robot import get_robot
+        from manip_il.robots.table import get_robot
 
         sweep(get_robot(self.robot))
 

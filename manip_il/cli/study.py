@@ -204,7 +204,7 @@ def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
     """Return a test in an arm's environment; None where it would change nothing."""
     from manip_il.evaluation.suites import varied
     from manip_il.evaluation.trial import Trial
-    from manip_il.robots.robot import get_robot  # here, as help needs no simulator
+    from manip_il.robots.table import get_robot  # here, as help needs no simulator
 
     env = replace(env, robot=test.robot or env.robot)
     get_robot(env.robot)

@@ -29,7 +29,7 @@ from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.variation import OLDER

@@ -21,7 +21,8 @@ from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.robots.gripper import sweep
 from manip_il.robots.reach import reach_of
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
+from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import EnvConfig

@@ -119,7 +119,7 @@ class HandDelta(Conversion):
 
     @property
     def _in_degrees(self) -> bool:
-        from manip_il.robots.robot import get_robot
+        from manip_il.robots.table import get_robot
 
         return get_robot(self.robot).lerobot is not None
 
@@ -139,7 +139,7 @@ def conversion(space: str, robot: str) -> Conversion:
         return Conversion() if space == JOINT_TARGET else JointDelta()
     if robot not in ROBOTS:  # no path either: the name may be a downloaded checkpoint's
         raise UnknownName("robot", robot, ROBOTS, f"{EE_DELTA} needs its kinematics; known: {', '.join(ROBOTS)}")
-    from manip_il.robots.robot import get_robot
+    from manip_il.robots.table import get_robot
 
     if (joints := len(get_robot(robot).joints)) < _POSE:
         raise UsageError(f"{EE_DELTA} has {_POSE} numbers, and the arm of {robot} {joints} joints; use {JOINT_DELTA}")
@@ -157,7 +157,7 @@ def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
         needed = " or ".join(JOINT_TARGETS)
         raise MismatchError("meaning of the action", "the dataset", spec.action_meaning, space, needed)
     if isinstance(found, HandDelta):
-        from manip_il.robots.robot import get_robot
+        from manip_il.robots.table import get_robot
 
         if (names := get_robot(spec.robot).joint_names) != spec.joint_names:
             raise MismatchError("joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names)
@@ -173,6 +173,6 @@ def same_width(actions: NDArray[Any], states: NDArray[Any], space: str) -> None:
 @cache
 def _arm_ik(robot: str) -> ArmIK:
     from manip_il.robots.ik import ArmIK
-    from manip_il.robots.robot import get_robot
+    from manip_il.robots.table import get_robot
 
     return ArmIK(get_robot(robot))

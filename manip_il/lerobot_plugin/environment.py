@@ -17,7 +17,7 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName, UsageError, silence_ffmpeg_warning
 from manip_il.learn.names import OBSERVATIONS
 from manip_il.option import option_of
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.config import EnvConfig as SimConfig
 from manip_il.sim.env import ManipEnv, environment_state_names

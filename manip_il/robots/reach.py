@@ -26,9 +26,10 @@ from manip_il.checks import open_regular
 from manip_il.robots import HERE, ROBOTS
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.meeting import CLEARANCE, Body
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_off_vertical, hand_down, off_yaw
 from manip_il.robots.spec import arm_spec
+from manip_il.robots.table import get_robot
 
 if TYPE_CHECKING:
     from manip_il.robots.ik import ArmIK

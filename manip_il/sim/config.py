@@ -50,7 +50,7 @@ class EnvConfig:
         self._take_object()
         self._take_reward()
         if not self.control_hz:
-            from manip_il.robots.robot import get_robot  # here, as help needs no robot
+            from manip_il.robots.table import get_robot  # here, as help needs no robot
 
             object.__setattr__(self, "control_hz", get_robot(self.robot).fps)
         if not 1 <= self.control_hz <= MOST_HZ:

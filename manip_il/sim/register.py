@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gymnasium
 
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.tasks.table import TASKS
 
 

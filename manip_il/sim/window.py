@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import RenderError, UnknownName
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.config import FILM, EnvConfig
 from manip_il.sim.view import ViewModel

@@ -12,7 +12,7 @@ from manip_il.cli.main import main
 from manip_il.errors import RenderError
 from manip_il.evaluation import robot_page
 from manip_il.robots.reach import Reach, keep_reach
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 
 from ..robots.own import tree_of, write
 

@@ -26,8 +26,8 @@ from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer, fit
 from manip_il.robots import robot as robots
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.robot import get_robot
 from manip_il.robots.servos import LeRobotConfig
+from manip_il.robots.table import get_robot
 
 from ..tables import every_large_robot, every_robot
 from .conftest import write_table

@@ -21,7 +21,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, STATE
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.scene import build_scene
 
 from ..so_follower import Camera, arm, record, recorders_features

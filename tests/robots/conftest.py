@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from manip_il.robots import files, robot
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
+from manip_il.robots.table import get_robot
 
 from .own import write
 

@@ -27,7 +27,8 @@ from manip_il.evaluation.robot_page import advice, check_report, task_table, ver
 from manip_il.evaluation.tables import CLONING, EXPERT
 from manip_il.robots import reach
 from manip_il.robots.reach import Reach
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.home import meeting_at
 from manip_il.sim.scene import PREFIX, build_scene
 from manip_il.tasks.table import TASKS

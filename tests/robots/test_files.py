@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from manip_il.errors import UsageError
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
+from manip_il.robots.table import get_robot
 
 from .own import model_of, tree_of, write
 

@@ -12,8 +12,9 @@ from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError
 from manip_il.robots.gripper import sweep
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.robot import FOUND, Robot, get_robot
+from manip_il.robots.robot import FOUND, Robot
 from manip_il.robots.rotations import angle_across, angle_off_vertical
+from manip_il.robots.table import get_robot, read_robot
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import EnvConfig
 
@@ -68,7 +69,7 @@ def test_gains_suit_the_inertia_that_a_joint_moves(own: Robot):
 
 
 def test_what_is_found_is_the_same_again(own: Robot, path: Path):
-    again = Robot.read(path)
+    again = read_robot(path)
     assert all(getattr(again, name) == getattr(own, name) for name in FOUND)
 
 

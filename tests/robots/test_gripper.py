@@ -11,10 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from manip_il.robots import ROBOTS
 from manip_il.robots.geometry import distance, outline
 from manip_il.robots.gripper import TOUCH, Gripper, sweep
-from manip_il.robots.robot import ROBOTS, Robot, get_robot
+from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
+from manip_il.robots.table import get_robot
 from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 

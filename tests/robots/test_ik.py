@@ -11,9 +11,10 @@ import pytest
 
 from manip_il.robots import ik
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down, rotation_matrix, rotation_vector
 from manip_il.robots.spec import arm_model
+from manip_il.robots.table import get_robot
 
 from ..tables import every_robot
 

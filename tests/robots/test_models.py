@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.suggest import suggest
+from manip_il.robots.table import get_robot
 
 from .own import EXAMPLES, model_of, tree_of, write
 

@@ -15,8 +15,9 @@ from manip_il.robots import HERE, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.meeting import Body
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, kept_reach, reach_of
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_between, hand_down, off_yaw
+from manip_il.robots.table import get_robot
 from manip_il.tasks.grasp import LEAN
 
 from ..tables import every_robot

@@ -14,8 +14,9 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.robots import reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import Reach
-from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
+from manip_il.robots.table import get_robot
 from manip_il.sim.scene import PREFIX, build_scene
 
 from ..scenes import drive, started, world_at_home

@@ -13,8 +13,9 @@ from manip_il.collect.environments import env_actions, env_spec
 from manip_il.data.schema import ACTION, LEROBOT_TYPES, SERVOS, STATE, features
 from manip_il.errors import ManipError
 from manip_il.lerobot_plugin import ManipILEnv
-from manip_il.robots.robot import ROBOTS, get_robot
+from manip_il.robots import ROBOTS
 from manip_il.robots.servos import LeRobotConfig, ServoUnits
+from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv, joint_state
 from manip_il.sim.scene import build_scene

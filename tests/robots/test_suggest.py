@@ -11,8 +11,8 @@ import yaml
 
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
-from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.suggest import found_lines, suggest, yaml_of
+from manip_il.robots.table import get_robot, read_robot
 
 from .own import ARM, JAWS, model_of, tree_of
 
@@ -60,7 +60,7 @@ def text_of(folder: Path, model: str) -> tuple[str, str]:
     (folder / "arm.xml").write_text(model)
     text = yaml_of(suggest(folder / "arm.xml"), "arm.xml")
     (folder / "arm.yaml").write_text(text)
-    return text, found_lines(Robot.read(folder / "arm.yaml"))
+    return text, found_lines(read_robot(folder / "arm.yaml"))
 
 
 def test_what_is_found_may_be_said(tmp_path: Path):
@@ -68,7 +68,7 @@ def test_what_is_found_may_be_said(tmp_path: Path):
     assert len(text.splitlines()) <= 15
     said = tmp_path / "said.yaml"
     said.write_text(text + "".join(line[2:] for line in found.splitlines(keepends=True)[1:]))
-    one, other = Robot.read(tmp_path / "arm.yaml"), Robot.read(said)
+    one, other = read_robot(tmp_path / "arm.yaml"), read_robot(said)
     assert one.joints == other.joints
     for name in ("home", "gains", "forces", "armature"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-4, atol=1e-4)
@@ -83,7 +83,7 @@ def test_a_name_is_a_value_whatever_is_in_it(tmp_path: Path):
     text, found = text_of(tmp_path, model.replace("<equality>", "<!--").replace("</equality>", "-->"))
     assert yaml.safe_load(text)["hand"] == name
     assert yaml.safe_load(text + found) == yaml.safe_load(text)
-    assert Robot.read(tmp_path / "arm.yaml").hand == name
+    assert read_robot(tmp_path / "arm.yaml").hand == name
 
 
 def test_a_third_finger_is_left_out_with_a_word_and_opens_with_the_others(tmp_path: Path):
@@ -138,7 +138,7 @@ def test_the_command_writes_a_yaml_that_is_a_robot_and_says_what_it_can_do(tmp_p
     said = capsys.readouterr().out
     assert f"--robot.type={path}" in said
     assert "arm has starts for all" in said
-    assert Robot.read(path).joints
+    assert read_robot(path).joints
     assert main(words) == 2  # there is one
     assert "exists already" in capsys.readouterr().err
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.sim.scene import PREFIX, build_scene, camera_id
 from manip_il.sim.world import World
 

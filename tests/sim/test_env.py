@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.env import EnvConfig, ManipEnv

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from manip_il.evaluation.suites import read_condition
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv

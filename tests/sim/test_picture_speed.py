@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.sim.config import CAMERAS
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "picture_speed.py"

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.env import ManipEnv

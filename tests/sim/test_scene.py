@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UnknownName
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.scene import DT_SIM, _build, build_scene, camera_id
 from manip_il.sim.variation import PER_OBJECT, WORLD_SIZE
 from manip_il.tasks.objects import CUBE_HALF

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from manip_il.errors import ManipError, UnknownName
 from manip_il.rewards.paths import cheapest_path, costs_to_go, plan
 from manip_il.robots.reach import reach_of
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 from manip_il.tasks.furnishing import space_of
 from manip_il.tasks.grid import Grid, descent
 from manip_il.tasks.layout import THINGS, Edge, Layout, Part, path_features

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manip_il.errors import UsageError
-from manip_il.robots.robot import get_robot
+from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import SCENES_KEPT, build_scene
