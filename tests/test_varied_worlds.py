@@ -210,7 +210,7 @@ def test_episodes_of_any_shape_have_the_shapes_that_are_asked_for_and_say_so(tmp
         ("dagger", ["--vary=veiw"], "did you mean 'view'?"),
         ("record", ["--vary=view"], "--vary=view changes nothing for pick_place without cameras"),
         ("record", ["--vary=mine.yaml"], "mine.yaml"),
-        ("record", ["--vary=round.yaml"], "round: shape is drawn where --task.object is any, not a cube"),
+        ("record", ["--vary=round.yaml"], "round: shape is drawn if --task.object is any, not a cube"),
         ("record", ["--vary=round.yaml", "--task.object=box:0.04"], "any, not box:0.04"),
         ("dagger", ["--vary=round.yaml", "--task.type=stack"], "--vary=round.yaml changes nothing for stack"),
     ],

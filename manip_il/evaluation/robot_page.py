@@ -178,6 +178,8 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     space = check.robot.workspace
     if check.table < ENOUGH:
         centre = f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green"
+        if not check.table and check.robot.gripper.files is not None:
+            centre += "; or turn the gripper on the hand by gripper.quaternion"
         narrower = f"take half_width: {check.half_width:g} in place of {space.half_width:g}"
         part = f"The hand gets to {100 * check.table:.0f} % of the workspace on the table"
         lines.append(f"{part}: {narrower if check.half_width else centre}.")
@@ -204,6 +206,8 @@ def _of_task(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
             narrow = max(0.005, math.floor(0.6 * most / 0.005) * 0.005)
             change = f"choose a narrower one, --task.object=box:{narrow:.3g}, or widen gripper.open"
         yield f"{task.name}: its object is {1000 * wide:.0f} mm wide, the gripper opens {1000 * most:.0f} mm: {change}."
+    elif task.drawn and not check.table:
+        return  # said of the whole workspace
     elif task.refused:
         yield f"{task.name}: {task.refused}."
     elif task.clean is not None:

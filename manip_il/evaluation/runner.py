@@ -18,6 +18,7 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
+from manip_il.data.atomic import writing
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.intervals import Proportion
@@ -157,7 +158,7 @@ class EpisodeJournal:
         return add
 
     def _append(self, record: Mapping[str, Any]) -> None:
-        with self.path.open("a", encoding="utf-8") as file:
+        with writing(self.path), self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, allow_nan=False) + "\n")
 
 

@@ -116,7 +116,6 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             "eval": "--policy.path=DIR",
             f"eval --policy.path={ROOT}": "no policy in",
             "push SAMPLE": "REMOTE is missing",
-            "pull file:///nowhere got --revision=main": "--revision=main is only for the Hub",
             "pull hf://me/x@a got --revision=b": "hf://me/x@a and --revision=b differ",
             "push missing hf://me/x": "missing does not exist; expected the folder of a dataset, a run or a policy",
             "push SAMPLE me/x": "'me/x' is not a URL",

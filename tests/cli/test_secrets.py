@@ -7,7 +7,7 @@ import io
 from urllib.parse import quote
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from manip_il.cli.main import main
@@ -49,6 +49,7 @@ def _nowhere():
 @example("sftp://", "u", "22/password", "@h/x", "{}", False, "pull")
 @example("sftp://", "u", "password", "@h/x", "--{}", False, "pull")
 def test_no_tail_of_a_password_is_printed(scheme, user, secret, behind, word, coded, command) -> None:
+    assume(secret[-4:] not in f"{scheme}{user}")
     address = f"{scheme}{user}:{quote(secret, safe='') if coded else secret}{behind}"
     words = word.format(address).split(" ", 1) if word.startswith("--debug") else [word.format(address)]
     said = printed([command, *(["out"] if command == "push" else []), *words, *(["out"] if command == "pull" else [])])

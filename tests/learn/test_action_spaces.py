@@ -24,7 +24,7 @@ from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TAR
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer, fit
-from manip_il.robots import robot as robots
+from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.servos import LeRobotConfig
 from manip_il.robots.table import get_robot

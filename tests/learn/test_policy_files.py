@@ -20,7 +20,7 @@ def test_a_checkpoint_says_what_it_must_be_shown(tmp_path):
     assert policy_cameras(write_checkpoint(tmp_path / "blind", "act", env_spec(ENV))) is None
     spec = env_spec(ENV, DIM)
     meta = Origin.of(spec, env_fingerprint(ENV, DIM), observation="images", look={"brightness": 0.5})
-    assert policy_cameras(write_checkpoint(tmp_path / "dim", "act", spec, "images", meta=meta)) == DIM
+    assert policy_cameras(write_checkpoint(tmp_path / "dim", "act", spec, "images", origin=meta)) == DIM
     spec = env_spec(ENV, CameraConfig(("wrist", "front"), 32, 64))
     other = write_checkpoint(tmp_path / "other", "act", spec, "both")  # as lerobot-train leaves it
     assert policy_cameras(other) == CameraConfig(("wrist", "front"), 32, 64)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.robots import files, robot
+from manip_il.robots import files, table
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 
@@ -14,7 +14,7 @@ from .own import write
 @pytest.fixture(autouse=True)
 def tried_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Models are tried in this process: a child takes half a second to start."""
-    monkeypatch.setattr(robot, "try_models", lambda name, *models: files._compile(name, models))
+    monkeypatch.setattr(table, "try_models", lambda name, *models: files._compile(name, models))
 
 
 @pytest.fixture

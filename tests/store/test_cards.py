@@ -86,7 +86,7 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     spec, run = Dataset.open(SAMPLE).spec, tmp_path / "run"
     meta = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
     write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
-    write_checkpoint(run / "best" / "pretrained_model", "act", spec, meta=meta)
+    write_checkpoint(run / "best" / "pretrained_model", "act", spec, origin=meta)
     text = cards(run, "policy", "user/act")[CARD].decode()
     assert "not measured" in text
     assert "model-index" not in ModelCard(text).data.to_dict()
