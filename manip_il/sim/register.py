@@ -5,15 +5,15 @@ from __future__ import annotations
 import gymnasium
 
 from manip_il.robots import ROBOTS
-from manip_il.tasks.table import TASKS
+from manip_il.tasks import NAMES
 
 
 def _id(name: str) -> str:
     return f"manip_il/{''.join(part.capitalize() for part in name.split('_'))}-v0"
 
 
-ENV_IDS = {_id(f"{robot}_{task}"): (robot, task) for robot in ROBOTS for task in TASKS}
-TASK_IDS = {_id(task): task for task in TASKS}  # their robot is an argument
+ENV_IDS = {_id(f"{robot}_{task}"): (robot, task) for robot in ROBOTS for task in NAMES}
+TASK_IDS = {_id(task): task for task in NAMES}  # their robot is an argument
 
 
 def register_envs() -> None:
