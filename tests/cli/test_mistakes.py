@@ -117,8 +117,6 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             f"eval --policy.path={ROOT}": "no policy in",
             "push SAMPLE": "REMOTE is missing",
             "push missing hf://me/x": "missing does not exist; expected the folder of a dataset, a run or a policy",
-            "push SAMPLE me/x": "'me/x' is not a URL",
-            "pull me/x out": "'me/x' is not a URL",
             "dagger --config_path=missing.yaml": "cannot read missing.yaml",
         },
         tmp_path,

@@ -49,7 +49,7 @@ def bucket(moto: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRe
     return name
 
 
-@pytest.fixture(params=["file", "s3", "sftp", "hub"])
+@pytest.fixture(params=["file", "s3", pytest.param("sftp", marks=pytest.mark.slow), "hub"])
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A URL where nothing is yet, on each kind of remote."""
     if request.param == "sftp":
