@@ -146,10 +146,11 @@ class TableWriter:
             raise ManipError(f"{self.root} is finished: no episodes can be added")
         numbers = np.array([self._tasks.setdefault(text, len(self._tasks)) for text in tasks], np.int64)
         columns = {**columns, **self._index_columns(numbers)}
-        statistics = films[0].picture_statistics[films[1]] if films else {}
+        statistics = dict(films[0].picture_statistics[films[1]]) if films else {}
         for key, feature in self.features.items():
-            if feature["dtype"] in ("video", "image") and key in columns:
-                statistics[key] = picture_statistics(columns[key])
+            if feature["dtype"] in ("video", "image") and key not in statistics:
+                frames = films[0].frames(key, films[0].rows_of(films[1])) if films else columns[key]
+                statistics[key] = picture_statistics(frames)
         plain = {key: one for key, one in columns.items() if key not in statistics and one.dtype.kind not in "OU"}
         statistics |= column_statistics(plain)
         another, self._source = bool(films) and films[0] is not self._source, films[0] if films else None

@@ -68,7 +68,7 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
     for dataset in datasets_in(source):
         if errors := [one for one in examine_folder(dataset) if one.severity is Severity.ERROR]:
             text = f"{dataset} is damaged and was not pushed: {' '.join(str(errors[0]).split())}"
-            raise NotWhole(f"{text}; see all with manip-il data check {dataset}, and repair it with --repair=true")
+            raise NotWhole(f"{text}; see all with manip-il data check, and try manip-il data repair {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         local = list_files(source.absolute(), kind, journals=journals)
         if isinstance(remote, Hub):  # elsewhere a pull gives the folder back as it was

@@ -119,7 +119,7 @@ def test_a_dataset_is_examined_before_its_push(tmp_path: Path):
     (broken / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1")
     (tmp_path / "run" / "config.yaml").write_text("")
     for folder in (broken, broken.parent):
-        with pytest.raises(NotWhole, match=r"is damaged and was not pushed.*--repair=true"):
+        with pytest.raises(NotWhole, match=r"is damaged and was not pushed.*manip-il data repair"):
             push(folder, open_quietly(f"file://{tmp_path}/store"))
     assert not (tmp_path / "store").exists()
 
