@@ -54,10 +54,10 @@ class Source:
 
 
 def open_source(root: Path, robot: str | None = None) -> Source:
-    """Read what is needed to restore a dataset's states; robot: the YAML of its robot, where that does not ship.
+    """Read what is needed to restore a dataset's states; robot: the YAML of its robot, if that does not ship.
 
     Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
-    a robot and task that are known here, `MismatchError` where its states do not fit them.
+    a robot and task that are known here, `MismatchError` if its states do not fit them.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -103,7 +103,7 @@ def relabel_dataset(source: Source, target: Target) -> int:
 
     A state that the expert was not asked in when it was recorded is labelled, too. Returns how many frames have another
     label: its action by more than `NOTICEABLE`, its phase, or whether it is sound. Raises what reading and
-    `rewrite_columns` raise, `ManipError` where a worker dies.
+    `rewrite_columns` raise, `ManipError` if a worker dies.
     """
     scale, dataset = env_actions(source.env).scale, source.dataset
     changed = 0
@@ -128,7 +128,7 @@ def relabel_dataset(source: Source, target: Target) -> int:
 def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> DatasetInfo:
     """Write `source` anew with these cameras' pictures in place of its own; every other column stays as it is.
 
-    Raises `RenderError` where there is no OpenGL, and what reading and `new_dataset` raise.
+    Raises `RenderError` if there is no OpenGL, and what reading and `new_dataset` raise.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
     spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
@@ -144,7 +144,7 @@ def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> Dat
 def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> DatasetInfo:
     """Write the dataset of other scenes of a dataset's states, each frame or branch an episode.
 
-    The same seed gives the same scenes, and more frames begin with the same ones. Raises `NothingToLearnError` where no
+    The same seed gives the same scenes, and more frames begin with the same ones. Raises `NothingToLearnError` if no
     scene has a sound label.
     """
     states = source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE]
