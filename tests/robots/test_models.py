@@ -229,11 +229,12 @@ from manip_il.checks import read_yaml
 from manip_il.errors import ManipError
 from manip_il.robots import ROBOTS
 from manip_il.robots.found import complete
-from manip_il.robots.robot import FOUND, Robot
+from manip_il.robots.robot import FOUND
+from manip_il.robots.table import _said
 import pathlib, sys
 
 def found(path, **home):
-    said = Robot._said(path, read_yaml(path, ""))
+    said = _said(path, read_yaml(path, ""))
     said = {name: value for name, value in said.items() if name not in (*FOUND, "costs", "yaw", "lerobot")}
     try:
         return {name: value for name, value in complete(said | home).items() if name in FOUND}
