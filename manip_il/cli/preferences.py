@@ -150,8 +150,8 @@ class PreferencesFitOptions:
     """Learn a reward of state and action from answers about pairs (Bradley-Terry): an ensemble of small networks.
 
     Every pair is held out by one network; agreement and calibration on those are in report.html. ANSWERS are files of
-    ask or answer, of one person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model is
-    a reward model in LeRobot's form.
+    ask or answer, of one person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model
+    holds the reward.
     """
 
     example: ClassVar[str] = "manip-il preferences fit pairs.json preferences.json --output_dir=runs/reward"
@@ -178,7 +178,7 @@ class PreferencesFitOptions:
 
     def run(self) -> None:
         """Fit, measure on held-out pairs, write the reward and the page."""
-        from manip_il.learn.preference.network import shape_for
+        from manip_il.learn.reward import shape_for
         from manip_il.preferences.answers import Preferences, join_answers
         from manip_il.preferences.fit_report import fit_report, summary_lines
         from manip_il.preferences.fitting import fit_answers
@@ -208,7 +208,7 @@ class PreferencesFitOptions:
     def _write(self, folder: Path, found: Any, clips: Any) -> None:
         from manip_il.data.dataset import Dataset
         from manip_il.evaluation.results import write_json
-        from manip_il.learn.preference.modeling_preference import write_reward
+        from manip_il.learn.reward import write_reward
         from manip_il.learn.training_state import PRETRAINED_MODEL
 
         target = folder / PRETRAINED_MODEL

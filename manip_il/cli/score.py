@@ -7,12 +7,11 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_dataset, require_folder
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import open_output, require_new
-from manip_il.cli.preferences import load_reward, reward_folder
-from manip_il.cli.progress import progress, say
+from manip_il.cli.preferences import load_reward
+from manip_il.cli.progress import say
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -35,11 +34,8 @@ class ScoreOptions:
 
     example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"
     dataset: Path = option(MISSING, "the dataset's folder", positional=True)
-    reward: str = option(
-        MISSING, "folder of manip-il preferences fit, or of a reward model of LeRobot's; progress: true progress"
-    )
+    reward: str = option(MISSING, "folder of manip-il preferences fit; progress: true progress")
     output_dir: Path = option(Path("runs/scores"), "folder of the files")
-    trust: bool = common.trust_option()
     overwrite: bool = option(False, "replace an existing one")
 
     def check(self) -> None:
@@ -77,19 +73,11 @@ class ScoreOptions:
         import numpy as np
 
         from manip_il.errors import ManipError
-        from manip_il.learn.checkpoint import read_config
-        from manip_il.learn.reward import PREFERENCE
 
         if self.reward == PROGRESS:
             if data.progress is None:
                 raise ManipError(f"{self.dataset} has no column progress; give --reward=FOLDER")
             return data.progress
-        folder = reward_folder(Path(self.reward))
-        if read_config(folder)["type"] == PREFERENCE:
-            reward = load_reward(folder)
-            reward.check_fits(str(self.dataset), data.spec)
-            return np.clip(reward.of_inputs(data.inputs).astype(np.float64), 0.0, 1.0)
-        from manip_il.learn.lerobot_reward import score_by_lerobot
-
-        with progress(len(data.states), f"score by {self.reward}") as bar:
-            return score_by_lerobot(self.dataset, folder, trust=self.trust, on_frames=bar.advance)
+        reward = load_reward(Path(self.reward))
+        reward.check_fits(str(self.dataset), data.spec)
+        return np.clip(reward.of_inputs(data.inputs).astype(np.float64), 0.0, 1.0)

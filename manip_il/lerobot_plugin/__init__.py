@@ -1,13 +1,12 @@
 """Our robots and policies in LeRobot's own commands: `--env.discover_packages_path=manip_il.lerobot_plugin`.
 
-Importing it registers the environment type `manip_il`, the policies and the reward model: LeRobot learns of plugins in
-no other way. It takes packages alone; its parser fails on a module without `__path__`.
+Importing it registers the environment type `manip_il` and the policies: LeRobot learns of plugins in no other way. It
+takes packages alone; its parser fails on a module without `__path__`.
 """
 
 from manip_il.learn.action_steps import JointTargetsStep, MeasuredJointsStep
 from manip_il.learn.cnn import CNNConfig
 from manip_il.learn.mlp import MLPConfig
-from manip_il.learn.preference.configuration_preference import PreferenceConfig
 from manip_il.lerobot_plugin.environment import ManipILEnv
 
-__all__ = ["CNNConfig", "JointTargetsStep", "MLPConfig", "ManipILEnv", "MeasuredJointsStep", "PreferenceConfig"]
+__all__ = ["CNNConfig", "JointTargetsStep", "MLPConfig", "ManipILEnv", "MeasuredJointsStep"]

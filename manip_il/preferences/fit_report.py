@@ -9,7 +9,7 @@ from manip_il.evaluation.figures import CLONING, DAGGER, RULE, Figure, drawing, 
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
-from manip_il.learn.preference.fitting import BY_CHANCE
+from manip_il.learn.reward_fit import BY_CHANCE
 from manip_il.preferences.answers import Answers
 from manip_il.preferences.fitting import TIE, Bin, Fitted
 from manip_il.preferences.pairs import Clips

@@ -11,8 +11,7 @@ import torch
 
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
-from manip_il.learn.preference.modeling_preference import write_reward
-from manip_il.learn.preference.network import RewardNetwork, RewardShape, ways_of
+from manip_il.learn.reward import RewardNetwork, RewardShape, ways_of, write_reward
 from manip_il.sim.env import EnvConfig
 
 from ..collect.clones import clone

@@ -12,10 +12,8 @@ from safetensors.torch import load_file, save_file
 
 from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.preference.fitting import Compared, answer_losses, deal, fit_reward
-from manip_il.learn.preference.modeling_preference import write_reward
-from manip_il.learn.preference.network import RewardNetwork, RewardShape, joints_of, shape_for, ways_of
-from manip_il.learn.reward import LearnedReward
+from manip_il.learn.reward import LearnedReward, RewardNetwork, RewardShape, joints_of, shape_for, ways_of, write_reward
+from manip_il.learn.reward_fit import Compared, answer_losses, deal, fit_reward
 from manip_il.preferences.answers import join_answers
 from manip_il.preferences.fit_report import fit_report
 from manip_il.preferences.fitting import calibration, fit_answers
@@ -67,7 +65,7 @@ def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, an
     said = []
     for better in (answers.better, turned):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("manip_il.learn.preference.fitting._EPOCHS", 1)
+            patch.setattr("manip_il.learn.reward_fit._EPOCHS", 1)
             said.append(
                 fit_reward(clips.inputs, Compared(rows[:, 0], rows[:, 1], better, answers.pair), SHAPE, 0).logits
             )
@@ -140,21 +138,6 @@ def test_a_reward_that_does_not_say_what_it_leaves_unread_reads_everything(folde
     assert (first == second).all()
 
 
-def test_ours_and_lerobots_factory_give_the_same_rewards(folder, clips):
-    from lerobot.configs.rewards import RewardModelConfig
-    from lerobot.rewards import make_reward_model, make_reward_pre_post_processors
-
-    frames = clips.frames[0]
-    given = frames.states[:9], frames.environment_states[:9], frames.actions[:9]
-    ours = LearnedReward.load(folder)(*given)
-    config = RewardModelConfig.from_pretrained(str(folder))
-    config.pretrained_path = str(folder)
-    model, (preprocess, _) = make_reward_model(config), make_reward_pre_post_processors(config)
-    keys = ("observation.state", "observation.environment_state", "action")
-    batch = preprocess({key: torch.tensor(one) for key, one in zip(keys, given, strict=True)})
-    assert model.compute_reward(batch).numpy() == pytest.approx(ours, abs=1e-6)
-
-
 def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
 
     reward = LearnedReward.load(folder)
@@ -167,26 +150,15 @@ def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
 
 @pytest.mark.parametrize(
     ("change", "says"),
-    [
-        ({"members": 10_000}, "members is 10000"),
-        ({"ways": [[0, 1, 99]]}, "a way has column 99; there are"),
-        ({"ways": [[0]]}, "expected columns of x, y and z"),
-        ({"unread": [0, 1_000]}, "2 columns up to 1000 are not read of"),
-        ({"unread": ["x"]}, "a column is 'x'"),
-        ({"logarithms": "yes"}, "logarithms is 'yes'"),
-        ({"width": 8}, "size mismatch"),
-        ({"type": "sarm"}, "is of type 'sarm'; expected a reward"),
-        ({"input_features": {}}, "observation.state is None"),
-    ],
+    [({"width": 8}, "do not match"), ({"type": "sarm"}, "is of type 'sarm'; expected a reward")],
 )
-def test_a_hostile_configuration_is_refused(change, says, folder, tmp_path):
+def test_a_folder_that_does_not_fit_itself_is_refused(change, says, folder, tmp_path):
     for path in folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     config = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(config | change))
-    with pytest.raises(ManipError) as refused:
+    with pytest.raises(ManipError, match=says):
         LearnedReward.load(tmp_path)
-    assert says in str(refused.value)
 
 
 def test_weights_that_are_not_finite_are_refused_when_they_are_used(folder, tmp_path, clips):

@@ -15,12 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lerobot.rewards.sarm.rabc import RABCWeights
 
-from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
-from manip_il.learn.lerobot_reward import score_by_lerobot
-from manip_il.learn.preference.modeling_preference import write_reward
-from manip_il.learn.preference.network import RewardNetwork, RewardShape
-from manip_il.learn.reward import LearnedReward
 from manip_il.learn.weights import rabc_weights
 from manip_il.preferences.frames import Frames, read_frames
 from manip_il.preferences.score_report import score_report
@@ -132,27 +127,3 @@ def test_a_file_of_other_weights_is_refused(change, says, tmp_path):
     pq.write_table(pa.table({key: value for key, value in columns.items() if value is not None}), path)
     with pytest.raises(ManipError, match=says):
         rabc_weights(path, np.array([0, 0, 1]), 1)
-
-
-def test_a_reward_model_is_scored_through_lerobots_factory(datasets, tmp_path):
-    """A model of random weights: what LeRobot's factory makes of its folder scores every frame, as ours does.
-
-    LeRobot knows one action, the expert's label.
-    """
-    spec, shape = read_frames(datasets / "good").spec, RewardShape(3, 8)
-    frames = read_frames(datasets / "good")
-    network = RewardNetwork(frames.inputs.shape[1], shape)
-    network.initialise(torch.Generator().manual_seed(0))
-    write_reward(tmp_path, network, shape, spec, {}, {})
-
-    labels = np.asarray(Dataset.open(datasets / "good").columns(["action"])["action"])
-    ours = LearnedReward.load(tmp_path)(frames.states, frames.environment_states, labels)
-    assert score_by_lerobot(datasets / "good", tmp_path, trust=True) == pytest.approx(ours, abs=1e-5)
-    with pytest.raises(ManipError, match="if you trust its source, add --trust=true"):
-        score_by_lerobot(datasets / "good", tmp_path, trust=False)
-
-
-def test_a_reward_model_whose_parts_are_not_here_is_one_line(datasets, tmp_path):
-    (tmp_path / "config.json").write_text('{"type": "reward_classifier", "device": "cpu", "model_name": "nowhere/x"}')
-    with pytest.raises(ManipError, match="LeRobot cannot load the reward model in"):
-        score_by_lerobot(datasets / "good", tmp_path, trust=True)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from manip_il.errors import ManipError
 from manip_il.learn.batches import generator_of
-from manip_il.learn.preference.network import RewardNetwork, RewardShape
+from manip_il.learn.reward import RewardNetwork, RewardShape
 from manip_il.learn.threads import threads
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
