@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 import manip_il.collect.expert as expert
 import manip_il.collect.job as jobs
-import manip_il.learn.mlp.modeling_mlp as mlp
+import manip_il.learn.mlp as mlp
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.table import run_algorithm
 from manip_il.collect.workers import Engine

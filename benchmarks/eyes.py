@@ -17,7 +17,7 @@ from PIL import Image
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.learn.cnn.modeling_cnn import CNNPolicy
+from manip_il.learn.cnn import CNNPolicy
 
 FRAMES, ROWS = 2_000, 4  # looked at, and drawn
 ENLARGED = 2

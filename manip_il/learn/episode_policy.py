@@ -2,27 +2,33 @@
 
 They keep what they remember (queues of actions, past observations, ensembles) as plain attributes, one for all rows of
 a batch. Here every episode has a copy of its own that shares the weights and acts alone: it plans at its own clock, and
-its actions are the same bits whatever runs beside it. Diffusion policies, which take long to plan, share calls of their
-network (`SharedPlans`).
+its actions are the same bits whatever runs beside it.
+
+Diffusion policies take long to plan, so episodes share calls of their network: an eighth of the time a plan. In its
+last bits a row's plan depends on how many rows there are and which of them it is, not on what the others hold. So every
+call has `ROWS` rows, and an episode's number says which is its own. LeRobot's plan, of one row, differs by rounding.
 """
 
 from __future__ import annotations
 
 import contextlib
 import copy
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.policies.utils import populate_queues
+from lerobot.utils.constants import ACTION, OBS_IMAGES
+from torch import Tensor
 
 from manip_il.errors import ManipError
 from manip_il.learn.lerobot_policy import line_of
-from manip_il.learn.shared_plans import SharedPlans
 
 Batch = dict[str, Any]
+ROWS = 25  # of the episodes that run in lockstep, whose numbers follow each other: each has a row to itself
 
 
 class EpisodePolicy:
@@ -36,52 +42,49 @@ class EpisodePolicy:
         self,
         policy: PreTrainedPolicy,
         before: Callable[[Batch], Batch],
-        after: Callable[[torch.Tensor], torch.Tensor],
+        after: Callable[[Tensor], Tensor],
         task: str = "",
     ):
         policy.reset()
         self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
-        self._plans = SharedPlans(policy) if policy.config.type == "diffusion" else None
         self._instructions: dict[int, str] = {}
         self._steps = Counter[int]()  # taken in every episode
-        self._memories: dict[int, PreTrainedPolicy] = {}
+        self._memories: dict[int, Any] = {}  # a copy of the policy; of diffusion its queues alone
 
-    def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
+    def select(self, batch: Batch, episodes: Sequence[int]) -> Tensor:
         """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
         self.forget([episode for episode in self._steps if episode not in set(episodes)])
+        seeds = [self._next_seed(episode) for episode in episodes]
         try:
             # mixed precision where the policy was trained so, as lerobot-eval has it
             with torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext():
-                if self._plans is not None:
-                    generators = [torch.Generator(self._device).manual_seed(self._next_seed(one)) for one in episodes]
-                    planned = self._plans.select(self._observed(batch, episodes), episodes, generators)
-                    actions = [self._after(planned)]
+                if self.module.config.type == "diffusion":
+                    actions = self._after(self._planned(self._observed(batch, episodes), episodes, seeds))
                 else:
-                    actions = [self._one(_row(batch, i), episode) for i, episode in enumerate(episodes)]
+                    rows = [_rows(batch, i) for i in range(len(episodes))]
+                    actions = torch.cat([self._one(*row) for row in zip(rows, episodes, seeds, strict=True)])
         except ManipError:
             raise
         except Exception as error:  # the code of any policy, with options and statistics from anywhere
             raise ManipError(f"the policy cannot act: {type(error).__name__}: {line_of(error)}") from error
-        return torch.cat([action.to("cpu", torch.float32) for action in actions])
+        return actions.to("cpu", torch.float32)
 
     def forget(self, episodes: Iterable[int]) -> None:
         """Drop the memory of these episodes."""
         for episode in episodes:
             for kept in (self._memories, self._steps, self._instructions):
                 kept.pop(episode, None)
-            if self._plans is not None:
-                self._plans.forget(episode)
 
     def instruct(self, instructions: Mapping[int, str]) -> None:
         """Take the texts of episodes that begin, by their numbers."""
         self._instructions.update({episode: text for episode, text in instructions.items() if text})
 
-    def _one(self, row: Batch, episode: int) -> torch.Tensor:
+    def _one(self, row: Batch, episode: int, seed: int) -> Tensor:
         if episode not in self._memories:
             self._memories[episode] = copy.deepcopy(self.module, dict(self._shared))
-        with _drawing(self._next_seed(episode), self._device):
+        with _drawing(seed, self._device):
             return self._after(self._memories[episode].select_action(self._observed(row, [episode])))
 
     def _observed(self, batch: Batch, episodes: Sequence[int]) -> Batch:
@@ -93,10 +96,49 @@ class EpisodePolicy:
         self._steps[episode] += 1
         return int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
 
+    def _planned(self, observed: Batch, episodes: Sequence[int], seeds: Sequence[int]) -> Tensor:
+        """Actions (B, n) as `DiffusionPolicy.select_action` has them, row by row, not yet in the data's units."""
+        policy: Any = self.module
+        batch = {key: value for key, value in observed.items() if isinstance(value, Tensor)}
+        if images := policy.config.image_features:
+            batch[OBS_IMAGES] = torch.stack([batch[key] for key in images], dim=-4)
+        waiting: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        for i, (episode, seed) in enumerate(zip(episodes, seeds, strict=True)):
+            if episode not in self._memories:
+                policy.reset()
+                self._memories[episode] = policy._queues
+            queues = populate_queues(self._memories[episode], {key: value[i : i + 1] for key, value in batch.items()})
+            if not queues[ACTION]:
+                waiting[episode % ROWS].append((episode, seed))
+        while waiting:
+            self._plan({row: asked.pop(0) for row, asked in waiting.items()})
+            waiting = defaultdict(list, {row: asked for row, asked in waiting.items() if asked})
+        return torch.cat([self._memories[episode][ACTION].popleft() for episode in episodes])
 
-def _row(batch: Batch, i: int) -> Batch:
+    def _plan(self, block: Mapping[int, tuple[int, int]]) -> None:
+        """Make the plans of the episodes in these rows, each with its seed."""
+        policy: Any = self.module
+        model, config = policy.diffusion, policy.config
+        weight = next(model.parameters())
+        generators = [torch.Generator(weight.device) for _ in range(ROWS)]
+        batch: dict[str, Tensor] = {}
+        for row, (episode, seed) in block.items():
+            generators[row].manual_seed(seed)
+            for key, past in self._memories[episode].items():
+                if key != ACTION:
+                    asked = torch.stack(list(past), dim=1)
+                    batch.setdefault(key, asked.new_zeros((ROWS, *asked.shape[1:])))[row] = asked[0]
+        shape = (config.horizon, *config.action_feature.shape)
+        noise = [torch.randn(shape, generator=one, device=weight.device, dtype=weight.dtype) for one in generators]
+        with _drawing_from(model.noise_scheduler, generators):
+            plans = model.generate_actions(batch, noise=torch.stack(noise))
+        for row, (episode, _) in block.items():
+            self._memories[episode][ACTION].extend(plans[row : row + 1].transpose(0, 1))
+
+
+def _rows(batch: Batch, i: int) -> Batch:
     """One row of what is there for every episode, (1, ...)."""
-    return {key: value[i : i + 1] if isinstance(value, torch.Tensor | list) else value for key, value in batch.items()}
+    return {key: value[i : i + 1] for key, value in batch.items()}
 
 
 def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
@@ -120,3 +162,18 @@ def _drawing(seed: int, device: torch.device) -> Iterator[None]:
             with torch.cuda.device(device):
                 torch.cuda.manual_seed(seed)
         yield
+
+
+@contextlib.contextmanager
+def _drawing_from(scheduler: Any, generators: Sequence[torch.Generator]) -> Iterator[None]:
+    """Let a noise scheduler draw each row's noise from a generator of its own."""
+    own = scheduler.step
+
+    def step(*args: Any, generator: None = None, **kwargs: Any) -> Any:
+        return own(*args, generator=generators, **kwargs)
+
+    scheduler.step = step
+    try:
+        yield
+    finally:
+        del scheduler.step

@@ -15,7 +15,7 @@ from manip_il.learn.action_steps import add_steps, is_in_processors
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit
-from manip_il.learn.mlp.modeling_mlp import MLPPolicy
+from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
 from manip_il.learn.network import fit_statistics, read_weights
 from manip_il.learn.transitions import F32

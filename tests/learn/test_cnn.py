@@ -14,11 +14,10 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 
 from manip_il.data.schema import features
 from manip_il.errors import MismatchError, UsageError
-from manip_il.learn.cnn import CNNConfig
-from manip_il.learn.cnn.modeling_cnn import CNNPolicy, KeypointEncoder, heat_map_losses
+from manip_il.learn import mlp as modeling_mlp
+from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder, heat_map_losses
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
-from manip_il.learn.mlp import modeling_mlp
 
 SIDE = 32
 PICTURES = ["observation.images.front", "observation.images.wrist"]

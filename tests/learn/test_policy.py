@@ -18,7 +18,7 @@ from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
 from manip_il.learn.losses import LIKELIHOODS, LOSSES
-from manip_il.learn.mlp.modeling_mlp import MLPPolicy
+from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.threads import threads
 from manip_il.learn.train import fit

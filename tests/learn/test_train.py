@@ -30,8 +30,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_policy import usable_statistics
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.metrics import METRICS_FILE, json_lines
-from manip_il.learn.mlp import MLPConfig
-from manip_il.learn.mlp.configuration_mlp import WarmUpAndCosineConfig
+from manip_il.learn.mlp import MLPConfig, WarmUpAndCosineConfig
 from manip_il.learn.network import MLPNetwork, fit_statistics
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.sources import Sources, input_columns, recorded_look
