@@ -244,8 +244,8 @@ class LearningRun:
         step = read_step(checkpoint)
         given = checks.mapping(f"{checkpoint}: given", step.get("given"))
         for name, ours in self._given.items():
-            if ours != given.get(name):
-                raise MismatchError("content", name, ours, f"the run in {self.folder}", given.get(name))
+            if ours not in given.values():
+                raise MismatchError("content", name, ours, f"the run in {self.folder}", sorted(given.values()))
         with readable_state(checkpoint), threads(1):
             self._learner.load(checkpoint / TRAINING_STATE, self._modules)
             self._number, self._simulated = int(step["step"]), int(step["simulated"])
@@ -274,11 +274,10 @@ class LearningRun:
 
 
 def _hashes(config: LearningConfig, reward: Path | None) -> dict[str, str]:
-    """SHA-256 of everything that a run is given, by its place."""
-    folders = [folder for folder in (config.start, reward) if folder is not None]
-    return {str(root): dataset_sha256(root) for root in config.datasets} | {
-        str(folder): policy_sha256(folder) for folder in folders
-    }
+    """SHA-256 of everything that a run is given, by what it is: checkpoints hold it, and no place of this machine."""
+    found = {f"dataset {i} ({root.resolve().name})": dataset_sha256(root) for i, root in enumerate(config.datasets)}
+    policies = {"init": config.start, "reward": reward}
+    return found | {name: policy_sha256(folder) for name, folder in policies.items() if folder is not None}
 
 
 def _episode_steps(config: LearningConfig, demonstrations: Demonstrations | None) -> int:
