@@ -99,7 +99,7 @@ def record(root: Path, size: int, episodes: int) -> Path:
 def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
     """Updates as lerobot-train makes them, with the same options."""
     config = ours.lerobot.policy
-    meta = LeRobotDataset("manip/benchmark", root=root).meta
+    meta: Any = LeRobotDataset("manip/benchmark", root=root).meta
     dataset = LeRobotDataset("manip/benchmark", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
     workers = min(8, len(os.sched_getaffinity(0)))
     loader = torch.utils.data.DataLoader(

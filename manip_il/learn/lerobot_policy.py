@@ -121,8 +121,8 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tuple[PreTrainedPolicy, Any, Any]:
     """Return the policy of a checkpoint and its processors, without a network where LeRobot needs none.
 
-    Raises `UnknownName` for a type that is not known, `ManipError` where packages are missing, where what it names
-    would have to be trusted and is not, or where LeRobot cannot load the folder.
+    Raises `UnknownName` for a type that is not known, `ManipError` if packages are missing, if what it names would have
+    to be trusted and is not, or if LeRobot cannot load the folder.
     """
     kind, path = checkpoint.kind, checkpoint.path
     if kind not in policy_types():
@@ -134,11 +134,7 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
             return _load(checkpoint, device)
     except ImportError as error:
         raise ManipError(f"{path} is a policy of type {kind!r}, which needs more packages: {line_of(error)}") from error
-    except ManipError as error:
-        raise ManipError(f"{path}: {error}") from error
     except Exception as error:  # a folder from anywhere, read by the code of any policy: errors of every kind
-        if "state_dict" in str(error):
-            raise ManipError(f"{path}: weights and {CONFIG} do not match: {line_of(error)}") from error
         raise ManipError(f"{path}: LeRobot cannot load it: {type(error).__name__}: {line_of(error)}") from error
 
 

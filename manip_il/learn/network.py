@@ -7,9 +7,8 @@ importing LeRobot.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -62,14 +61,6 @@ class Shape:
         if not checks.number("clamp", self.clamp, 0.0) > 0:
             raise ManipError(f"clamp is {self.clamp}; expected more than 0")
         checks.number("sigma", self.sigma, 0.0)
-
-    @classmethod
-    def read(cls, config: Mapping[str, Any]) -> Shape:
-        """Return the shape in an mlp's `config.json`. Raises `ManipError` for one that is no mlp's."""
-        needed = [one.name for one in fields(cls) if one.default is MISSING or one.name in config]
-        if missing := [name for name in needed if name not in config]:
-            raise ManipError(f"no {missing[0]}; it is not an mlp's")
-        return cls(**{name: config[name] for name in needed})
 
 
 Statistics = Mapping[str, Tensor]  # by the names of `MLPNetwork`'s buffers

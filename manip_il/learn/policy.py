@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -138,8 +139,7 @@ class LearnedPolicy:
             raise MismatchError(what, "the policy", sorted(self.cameras), "the caller", sorted(images))
         batch = {}
         for camera, size in self.checkpoint.pictures.items():
-            expected = (rows, *size, 3)
-            if (given := images[camera].shape) != expected:
+            if (given := images[camera].shape) != (expected := (rows, *size, 3)):
                 raise MismatchError(f"shape of the pictures of {camera}", "the policy", expected, "the caller", given)
             picture = torch.from_numpy(np.ascontiguousarray(images[camera])).permute(0, 3, 1, 2)
             batch[IMAGES + camera] = picture.contiguous().to(torch.float32) / 255
@@ -150,17 +150,16 @@ class _Perceptron:
     """The mlp: no memory, and one call for all rows, whose actions do not depend on each other."""
 
     def __init__(self, checkpoint: Checkpoint, device: str):
-        self._device = device
+        self._device, config = device, checkpoint.config
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in checkpoint.numbers]
         width = sum(checkpoint.numbers[key] for key in self._keys)
-        try:
-            self.module = MLPNetwork(width, checkpoint.action, Shape.read(checkpoint.config))
+        try:  # what an older one does not say is the default
+            shape = Shape(**{one.name: config[one.name] for one in fields(Shape) if one.name in config})
+            self.module = MLPNetwork(width, checkpoint.action, shape)
             self.module.load_state_dict(read_weights(checkpoint.path))
-        except RuntimeError as error:
+        except (TypeError, RuntimeError) as error:
             line = checks.one_line(error)
             raise ManipError(f"{checkpoint.path}: weights and {CONFIG} do not match: {line}") from error
-        except ManipError as error:
-            raise ManipError(f"{checkpoint.path / CONFIG}: {error}") from error
         self.module.to(device).eval()
         space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # every other is the network's own
         self._conversion = conversion(space, checkpoint.robot)

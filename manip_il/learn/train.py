@@ -41,7 +41,7 @@ from manip_il.learn.sources import Sources, input_columns
 from manip_il.learn.threads import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
-    check_same_run,
+    check_same_data,
     last_checkpoint,
     read_step,
     readable_state,
@@ -61,7 +61,7 @@ class Trainer:
     Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is resumed
-    on other data or options, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.
+    on other data, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Trainer:
             self.digest = hashlib.sha256(self.digest.encode() + drawn.tobytes()).hexdigest()
         self.options = self.lerobot.resume_options()
         if checkpoint is not None:
-            check_same_run(checkpoint, self.digest, self.options)
+            check_same_data(checkpoint, self.digest)
         self.origin = Origin.of(
             spec,
             first.fingerprint if fingerprint is None else fingerprint,
@@ -234,7 +234,7 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of this step and make it the last one."""
         if self.accelerator.is_main_process:
-            own = {"data": self.digest, "options": self.options, "batch_size": self.batch_size}
+            own = {"data": self.digest, "batch_size": self.batch_size}
             with unpublished(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
                 save_checkpoint(new, self.step, without_places(self.pipeline), self.unwrapped, *state, *processors)

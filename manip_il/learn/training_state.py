@@ -52,16 +52,11 @@ def read_step(checkpoint: Path) -> dict[str, Any]:
     return values
 
 
-def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) -> None:
-    """Raise `MismatchError` unless the checkpoint's run learnt from the same data with the same options."""
-    saved = read_step(checkpoint)
-    if saved.get("data") != digest:
-        raise MismatchError("training data", f"checkpoint {checkpoint}", saved.get("data"), "this run", digest)
-    before = checks.mapping(f"{checkpoint}: options", saved.get("options", {}))
-    for name, ours in options.items():
-        if before.get(name) != ours:
-            what = f"training option {name}"
-            raise MismatchError(what, f"checkpoint {checkpoint}", before.get(name), "this run", ours)
+def check_same_data(checkpoint: Path, digest: str) -> None:
+    """Raise `MismatchError` unless the checkpoint's run learnt from the same data."""
+    saved = read_step(checkpoint).get("data")
+    if saved != digest:
+        raise MismatchError("training data", f"checkpoint {checkpoint}", saved, "this run", digest)
 
 
 @contextmanager
