@@ -23,9 +23,9 @@ from torch import Tensor, nn
 
 from manip_il.checks import mapping, shorten
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
-from manip_il.learn.checkpoint import CONFIG, META_FILE
+from manip_il.learn.checkpoint import CONFIG
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
@@ -176,8 +176,6 @@ def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
     names: list[str] = []
     if meta:
         names = list(meta.environment_state_names if key == ENVIRONMENT_STATE else meta.joint_names)
-    if names and len(names) != size:
-        raise MismatchError(f"numbers in {key}", META_FILE, len(names), CONFIG, size)
     units = ["rad"] * (size - 1) + ["m"]  # the arm's joints, then the gripper's opening
     if key == ENVIRONMENT_STATE:
         units = ["1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2]) for name in names]

@@ -176,16 +176,6 @@ def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_t
         before({STATE: torch.zeros(2, 8), ACTION: torch.zeros(2, 4, 8)})
 
 
-def test_an_action_without_its_steps_joints_is_refused(sources, tmp_path):
-    path = trainer_of(sources, tmp_path / "run", ACT, JOINT_DELTA).fit()
-    before, after = make_pre_post_processors(PreTrainedConfig.from_pretrained(path), str(path))
-    with pytest.raises(ManipError, match=r"joint_delta: .* not \(2, 8\) of None"):
-        after(torch.zeros(2, 8))
-    before({STATE: torch.zeros(2, 8), "observation.environment_state": torch.zeros(2, 2)})
-    with pytest.raises(ManipError, match=r"not \(2, 4, 8\) of \(2, 8\)"):
-        after(torch.zeros(2, 4, 8))  # a whole plan
-
-
 def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
     path = fit(sources, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee")
     more = LearnedPolicy.load(trainer_of(sources, tmp_path / "more", {"path": str(path)}, None).fit())

@@ -48,14 +48,6 @@ def moves_of(crop: Tensor, picture: Tensor, shift: int) -> list[tuple[int, int]]
     return [(y, x) for y, x in places if torch.allclose(padded[:, y : y + height, x : x + width], crop, atol=1e-6)]
 
 
-def test_crops_move_as_far_as_they_may_and_no_further() -> None:
-    shift, size = 2, 8
-    picture = torch.arange(size * size, dtype=torch.uint8).view(1, 1, size, size).expand(500, 3, -1, -1)
-    centre = (Augment(shift, 0, 0, 0)(picture, generator())[:, 0, 4, 4] * 255).round().long()
-    moves = torch.stack([centre // size - 4, centre % size - 4], dim=1)
-    assert moves.unique(dim=0).tolist() == [[y, x] for y in range(-shift, shift + 1) for x in range(-shift, shift + 1)]
-
-
 def test_values_stay_within_bounds_and_the_batch_as_it_was(pictures: Tensor) -> None:
     before = pictures.clone()
     changed = Augment(4, 1.0, 1.0, 1.0)(pictures, generator())
@@ -87,10 +79,3 @@ def test_rows_are_drawn_as_often_as_they_weigh():
     counts = torch.bincount(torch.cat([order.batch(step) for step in range(200)]), minlength=4).numpy()
     assert counts[[1, 3]].tolist() == [0, 0]
     assert counts[2] / counts.sum() == pytest.approx(0.75, abs=5 * np.sqrt(0.75 * 0.25 / 10_000))
-
-
-def test_a_weighted_batch_depends_on_seed_and_step_alone():
-    weights = np.ones(100)
-    assert torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 1).batch(5))
-    assert not torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 1).batch(6))
-    assert not torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 2).batch(5))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,8 @@ from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import fit
 from manip_il.sim.env import EnvConfig
 
-from .tiny_policies import edit_config, observations, refused, write_checkpoint
+from .tiny_policies import edit_config, refused, write_checkpoint
 
-DEEP = "[" * 100_000
 EVIL = {
     "registry_name": "action_tokenizer_processor",
     "config": {"action_tokenizer_name": "evil/tokenizer", "trust_remote_code": True},
@@ -120,32 +118,13 @@ def test_a_file_that_is_missing_is_named(name, words, act):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("{", "is not valid JSON"),
-        (DEEP, "nested too deeply"),
-        ('{"type": {"act": 1}}', "is not a LeRobot policy's: type is"),
-        ('{"type": "act", "input_features": null}', "is not a LeRobot policy's: input_features is None"),
-    ],
-)
-def test_a_config_that_is_no_policys_is_refused(text, words, act):
-    (act / "config.json").write_text(text)
-    refused(act, words)
-
-
-@pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"width": "256"}, "width is '256'; expected a whole number"),
         ({"width": 32}, "do not match"),
-        ({"loss": {}}, "unknown loss"),
         ({"activation": "sqrt"}, "unknown activation 'sqrt'"),
-        ({"clamp": 0}, "clamp is 0; expected more than 0"),
         ({"action_space": "nowhere"}, "unknown action space"),
-        ({"input_features": {"observation.state": {"type": "STATE", "shape": ["4"]}}}, "a side of observation.state"),
-        ({"input_features": {"observation.state": 4}}, "expected an object"),
-        ({"output_features": {"move": {"type": "ACTION", "shape": [4]}}}, "no action among the outputs"),
-        ({"input_features": {"observation.images.x": {"type": "VISUAL", "shape": [3, 32]}}}, r"expected \(3, H, W\)"),
+        ({"type": 5}, "names no type"),
+        ({"output_features": {"move": {"type": "ACTION", "shape": [4]}}}, "features that cannot be read"),
     ],
 )
 def test_an_mlps_config_that_cannot_be_is_one_line(changes, words, mlp):
@@ -157,10 +136,8 @@ def test_an_mlps_config_that_cannot_be_is_one_line(changes, words, mlp):
     ("changes", "words"),
     [
         ({"dim_model": "wide"}, "dim_model"),
-        ({"chunk_size": -5}, "LeRobot cannot load it"),
-        ({"vision_backbone": None}, "LeRobot cannot load it"),
         ({"no_such_option": 3}, r"LeRobot cannot load it.*no_such_option"),
-        ({"dim_model": 32}, "do not match"),
+        ({"dim_model": 32}, "LeRobot cannot load it.*size mismatch"),
     ],
 )
 def test_a_config_of_lerobots_that_cannot_be_is_one_line(changes, words, act):
@@ -184,44 +161,19 @@ def test_options_of_our_own_policies_are_checked_where_they_are_made(settings, w
 
 @pytest.mark.parametrize(
     ("changes", "words"),
-    [
-        ({"fps": "20"}, "fps is '20'; expected a whole number"),
-        ({"robot": "../../x"}, "robot is"),
-        ({"joint_names": 5}, "joint_names is 5; expected a list"),
-        ({"image_size": [1, "x"]}, "a side of image_size is 'x'"),
-        ({"options": 7}, "options is 7"),
-        ({"colour": "red"}, "colour"),
-    ],
+    [({"robot": "../../x"}, "robot is"), ({"joint_names": 5}, "int"), ({"colour": "red"}, "colour")],
 )
-def test_what_a_policy_was_trained_for(changes: dict[str, Any], words, act):
+def test_what_a_policy_was_trained_for_is_read_or_refused_in_one_line(changes: dict[str, Any], words, act):
     path = act / "manip_il.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
     with pytest.raises(ManipError, match=rf"manip_il\.json cannot be read \(.*{words}"):
         read_origin(act)
-    for text in (DEEP, "", "null", '{"robot": "panda"}'):
-        path.write_text(text)
-        refused(act, r"manip_il\.json")
 
 
-def header(table: Any, length: int | None = None) -> bytes:
-    text = table if isinstance(table, bytes) else json.dumps(table).encode()
-    return struct.pack("<Q", len(text) if length is None else length) + text
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        header({}, length=2**60),
-        header(b"[]"),
-        header({"x": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4 * 10**12]}}),
-        header({"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}) + b"0000",
-    ],
-)
 @pytest.mark.parametrize("kind", ["mlp", "act"])
-def test_weights_that_are_broken_or_of_another_network(data, kind, request):
+def test_weights_that_are_broken(kind, request):
     policy = request.getfixturevalue(kind)
-    (policy / "model.safetensors").write_bytes(data)
+    (policy / "model.safetensors").write_bytes(b"")
     refused(policy, r"model\.safetensors cannot be read|do not match|LeRobot cannot load it")
 
 
@@ -286,8 +238,6 @@ def test_a_worker_trusts_only_what_its_job_does(act, ran):
         ({"registry_name": "x" * 90, "config": {"y" * 10_000: "z" * 10_000}}, "--trust=true"),
         ({"registry_name": "device_processor", "config": {"hook": "evil"}}, "LeRobot cannot load it"),
         ({"class": "subprocess.Popen", "config": {"args": "true"}}, r"subprocess\.Popen"),
-        (5, "a step is 5"),
-        ({"registry_name": 5}, "registry_name is 5"),
         *(
             ({"registry_name": "normalizer_processor", "config": {}, "state_file": name}, "cannot be read")
             for name in ("../secret.safetensors", "/etc/secret", "missing.safetensors")
@@ -301,17 +251,6 @@ def test_a_processor_loads_registered_steps_and_files_beside_it_alone(step, word
     if "trust" not in words:
         with pytest.raises(ManipError, match=words):
             LearnedPolicy.load(act, trust=True)
-
-
-@pytest.mark.parametrize("changes", [{"eps": "small"}, {"features": 5}, {"norm_map": 3}])
-def test_odd_options_of_a_normaliser_are_found_before_the_first_episode(changes, act):
-    path = act / "policy_preprocessor.json"
-    values = json.loads(path.read_text())
-    [step] = [step for step in values["steps"] if step["registry_name"] == "normalizer_processor"]
-    step["config"] |= changes
-    path.write_text(json.dumps(values))
-    with pytest.raises(ManipError, match=r"LeRobot cannot load it|the policy cannot act"):
-        LearnedPolicy.load(act).act(*observations(1))
 
 
 @pytest.mark.parametrize("kind", policy_types())

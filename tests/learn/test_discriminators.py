@@ -71,14 +71,6 @@ def test_the_reward_of_airl_is_f_less_the_log_density():
     np.testing.assert_allclose(d.reward(steps, logs), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_densities_change_nothing_for_gail_and_are_missed_by_airl():
-    steps = rows(0.0, seed=3)
-    gail, airl = trained("gail")[0], trained("airl")[0]
-    assert np.array_equal(gail.reward(steps), gail.reward(steps, log_density(steps, 0.0)))
-    with pytest.raises(UsageError, match="AirlDiscriminator needs the log-densities of actions"):
-        airl.reward(steps)
-
-
 def test_in_the_absorbing_state_nothing_but_the_flag_is_seen():
     d, _ = trained("gail")
     states = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import pytest
 import torch
-from lerobot.configs import FeatureType
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from manip_il.data.schema import features
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import (
     LeRobotFit,
     choice,
     option_lines,
-    policy_class,
     policy_config,
-    policy_features,
     policy_types,
 )
 
@@ -101,19 +97,8 @@ def test_the_help_lists_a_policys_options() -> None:
 PLANS = {
     "act": ("chunk_size", 10, 10),
     "diffusion": ("horizon", 16, 15),  # its plan begins with the first of two observations
-    "evo1": ("chunk_size", 10, 10),
-    "fastwam": ("action_horizon", 8, 8),
     "groot": ("chunk_size", 10, 10),
-    "molmoact2": ("chunk_size", 10, 10),
-    "multi_task_dit": ("horizon", 16, 15),
-    "pi0": ("chunk_size", 10, 10),
-    "pi05": ("chunk_size", 10, 10),
-    "pi0_fast": ("chunk_size", 10, 10),
-    "smolvla": ("chunk_size", 10, 10),
     "tdmpc": ("horizon", 16, 1),
-    "vla_jepa": ("chunk_size", 5, 5),
-    "wall_x": ("chunk_size", 10, 10),
-    "xvla": ("chunk_size", 10, 10),
 }
 
 
@@ -122,16 +107,6 @@ def test_no_more_actions_are_taken_of_a_plan_than_it_has(kind) -> None:
     option, plan, taken = PLANS[kind]
     config = configured({"type": kind, option: plan, "device": "cpu"}, trust=True)
     assert (getattr(config, option), vars(config)["n_action_steps"]) == (plan, taken)
-
-
-def test_a_policy_that_plans_and_is_not_above_is_new_in_lerobot() -> None:
-    plan = {kind for kind in policy_types() if "n_action_steps" in vars(policy_class(kind)).get("__annotations__", {})}
-    assert plan == {*PLANS, "eo1"}  # eo1 cannot be made without transformers
-
-
-def test_packages_that_a_policy_needs_are_named() -> None:
-    with pytest.raises(UsageError, match=r"--policy\.type=eo1: 'transformers' is required"):
-        configured({"type": "eo1", "device": "cpu"}, trust=True)
 
 
 @pytest.mark.parametrize(
@@ -147,14 +122,3 @@ def test_packages_that_a_policy_needs_are_named() -> None:
 def test_options_of_a_fit_out_of_range_are_refused(changes, says):
     with pytest.raises(UsageError, match=says):
         FitConfig(**changes)
-
-
-def test_pictures_are_channels_first_for_a_policy_and_kinds_are_lerobots(pictured):
-    table = features(pictured)
-    table["observation.state"] |= {"shape": [4]}  # as JSON has it
-    observed, acted = policy_features(table, list(features(pictured))[:4])
-    assert observed["observation.images.front"].shape == (3, 32, 48)
-    assert observed["observation.state"].shape == (4,)
-    kinds = [FeatureType.STATE, FeatureType.ENV, FeatureType.VISUAL, FeatureType.VISUAL]
-    assert [feature.type for feature in observed.values()] == kinds
-    assert acted["action"].type is FeatureType.ACTION

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 
 import draccus
@@ -76,15 +75,6 @@ def test_a_categorical_checkpoint_from_before_targets_were_smeared_acts_as_it_di
     assert np.array_equal(actions.numpy().astype(np.float64), before)
     assert draccus.encode(policy_config(FitConfig({"path": str(path)})))["sigma"] == 0  # learning goes on as it began
     assert draccus.encode(policy_config(FitConfig({"loss": "categorical"})))["sigma"] == 3
-
-
-def test_loading_needs_no_network(checkpoint, monkeypatch):
-    def refuse(*_):
-        raise AssertionError("a network connection was tried")
-
-    monkeypatch.setattr(socket.socket, "connect", refuse)
-    monkeypatch.setattr(socket, "getaddrinfo", refuse)
-    assert LearnedPolicy.load(checkpoint).act(*observations(2)).shape == (2, 4)
 
 
 def test_off_the_data_an_arm_target_stays_as_near_as_in_the_data(checkpoint, table):

@@ -74,21 +74,6 @@ def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_st
     assert np.array_equal(rows.states.reshape(STEPS, EPISODES, -1)[1:], after[:-1])
 
 
-def test_the_buffer_has_the_value_and_density_of_every_step():
-    one, env = learner()
-    env.seeds = range(EPISODES)
-    with lent_generators(0):
-        one.collect()
-    buffer = one.ppo.rollout_buffer
-    assert buffer.values.any()
-    for step in range(STEPS):
-        obs, actions = torch.from_numpy(buffer.observations[step]), torch.from_numpy(buffer.actions[step])
-        with torch.no_grad():
-            values, log_probs, _ = one.policy.evaluate_actions(obs, actions)
-        np.testing.assert_allclose(buffer.values[step], values[:, 0], rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(buffer.log_probs[step], log_probs, rtol=1e-5, atol=1e-5)
-
-
 def test_it_learns_what_the_reward_asks_for():
     one, env = learner(ends=False, epochs=10)
     first = np.abs(iterate(one, env, 0).next_states[:, 0]).mean()
@@ -140,17 +125,3 @@ def test_a_reward_that_is_not_finite_is_refused():
 def test_an_option_out_of_range_is_named(option, value):
     with pytest.raises(UsageError, match=rf"ppo\.{option} is {value}"):
         PPOConfig(**{option: value})
-
-
-def test_the_global_generators_are_as_they_were_after_being_lent():
-    def drawn() -> tuple[float, float]:
-        return torch.rand(1).item(), np.random.random()  # noqa: NPY002
-
-    torch_state, numpy_state = torch.random.get_rng_state(), np.random.get_state()  # noqa: NPY002
-    with lent_generators(3):
-        first = drawn()
-    with lent_generators(3):
-        assert drawn() == first
-    assert torch.equal(torch.random.get_rng_state(), torch_state)
-    after = np.random.get_state()  # noqa: NPY002
-    assert np.array_equal(after[1], numpy_state[1])
