@@ -149,8 +149,8 @@ def conversion(space: str, robot: str) -> Conversion:
 def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
     """Return the conversion of a space for data of `spec`.
 
-    Raises `MismatchError` naming both sides where the data's actions are not joint targets of a robot that is known
-    here with these joints, where that matters, and what `conversion` raises.
+    Raises `MismatchError` naming both sides if the data's actions are not joint targets of a robot that is known
+    here with these joints, if that matters, and what `conversion` raises.
     """
     found = conversion(space, spec.robot)
     if space != JOINT_TARGET and spec.action_meaning not in JOINT_TARGETS:

@@ -81,7 +81,7 @@ class ActorCritic(ActorCriticPolicy):
 
     @property
     def spread(self) -> Tensor:
-        """Deviations of the numbers of an action, (n,), in normalised units; 0 where they never change."""
+        """Deviations of the numbers of an action, (n,), in normalised units; 0 if they never change."""
         return floored_log_std(_head(self.actor).raw_log_std).exp().detach() * self._free
 
     @property
@@ -127,5 +127,5 @@ def _head(network: MLPNetwork) -> GaussianHead:
 
 
 def _live(obs: Tensor) -> Tensor:
-    """1 where the state is not absorbing, (B,)."""
+    """1 if the state is not absorbing, (B,)."""
     return 1.0 - obs[:, -EXTRA]

@@ -64,7 +64,7 @@ class WeightedRows:
 
 
 def order_of(rows: int, weights: NDArray[np.float64] | None, batch_size: int, seed: int) -> ShuffledRows | WeightedRows:
-    """Return an order by weights, (N,), where there are some, else every row once an epoch."""
+    """Return an order by weights, (N,), if there are some, else every row once an epoch."""
     return ShuffledRows(rows, batch_size, seed) if weights is None else WeightedRows(weights, batch_size, seed)
 
 

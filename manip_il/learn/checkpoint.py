@@ -31,7 +31,7 @@ _STEPS = (  # of LeRobot's default processors, and ours: they load nothing
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
 )
 _NAMING = ("model", "tokenizer", "encoder_name", "vlm", "path")  # in the names of options that name what is loaded
-_MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp")
+_MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled")
 _MUST_AGREE = {
     "robot": "robot",
     "fps": "control rate [1/s]",
@@ -46,8 +46,8 @@ _MUST_AGREE = {
 class Origin:
     """Robot, task and data that a policy was trained for, and the options of its fit; `manip_il.json`.
 
-    observation: one of `OBSERVATIONS`. cameras, image_size: of the pictures that it was trained on, where it sees any;
-    look: their light, as arguments of `sim.look.Look`, None where that is not known. datasets: name, frames and weight
+    observation: one of `OBSERVATIONS`. cameras, image_size: of the pictures that it was trained on, if it sees any;
+    look: their light, as arguments of `sim.look.Look`, None if that is not known. datasets: name, frames and weight
     of each. action_space: in which it learnt, None in a checkpoint from before there was a choice.
     """
 
@@ -117,7 +117,7 @@ class Origin:
 
 
 def read_origin(path: Path) -> Origin | None:
-    """Return the origin in a `pretrained_model` folder, or None where another tool (lerobot-train) wrote it.
+    """Return the origin in a `pretrained_model` folder, or None if another tool (lerobot-train) wrote it.
 
     Raises `ManipError` for a file that is not ours or not whole.
     """
@@ -136,7 +136,7 @@ class Checkpoint:
     """A policy on disk. path: its `pretrained_model` folder. config: the `config.json` there.
 
     numbers: column -> how many; pictures: camera -> (height, width) [pixels]; action: how many numbers. space: the
-    action space it has learnt in; robot: whose hand moves, for `ee_delta` alone. origin: None where another program
+    action space it has learnt in; robot: whose hand moves, for `ee_delta` alone. origin: None if another program
     wrote it. processors: steps by file, each `registry_name`, `config` and perhaps `state_file`.
     """
 

@@ -40,13 +40,13 @@ class CNNConfig(MLPConfig):
 
     channels: of the encoder's layers; the first two halve the picture, the rest keep its size. keypoints: a
     camera. aux_weight: while learning, weight of the mean absolute error, in standard deviations, of reading
-    `observation.environment_state` off joints and keypoints by a perceptron, where the dataset has that column and
+    `observation.environment_state` off joints and keypoints by a perceptron, if the dataset has that column and
     it is not an input. The action is read off what was read off, too, and off joints and keypoints; acting never sees
     the true state. heatmap_weight: while learning, weight of the cross-entropy [nats] of heat maps against the places
     of points that the scene names (`privileged.keypoints.<camera>`), each of which has a keypoint of its own beside the
     others; 0: off. What is not said here is the mlp's.
 
-    `use_amp` takes the convolutions of learning to half precision, where the processor has bfloat16: twice as fast.
+    `use_amp` takes the convolutions of learning to half precision, if the processor has bfloat16: twice as fast.
     Acting is always in single precision.
 
     Raises what `MLPConfig` raises, `UsageError` for sizes and weights out of range.
@@ -72,6 +72,8 @@ class CNNConfig(MLPConfig):
                 f"policy.channels is {list(self.channels)}, keypoints {self.keypoints}; expected two layers or "
                 "more, and at least 1"
             )
+        if self.scales:
+            raise UsageError("policy.scales is for the mlp, which is given offsets; the cnn sees them in pictures")
         for name in ("aux_weight", "heatmap_weight"):
             if not getattr(self, name) >= 0:
                 raise UsageError(f"policy.{name} is {getattr(self, name)}; expected 0 or more")
@@ -156,7 +158,7 @@ def _places(height: int, width: int, device: torch.device) -> Tensor:
 
 
 def heat_map_losses(maps: Tensor, places: Tensor) -> Tensor:
-    """Return the mean cross-entropy [nats] of the points in view, (B,), 0 where none is.
+    """Return the mean cross-entropy [nats] of the points in view, (B,), 0 if none is.
 
     maps: logarithms of heat maps (B, K, height, width), whose cells are `STRIDE` pixels apart from the first pixel on.
     places: across and down from 0 to 1, and whether that is in view, (B, K, 3); a place between cells counts for the
@@ -191,7 +193,7 @@ def _light_and_colour(pictures: Tensor) -> Tensor:
 class CNNPolicy(MLPPolicy):
     """LeRobot's policy interface to a `KeypointEncoder` a camera and an `MLPNetwork` on joints and keypoints.
 
-    Batches hold what the mlp's do (`observation.environment_state` where it is an input) and
+    Batches hold what the mlp's do (`observation.environment_state` if it is an input) and
     `observation.images.<camera>` (B, 3, H, W), from 0 to 1.
 
     dataset_meta: as for the mlp. While training, the state of the environment is then read off the keypoints
@@ -289,7 +291,7 @@ class CNNPolicy(MLPPolicy):
 
     @override
     def _more_columns(self) -> Sequence[str]:
-        """The truth to read off, and the places of named points, where heat maps are learnt."""
+        """The truth to read off, and the places of named points, if heat maps are learnt."""
         return [ENVIRONMENT_STATE, *self._place_columns()]
 
     def _place_columns(self) -> list[str]:
@@ -312,7 +314,7 @@ class CNNPolicy(MLPPolicy):
             self._remember(KEYPOINTS, columns, places)
 
     def _truth(self, columns: Table) -> Tensor | None:
-        """The state of the environment, (N, k), where it is to be read off."""
+        """The state of the environment, (N, k), if it is to be read off."""
         if not self.aux_weight or ENVIRONMENT_STATE not in columns or ENVIRONMENT_STATE in self.inputs:
             return None
         return torch.from_numpy(columns[ENVIRONMENT_STATE].astype(np.float32))

@@ -44,7 +44,7 @@ class Discriminator(nn.Module, ABC):
         super().__init__()
         self.config = config
         for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
-            self.register_buffer(name, value.clone())
+            self.register_buffer(name, value[: network.inputs].clone())
         self.register_buffer("clamp", torch.tensor(network.clamp))
         self.register_buffer("free", (network.target_scale > 0).float())
         self.build(len(self.mean) + 1, len(self.free))
@@ -65,7 +65,7 @@ class Discriminator(nn.Module, ABC):
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
         """Return the reward of every transition, (N,), within +-10.
 
-        log_probs: of its action for the learner, (N,), where the discriminator `asks_density`.
+        log_probs: of its action for the learner, (N,), if the discriminator `asks_density`.
         """
         with torch.no_grad():
             rewards = self.rewards_of(self.logits(self._encode(learner, log_probs)))
@@ -76,7 +76,7 @@ class Discriminator(nn.Module, ABC):
     ) -> dict[str, float]:
         """Take an iteration's gradient steps; return the loss, and accuracies before them.
 
-        log_probs: of the expert's and the learner's actions for the learner, (N,) each, where it `asks_density`.
+        log_probs: of the expert's and the learner's actions for the learner, (N,) each, if it `asks_density`.
         """
         data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs or (None, None), strict=True)]
         with torch.no_grad():

@@ -58,7 +58,7 @@ class EpisodePolicy:
         self.forget([episode for episode in self._steps if episode not in set(episodes)])
         seeds = [self._next_seed(episode) for episode in episodes]
         try:
-            # mixed precision where the policy was trained so, as lerobot-eval has it
+            # mixed precision if the policy was trained so, as lerobot-eval has it
             with torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext():
                 if self.module.config.type == "diffusion":
                     actions = self._after(self._planned(self._observed(batch, episodes), episodes, seeds))

@@ -92,7 +92,7 @@ class _InOrder(nn.Module):
 def export_onnx(path: Path, policy_sha256: str) -> Exported:
     """Return the policy in a `pretrained_model` folder as ONNX.
 
-    Raises `ManipError` where the file would act otherwise than the checkpoint, and what `LearnedPolicy.load` raises.
+    Raises `ManipError` if the file would act otherwise than the checkpoint, and what `LearnedPolicy.load` raises.
     """
     import onnx
     import onnxruntime
@@ -167,7 +167,7 @@ def file_metadata(
 
 
 def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
-    """The name, type and shape of an input or output, and what its numbers mean, where that is known."""
+    """The name, type and shape of an input or output, and what its numbers mean, if that is known."""
     checkpoint, meta = policy.checkpoint, policy.checkpoint.origin
     if key.startswith(IMAGES):
         shape = ["batch", *checkpoint.pictures[key.removeprefix(IMAGES)], 3]

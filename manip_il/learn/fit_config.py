@@ -28,11 +28,11 @@ class Defaults(NamedTuple):
 
 
 LEROBOT = Defaults(100_000, 8, 20_000)
-DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}  # where they are not LeRobot's
+DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}  # if they are not LeRobot's
 
 
 def _by_default(name: str) -> str:
-    """Return what a number is where it is not given, by the kind of the policy."""
+    """Return what a number is if it is not given, by the kind of the policy."""
     own = ", ".join(f"{getattr(numbers, name):,} for {kind}" for kind, numbers in DEFAULTS.items())
     return f"by default {own}, else {getattr(LEROBOT, name):,}"
 
@@ -52,7 +52,7 @@ class FitConfig:
 
     policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). action_space: see
     `manip_il.learn.action_spaces`; by default that of a checkpoint to start from, too. threads: a second one is up to
-    1.8 times as fast where a core is free, and tens of times slower where none is. trust: whether models that the
+    1.8 times as fast if a core is free, and tens of times slower if none is. trust: whether models that the
     policy or its checkpoint names may be loaded. seed: of weights and batches. init_from: a `pretrained_model` folder
     whose weights to start from.
 
@@ -142,7 +142,7 @@ class FitConfig:
 
     @property
     def defaults(self) -> Defaults:
-        """Numbers that hold where none are given."""
+        """Numbers that hold if none are given."""
         return DEFAULTS.get(self.kind, LEROBOT)
 
     @property

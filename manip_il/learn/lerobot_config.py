@@ -52,9 +52,9 @@ def policy_class(kind: str) -> type[PreTrainedConfig]:
 def policy_config(fit: FitConfig) -> PreTrainedConfig:
     """Return the configuration of the policy of a fit: new, or that of the checkpoint to start from, changed.
 
-    The device is the graphics card where there is one. As many actions are taken of a plan as it has, where LeRobot's
+    The device is the graphics card if there is one. As many actions are taken of a plan as it has, if LeRobot's
     default is more. Raises `UnknownName` for a type or an option that is not there, `UsageError` for a value that
-    LeRobot refuses, `ManipError` where models are named that would have to be trusted.
+    LeRobot refuses, `ManipError` if models are named that would have to be trusted.
     """
     given = {name: value for name, value in fit.policy.items() if name not in ("type", "path")}
     if str(given.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot takes another
@@ -78,7 +78,7 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
 
 
 def _shorter_plan(cls: type[PreTrainedConfig], options: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, int]:
-    """The number of `n_action_steps` that a plan has, where it is fewer than the default and the user gave none."""
+    """The number of `n_action_steps` that a plan has, if it is fewer than the default and the user gave none."""
     defaults = {field.name: field.default for field in dataclasses.fields(cls)}
     values = defaults | dict(options)
     wanted = values.get("n_action_steps")
@@ -145,7 +145,7 @@ def policy_features(
 class LeRobotFit:
     """The options of a fit as LeRobot's configurations: policy, optimiser, schedule, logger.
 
-    action_meaning: of the data's numbers; where they are no joint targets, they are learnt as they are by default.
+    action_meaning: of the data's numbers; if they are no joint targets, they are learnt as they are by default.
     action_space: in which the policy learns. augment: of pictures, None for none. Raises what `policy_config` raises,
     `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot does not know, `MismatchError`
     for a checkpoint to start from that has learnt in another action space.

@@ -35,7 +35,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     """Return LeRobot's policy, its weights new, from `config.pretrained_path`, or those of a run that is resumed.
 
     An mlp that starts from another one's weights has the units of its own data, see `warm_start`. Raises `ManipError`
-    for a checkpoint that cannot be loaded, and with the two ways out where a backbone's weights would have to be
+    for a checkpoint that cannot be loaded, and with the two ways out if a backbone's weights would have to be
     downloaded and cannot be.
     """
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
@@ -56,7 +56,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     if warm:
         model: Any = policy.model
         warm_start(model, Path(str(start)))
-    if weights:  # a checkpoint has its own: it shall load where there is no network
+    if weights:  # a checkpoint has its own: it shall load if there is no network
         config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
     config.pretrained_path = None
     return policy
@@ -83,8 +83,8 @@ def build_processors(
 ) -> tuple[Any, Any]:
     """Return LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's.
 
-    conversion: of the actions, which the dataset's metadata then has, where the processors are to carry one. Raises
-    what `Checkpoint.require_trust` raises, and `ManipError` where the checkpoint's cannot be read.
+    conversion: of the actions, which the dataset's metadata then has, if the processors are to carry one. Raises
+    what `Checkpoint.require_trust` raises, and `ManipError` if the checkpoint's cannot be read.
     """
     if checkpoint is None:
         before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
@@ -119,7 +119,7 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 
 
 def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tuple[PreTrainedPolicy, Any, Any]:
-    """Return the policy of a checkpoint and its processors, without a network where LeRobot needs none.
+    """Return the policy of a checkpoint and its processors, without a network if LeRobot needs none.
 
     Raises `UnknownName` for a type that is not known, `ManipError` if packages are missing, if what it names would have
     to be trusted and is not, or if LeRobot cannot load the folder.

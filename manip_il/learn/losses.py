@@ -75,7 +75,7 @@ class L1Head(MSEHead):
 class GaussianHead(Head, nn.Module):
     """Diagonal Gaussian: the network gives the mean; one learned log-deviation a dimension. Acts with the mean.
 
-    The deviation does not depend on the state: where it does, easy states outweigh hard ones by
+    The deviation does not depend on the state: if it does, easy states outweigh hard ones by
     orders of magnitude in the mean's gradient and the mean underfits (Seitzer et al., On the
     pitfalls of heteroscedastic uncertainty estimation, ICLR 2022). In closed loop that lost
     nearly every episode.

@@ -27,7 +27,7 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
     """Give the functions to call with each record: of the file of lines, and of what else the user asked for.
 
     step: the fit goes on from there. curves: for TensorBoard. pipeline: with the options for Weights & Biases. Raises
-    `UsageError` where one of them is not installed.
+    `UsageError` if one of them is not installed.
     """
     with writing(output_dir):
         output_dir.mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
 
 @contextmanager
 def json_lines(path: Path, step: int) -> Iterator[Writer]:
-    """Give a function that adds a line, null where a number is not finite; lines after `step` are dropped first."""
+    """Give a function that adds a line, null if a number is not finite; lines after `step` are dropped first."""
     lines = path.read_text(errors="replace").splitlines() if step > 0 and path.is_file() else []
     write_file(path, "".join(f"{line}\n" for line in lines if _is_until(step, line)).encode())
 
@@ -57,7 +57,7 @@ def json_lines(path: Path, step: int) -> Iterator[Writer]:
 
 @contextmanager
 def tensorboard(folder: Path, step: int) -> Iterator[Writer]:
-    """Give a function that adds a point to every curve. Raises `UsageError` where TensorBoard is not installed."""
+    """Give a function that adds a point to every curve. Raises `UsageError` if TensorBoard is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -75,7 +75,7 @@ def tensorboard(folder: Path, step: int) -> Iterator[Writer]:
 
 @contextmanager
 def weights_and_biases(config: TrainPipelineConfig) -> Iterator[Writer]:
-    """Give a function that adds a point by LeRobot's own logger. Raises `UsageError` where wandb is not installed."""
+    """Give a function that adds a point by LeRobot's own logger. Raises `UsageError` if wandb is not installed."""
     try:
         importlib.import_module("wandb")  # LeRobot's logger imports it, and says less
         from lerobot.common.wandb_utils import WandBLogger

@@ -63,6 +63,8 @@ class MLPConfig(PreTrainedConfig):
     nearest. None is the default, but for a configuration with features, as a checkpoint's is: it was saved before there
     was a sigma, so it is 0. clamp: bound of the normalised inputs, in standard deviations, so that a state
     far off the data cannot blow the outputs up. action_space: of `manip_il.learn.action_spaces`, in which it learns.
+    scales: lengths s [m]; of every offset x among the inputs (`object_from_ee.x`, ...) tanh(x / s) is an input, too.
+    scaled: the columns of these offsets, taken from the dataset.
 
     The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
@@ -79,6 +81,8 @@ class MLPConfig(PreTrainedConfig):
     sigma: float | None = None
     clamp: float = 10.0
     action_space: str = JOINT_DELTA
+    scales: tuple[float, ...] = ()
+    scaled: tuple[int, ...] = ()
 
     device: str | None = "cpu"
     push_to_hub: bool = False  # type: ignore[assignment]
@@ -143,6 +147,8 @@ class MLPPolicy(PreTrainedPolicy):
         config.validate_features()
         self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})]
         self._by_index: dict[str, Tensor] = {}  # of every frame of the data, by its `index`
+        if config.scales and not config.scaled and dataset_meta is not None:
+            config.scaled = self._offsets(config, dataset_meta.features)
         self._build(config)
         if dataset_meta is not None:
             self._learn_columns(self._columns(config, dataset_meta))
@@ -186,6 +192,15 @@ class MLPPolicy(PreTrainedPolicy):
         config.input_features = {key: features[key] for key in self.inputs}
         width = sum(features[key].shape[0] for key in self.inputs)
         self.model = MLPNetwork(width, features[STATE].shape[0], config.network_shape())
+
+    def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
+        """The columns of the inputs that say how far one thing is from another."""
+        names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in self.inputs else []
+        n = (config.input_features or {})[STATE].shape[0]
+        found = tuple(n + i for i, name in enumerate(names) if "_from_" in name)
+        if not found:
+            raise UsageError(f"policy.scales is for offsets (..._from_...) among the inputs; there are {list(names)}")
+        return found
 
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
         targets = self.model.encode_targets(self.model.relative(batch[ACTION], inputs))
@@ -234,7 +249,8 @@ class MLPPolicy(PreTrainedPolicy):
         seen = torch.cat([torch.from_numpy(columns[key])[valid] for key in self.inputs], dim=1).float()
         actions = torch.from_numpy(columns[ACTION])[valid].float()
         targets = self.model.relative(actions, seen)
-        self.model.set_statistics(fit_statistics(seen.numpy(), targets.numpy(), self.model.loss))
+        inputs = self.model.expanded(seen).numpy()
+        self.model.set_statistics(fit_statistics(inputs, targets.numpy(), self.model.loss))
         self._remember(LABEL_VALID, columns, valid)
 
 

@@ -51,8 +51,14 @@ class Shape:
     clamp: float
     sigma: float = 0.0  # checkpoints from before there was one have none
     action_space: str = JOINT_DELTA
+    scales: tuple[float, ...] = ()
+    scaled: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("scales", "scaled"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not all(checks.number("scales", scale, 0.0) > 0 for scale in self.scales):
+            raise ManipError(f"scales is {list(self.scales)}; expected lengths of more than 0")
         for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS), ("action_space", ACTION_SPACES)):
             if (value := getattr(self, name)) not in known:
                 raise UnknownName(name, str(value), known)
@@ -113,6 +119,8 @@ class MLPNetwork(nn.Module):
         super().__init__()
         self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
         self.adds_joints = shape.action_space == JOINT_DELTA
+        self.scales, self.scaled, self.inputs = shape.scales, list(shape.scaled), inputs
+        inputs += len(shape.scales) * len(shape.scaled)
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma)
         layers: list[nn.Module] = []
         for width in (inputs, *[shape.width] * (shape.depth - 1)):
@@ -129,12 +137,18 @@ class MLPNetwork(nn.Module):
         for name, tensor in statistics.items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
+    def expanded(self, inputs: Tensor) -> Tensor:
+        """Return inputs (B, n + k) and, of those at several scales, each scale's: close to, a millimetre counts."""
+        if not self.scales:
+            return inputs
+        return torch.cat([inputs, *(torch.tanh(inputs[:, self.scaled] / scale) for scale in self.scales)], dim=1)
+
     def encode(self, inputs: Tensor) -> Tensor:
         """Return the perceptron's inputs from raw ones, (B, n + k)."""
-        return ((inputs - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
+        return ((self.expanded(inputs) - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
 
     def encode_targets(self, targets: Tensor) -> Tensor:
-        """Return the head's targets from raw relative ones, (B, n); 0 where the scale is 0."""
+        """Return the head's targets from raw relative ones, (B, n); 0 if the scale is 0."""
         inverse = torch.where(self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale))
         return (targets - self.target_mean) * inverse
 
@@ -143,7 +157,7 @@ class MLPNetwork(nn.Module):
         return self.head.nll(self.layers(x), y)
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
-        """Return targets (B, n) of actions (B, n): the arm's from the measured joints where the network adds these."""
+        """Return targets (B, n) of actions (B, n): the arm's from the measured joints if the network adds these."""
         if not self.adds_joints:
             return actions
         return torch.cat([actions[:, ARM] - inputs[:, : self.n - 1], actions[:, GRIPPER:]], dim=1)

@@ -45,7 +45,7 @@ class LearnedPolicy:
         """Load any LeRobot `pretrained_model` folder, from JSON and safetensors alone unless `trust`.
 
         The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task:
-        text for a policy that reads language, where `instruct` gives no other. trust: load models and code that the
+        text for a policy that reads language, if `instruct` gives no other. trust: load models and code that the
         checkpoint names, too. Raises what `Checkpoint.open` raises, `ManipError` for files that do not match or,
         without `trust`, name models to load; `UnknownName` for a type of policy that is not known.
         """

@@ -24,7 +24,7 @@ def policy_sha256(policy: Path) -> str:
 def policy_cameras(policy: Path) -> CameraConfig | None:
     """Return cameras, size and light of the pictures that a checkpoint was trained with; None for one without.
 
-    The light is the default where the checkpoint does not say. Raises `MismatchError` for cameras that environments do
+    The light is the default if the checkpoint does not say. Raises `MismatchError` for cameras that environments do
     not have or whose pictures differ in size, `ManipError` for a folder or a size that cannot be.
     """
     checkpoint = Checkpoint.open(policy)

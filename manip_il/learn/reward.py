@@ -68,9 +68,9 @@ def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
 
 
 def joints_of(spec: RobotTaskSpec) -> tuple[int, ...]:
-    """Return the columns of the arm's joints and of their targets, where the environment state has the hand's pose.
+    """Return the columns of the arm's joints and of their targets, if the environment state has the hand's pose.
 
-    None where it has not. A few hundred answers are few to find out that joints say the same in another way.
+    None if it has not. A few hundred answers are few to find out that joints say the same in another way.
     """
     if not {"ee.x", "ee.y", "ee.z"} <= set(spec.environment_state_names):
         return ()

@@ -65,7 +65,7 @@ class Windows:
         """Return the samples to learn from (S,): every label in the window is sound, `drop_last` frames left out.
 
         valid: whether each frame's label is sound, (N,). drop_last: LeRobot's `drop_n_last_frames`. Raises
-        `ManipError` where nothing is left.
+        `ManipError` if nothing is left.
         """
         samples = np.flatnonzero(np.arange(len(valid)) + drop_last <= self._last)
         sound = valid[self.rows(samples, ACTION)[0]]
@@ -174,7 +174,7 @@ def load_data(
 ) -> TrainingData:
     """Return the samples of datasets, taken as one, for a policy that has its features.
 
-    meta: of the datasets; its statistics follow the actions. encode: of actions (N, n) and states (N, n), where others
+    meta: of the datasets; its statistics follow the actions. encode: of actions (N, n) and states (N, n), if others
     are learnt than the datasets'. on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and
     what `windows_of` and `Windows.usable` raise.
     """
@@ -231,7 +231,7 @@ def require_finite(table: Table, keys: Sequence[str]) -> None:
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Return whether each frame takes part in the loss, (N,): all do where no column says otherwise."""
+    """Return whether each frame takes part in the loss, (N,): all do if no column says otherwise."""
     if LABEL_VALID not in table:
         return np.ones(len(table[ACTION]), dtype=bool)
     return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
@@ -240,7 +240,7 @@ def valid_frames(table: Table) -> NDArray[np.bool_]:
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
     """Return the rows (of N) to train on and to hold out: about `fraction` of the episodes (N,), whole ones.
 
-    Nothing is held out where that would be less than half an episode or all of them.
+    Nothing is held out if that would be less than half an episode or all of them.
     """
     names = np.unique(episodes)
     count = round(fraction * len(names))

@@ -29,7 +29,7 @@ F64, I64 = NDArray[np.float64], NDArray[np.int64]
 class Sources:
     """Datasets in the order in which their frames are numbered.
 
-    weights: the share of the samples drawn from each, relative to the others; none where every frame is drawn alike.
+    weights: the share of the samples drawn from each, relative to the others; none if every frame is drawn alike.
     Raises `UsageError` for what `check_weights` refuses.
     """
 
@@ -57,7 +57,7 @@ class Sources:
     def row_weights(self, rows: I64) -> F64 | None:
         """Return how often each of the rows (S,) that are drawn from is drawn, relative to the others, (S,).
 
-        rows: numbers of frames through all datasets. None where all are alike. Raises `ManipError` for a dataset
+        rows: numbers of frames through all datasets. None if all are alike. Raises `ManipError` for a dataset
         without any row.
         """
         if not self.weights:
@@ -129,7 +129,7 @@ def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
 def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the light in which a dataset's pictures were made, as arguments of `sim.look.Look`; {} is the default.
 
-    None where that is not known: another program's dataset, or one without pictures.
+    None if that is not known: another program's dataset, or one without pictures.
     """
     if "cameras_sha256" not in fingerprint:
         return None

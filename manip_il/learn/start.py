@@ -58,7 +58,8 @@ def start_policy(
     if start is not None:
         policy.model.load_state_dict({**policy.model.state_dict(), **read_weights(start)})
     elif rows is not None:
-        policy.model.set_statistics(fit_statistics(*rows, _GAUSSIAN))
+        inputs = policy.model.expanded(torch.from_numpy(rows[0])).numpy()
+        policy.model.set_statistics(fit_statistics(inputs, rows[1], _GAUSSIAN))
     else:
         raise UsageError("no demonstrations and no policy to begin with; give --dataset.root=DIR or --init=RUN")
     return policy

@@ -152,7 +152,7 @@ class Trainer:
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
         """Take the steps that are left, with metrics and checkpoints; return the last one's `pretrained_model`.
 
-        on_step: called after every step, with the metrics where there are some, else with {}; an exception from it ends
+        on_step: called after every step, with the metrics if there are some, else with {}; an exception from it ends
         the fit, `KeyboardInterrupt` after a checkpoint. Raises `NotFiniteError` for a loss that is not finite.
         """
         main = self.accelerator.is_main_process
@@ -180,7 +180,7 @@ class Trainer:
         since, started, waited, sums = self.step, time.perf_counter(), 0.0, defaultdict[str, float](float)
         batches = (self.batch(step) for step in range(self.step, self.steps))
         self.policy.train()
-        # ahead only where there are pictures: a thread costs more than a gather of numbers
+        # ahead only if there are pictures: a thread costs more than a gather of numbers
         with prefetched(batches) if self.data.cameras else contextlib.nullcontext(batches) as ready:
             while self.step < self.steps:
                 asked = time.perf_counter()
@@ -281,7 +281,7 @@ def _numbers(outputs: Mapping[str, Any] | None) -> dict[str, float]:
 
 
 def _on_this_cpu() -> str:
-    """Half precision where the processor has it, else single."""
+    """Half precision if the processor has it, else single."""
     return "bf16" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "no"  # pyright: ignore[reportPrivateUsage]
 
 

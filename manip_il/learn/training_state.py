@@ -30,9 +30,9 @@ _LAST = "last"
 
 
 def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
-    """Return the folder `checkpoints/last` to go on from, or None where there is none.
+    """Return the folder `checkpoints/last` to go on from, or None if there is none.
 
-    Raises `FolderExistsError` where there is one, unless `resume`.
+    Raises `FolderExistsError` if there is one, unless `resume`.
     """
     last = output_dir / "checkpoints" / _LAST
     if not (last / PRETRAINED_MODEL).is_dir():
@@ -43,7 +43,7 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
 
 
 def read_step(checkpoint: Path) -> dict[str, Any]:
-    """Return the step and the resume key of a checkpoint folder. Raises `ManipError` where it has none."""
+    """Return the step and the resume key of a checkpoint folder. Raises `ManipError` if it has none."""
     path = checkpoint / TRAINING_STATE / STEP_FILE
     if not path.is_file():
         raise ManipError(f"no {path}: this checkpoint cannot be resumed; use it as init_from instead")
@@ -77,7 +77,7 @@ def readable_state(checkpoint: Path) -> Iterator[None]:
 def unpublished(final: Path) -> Generator[Path]:
     """Give an empty folder to write a checkpoint into; on leaving, it gets its name and is `last`.
 
-    An exception removes it. Raises `WriteError` where the disk is full or read-only.
+    An exception removes it. Raises `WriteError` if the disk is full or read-only.
     """
     temporary = final.parent / f".{final.name}.tmp"
     try:

@@ -1,6 +1,6 @@
 """Transitions of episodes of one length: what discriminators see of demonstrations and of the learner.
 
-Learning needs episodes of one length H: where an episode that succeeds ends early, a reward that is positive (or
+Learning needs episodes of one length H: if an episode that succeeds ends early, a reward that is positive (or
 negative) everywhere rewards (or punishes) living on, whatever was demonstrated (Kostrikov et al., Discriminator-actor-
 critic, ICLR 2019, section 4.2; Orsini et al., What matters for adversarial imitation learning?, NeurIPS 2021, section
 4). So an episode that has ended goes on in an absorbing state, marked by a flag, until step H. Demonstrations are
@@ -9,7 +9,7 @@ padded in the same way.
 An episode ends the demonstrations' `hold` steps after success. To go on acting after it would be no sounder: nobody
 demonstrated how to stay at the goal for long, so that the learner's many states there would look unlike the
 demonstrations' few, and arriving late would pay. In the absorbing state both have the same share of time exactly
-where the learner arrives as fast as it was shown.
+if the learner arrives as fast as it was shown.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TELLING = (LABEL_VALID, ACTOR, SUCCESS)  # columns that say whether an episode 
 class Transitions:
     """Steps of episodes, N rows. states, next_states: (N, d + 1), raw inputs and the flag of the absorbing state.
 
-    actions: (N, n), normalised as the policy's head has them, within their range. Raises `MismatchError` where lengths
+    actions: (N, n), normalised as the policy's head has them, within their range. Raises `MismatchError` if lengths
     differ, `NotFiniteError` for a number that is none.
     """
 
@@ -68,7 +68,7 @@ class Transitions:
 class Demonstrations:
     """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, these in a policy's action space.
 
-    hold: steps from success to the end; None where no column says when an episode succeeds.
+    hold: steps from success to the end; None if no column says when an episode succeeds.
     """
 
     inputs: tuple[F32, ...]
@@ -89,7 +89,7 @@ class Demonstrations:
         """Return all episodes as `steps` transitions each. encode: raw targets (T, n) to normalised ones.
 
         Without a `hold` nothing is padded: how the episodes would have gone on is not known.
-        Raises `UsageError` where one is longer.
+        Raises `UsageError` if one is longer.
         """
         if self.longest > steps:
             raise UsageError(f"episode_steps is {steps}; expected at least {self.longest}, the longest demonstration")
@@ -103,7 +103,7 @@ class Demonstrations:
 def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32]:
     """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode of T steps that ended.
 
-    N: T, or `steps` where it is larger: the rest is absorbing. steps 0: it did not end; N is T - 1.
+    N: T, or `steps` if it is larger: the rest is absorbing. steps 0: it did not end; N is T - 1.
     """
     states = np.pad(inputs, ((0, 0), (0, 1)))
     if not steps:
@@ -121,7 +121,7 @@ def read_demonstrations(
     """Read the expert's whole episodes from datasets. encode: `Conversion.encode` of actions (T, n), states (T, n).
 
     Left out are episodes that a learner drove at some step, that hold a label that is not valid, or of which a column
-    says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `joined_columns`
+    says that they failed. Raises `NothingToLearnError` if none is left, `NotFiniteError` and what `joined_columns`
     raises.
     """
     table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])

@@ -21,7 +21,7 @@ def rabc_weights(path: Path, episodes: NDArray[np.int64], ahead: int) -> NDArray
     """Return the weight of every frame, (N,), 1 at most, by the progress in a file.
 
     episodes: the dataset's `episode_index`, (N,). ahead: frames that an action reaches. Raises `ManipError` for a file
-    that is no such table and where every frame weighs 0, `MismatchError` for one of another dataset.
+    that is no such table and if every frame weighs 0, `MismatchError` for one of another dataset.
     """
     try:
         found = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import draccus
@@ -142,3 +143,21 @@ def test_a_policy_without_a_likelihood_says_so_in_one_line(checkpoint, act):
     for path in (checkpoint, act):
         with pytest.raises(UsageError, match=r"needs a policy with a likelihood: .*mixture or categorical"):
             LearnedPolicy.load(path).require_likelihood()
+
+
+def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, spec, tmp_path):
+    names = ("ee.x", "goal_from_object.x", "goal_from_object.y", "e3", "e4", "e5")
+    data = write(table, spec=replace(spec, environment_state_names=names))
+    path = fit(data, FitConfig({"scales": [0.003, 0.03], "width": 16}, steps=3, batch_size=32), tmp_path / "run")
+    policy, states, environments = LearnedPolicy.load(path), *observations(70)
+    network = policy.module
+    assert (network.scaled, network.inputs, len(network.input_mean)) == ([5, 6], 10, 14)
+    raw = torch.from_numpy(np.concatenate([states, environments], axis=1))
+    assert torch.equal(network.expanded(raw)[:, 12:], torch.tanh(raw[:, [5, 6]] / 0.03))
+    actions = policy.act(states, environments)
+    assert np.array_equal(policy.act(states[7:9], environments[7:9]), actions[7:9])
+    assert np.array_equal(MLPPolicy.from_pretrained(path).model.act(raw).numpy().astype(np.float64), actions)
+    again = fit(data, FitConfig({"path": str(path)}, steps=1, lr=1e-12, batch_size=32), tmp_path / "again")
+    np.testing.assert_allclose(LearnedPolicy.load(again).act(states, environments), actions, atol=2e-5)
+    with pytest.raises(UsageError, match="scales is for offsets"):
+        fit(write(table, "other"), FitConfig({"scales": [0.003]}), tmp_path / "other_run")
