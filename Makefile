@@ -76,7 +76,7 @@ docker-test: setup  ## build the image, evaluate in it, compare with here
 
 # One by one: two at a time would measure each other. What learning is worth has scripts of its own, of up to hours.
 SPEEDS := $(wildcard benchmarks/*_speed.py) $(addprefix benchmarks/,image_loading.py training_throughput.py \
-	dagger_round.py ray_nodes.py scale.py)
+	dagger_round.py ray_nodes.py scale.py gpu.py)
 bench: setup  ## every speed ratio, in about 40 minutes; PEER=PYTHON, which has the imitation library
 	@.ci/system sshd
 	@set -e; for file in $(SPEEDS); do echo "== $$file"; $(BIN)/python "$$file"; done

@@ -164,12 +164,6 @@ def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
     return found
 
 
-def same_width(actions: NDArray[Any], states: NDArray[Any], space: str) -> None:
-    """Raise `MismatchError` unless actions (N, n) have a measured joint for each number, which a delta needs."""
-    if space != JOINT_TARGET and actions.shape[1:] != states.shape[1:]:
-        raise MismatchError(f"width, for {space},", "action", actions.shape[1:], "observation.state", states.shape[1:])
-
-
 @cache
 def _arm_ik(robot: str) -> ArmIK:
     from manip_il.robots.ik import ArmIK

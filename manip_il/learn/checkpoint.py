@@ -195,7 +195,9 @@ class Checkpoint:
     @property
     def observation(self) -> str:
         """The one of `OBSERVATIONS` that the policy takes."""
-        return observation_of(self.columns)
+        if not any(key.startswith(IMAGES) for key in self.columns):
+            return "state"
+        return "both" if ENVIRONMENT_STATE in self.columns else "images"
 
     @property
     def mlp_options(self) -> dict[str, Any] | None:
@@ -227,6 +229,24 @@ class Checkpoint:
                 raise MismatchError(what, "the policy", size, environment, spec.image_size)
 
     def require_trust(self, trust: bool) -> None:
+        """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
+        others = [
+            _list_options(f"the step {checks.shorten(step['registry_name'])} of {name}", step["config"])
+            for name, steps in self.processors.items()
+            for step in steps
+            if step["registry_name"] not in _STEPS
+        ]
+        require_trust(self.config, str(self.path), trust, others)
+
+    def require_processors(self) -> None:
+        """Raise `ManipError` unless both processors are there."""
+        for name in PROCESSORS:
+            if name not in self.processors:
+                hint = "LeRobot's migrate_policy_normalization adds it to an old checkpoint"
+                raise ManipError(f"no {self.path / name}; {hint}")
+
+
+def require_trust(self, trust: bool) -> None:
         """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
         others = [
             _list_options(f"the step {checks.shorten(step['registry_name'])} of {name}", step["config"])

@@ -25,7 +25,6 @@ from manip_il.learn.threads import threads
 
 F32 = NDArray[np.float32]
 PREFERENCE = "preference"  # its type, in config.json
-LEAST_MEMBERS = 3  # each leaves one fold of the pairs out
 _KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # of its inputs, in LeRobot's words
 _ROWS = 16_384  # evaluated at once
 
