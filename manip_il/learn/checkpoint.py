@@ -8,7 +8,7 @@ and weights alone are listed in `PLAIN`, the steps of their processors in `_STEP
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -244,32 +244,6 @@ class Checkpoint:
             if name not in self.processors:
                 hint = "LeRobot's migrate_policy_normalization adds it to an old checkpoint"
                 raise ManipError(f"no {self.path / name}; {hint}")
-
-
-def require_trust(self, trust: bool) -> None:
-        """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
-        others = [
-            _list_options(f"the step {checks.shorten(step['registry_name'])} of {name}", step["config"])
-            for name, steps in self.processors.items()
-            for step in steps
-            if step["registry_name"] not in _STEPS
-        ]
-        require_trust(self.config, str(self.path), trust, others)
-
-    def require_processors(self) -> None:
-        """Raise `ManipError` unless both processors are there."""
-        for name in PROCESSORS:
-            if name not in self.processors:
-                hint = "LeRobot's migrate_policy_normalization adds it to an old checkpoint"
-                raise ManipError(f"no {self.path / name}; {hint}")
-
-
-def observation_of(input_features: Iterable[str]) -> str:
-    """Return which of `OBSERVATIONS` a policy takes, from the names of its inputs."""
-    keys = set(input_features)
-    if not any(key.startswith(IMAGES) for key in keys):
-        return "state"
-    return "both" if ENVIRONMENT_STATE in keys else "images"
 
 
 def require_trust(settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[str] = ()) -> None:

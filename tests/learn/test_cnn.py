@@ -14,7 +14,7 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 
 from manip_il.data.schema import features
 from manip_il.errors import MismatchError, UsageError
-from manip_il.learn import mlp as modeling_mlp
+from manip_il.learn import mlp
 from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder, heat_map_losses
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
@@ -230,7 +230,7 @@ def test_a_heat_map_is_best_where_the_point_is_and_between_cells_where_it_lies_b
 def named(meta, spec, table, monkeypatch):
     """The same dataset with the places of two points."""
     pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE), keypoints=("cube", "goal"))
-    rng, read = np.random.default_rng(0), modeling_mlp.joined_columns
+    rng, read = np.random.default_rng(0), mlp.joined_columns
 
     def with_places(roots, columns):
         kept = [key for key in columns if key not in pictured.keypoint_keys]
@@ -240,7 +240,7 @@ def named(meta, spec, table, monkeypatch):
             one[:, [2, 5]] = one[:, [2, 5]].round()
         return found | {key: one.astype(np.float32) for key, one in places.items()}
 
-    monkeypatch.setattr(modeling_mlp, "joined_columns", with_places)
+    monkeypatch.setattr(mlp, "joined_columns", with_places)
     return SimpleNamespace(features=features(pictured), root=meta.root, stats={})
 
 

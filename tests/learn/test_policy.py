@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import draccus
 import numpy as np
@@ -150,7 +151,7 @@ def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, sp
     data = write(table, spec=replace(spec, environment_state_names=names))
     path = fit(data, FitConfig({"scales": [0.003, 0.03], "width": 16}, steps=3, batch_size=32), tmp_path / "run")
     policy, states, environments = LearnedPolicy.load(path), *observations(70)
-    network = policy.module
+    network: Any = policy.module
     assert (network.scaled, network.inputs, len(network.input_mean)) == ([5, 6], 10, 14)
     raw = torch.from_numpy(np.concatenate([states, environments], axis=1))
     assert torch.equal(network.expanded(raw)[:, 12:], torch.tanh(raw[:, [5, 6]] / 0.03))
