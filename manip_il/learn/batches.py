@@ -27,45 +27,32 @@ def generator_of(*key: int) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
 
 
-class ShuffledRows:
-    """Row numbers in batches, every row once an epoch, in an order of its own each epoch.
+class Order:
+    """Row numbers in batches: every row once an epoch, in an order of its own each epoch, or as often as it weighs.
 
-    A batch is a function of the seed and the step alone, so there is no state to save.
+    weights: of each row, (N,), to draw in proportion to, with replacement; None for epochs. A batch is a function of
+    the seed and the step alone, so there is no state to save.
     """
 
-    def __init__(self, rows: int, batch_size: int, seed: int) -> None:
+    def __init__(self, rows: int, weights: NDArray[np.float64] | None, batch_size: int, seed: int) -> None:
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
-        self._epoch, self._order = -1, torch.empty(0, dtype=torch.int64)
+        self._edges = None if weights is None else np.cumsum(weights) / weights.sum()
+        self._epoch, self._order = -1, np.empty(0, np.int64)
 
-    def batch(self, step: int) -> torch.Tensor:
+    def batch(self, step: int) -> NDArray[np.int64]:
         """Return row numbers of the batch of `step`, (batch_size,)."""
+        if self._edges is not None:
+            draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
+            return np.minimum(np.searchsorted(self._edges, draws, side="right"), self.rows - 1)
         start, end = step * self.batch_size, (step + 1) * self.batch_size
         epochs = [(epoch, epoch * self.rows) for epoch in range(start // self.rows, -(-end // self.rows))]
-        return torch.cat([self._permutation(epoch)[max(start - first, 0) : end - first] for epoch, first in epochs])
+        return np.concatenate([self._permutation(e)[max(start - first, 0) : end - first] for e, first in epochs])
 
-    def _permutation(self, epoch: int) -> torch.Tensor:
+    def _permutation(self, epoch: int) -> NDArray[np.int64]:
         if epoch != self._epoch:
-            self._epoch, self._order = epoch, torch.randperm(self.rows, generator=generator_of(self.seed, epoch))
+            order = torch.randperm(self.rows, generator=generator_of(self.seed, epoch))
+            self._epoch, self._order = epoch, order.numpy()
         return self._order
-
-
-class WeightedRows:
-    """Row numbers in batches, each drawn with a probability in proportion to its weight, (N,), with replacement."""
-
-    def __init__(self, weights: NDArray[np.float64], batch_size: int, seed: int) -> None:
-        self._edges = np.cumsum(weights) / weights.sum()
-        self.batch_size, self.seed = batch_size, seed
-
-    def batch(self, step: int) -> torch.Tensor:
-        """Return row numbers of the batch of `step`, (batch_size,)."""
-        draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
-        rows = np.searchsorted(self._edges, draws, side="right")
-        return torch.from_numpy(np.minimum(rows, len(self._edges) - 1))
-
-
-def order_of(rows: int, weights: NDArray[np.float64] | None, batch_size: int, seed: int) -> ShuffledRows | WeightedRows:
-    """Return an order by weights, (N,), if there are some, else every row once an epoch."""
-    return ShuffledRows(rows, batch_size, seed) if weights is None else WeightedRows(weights, batch_size, seed)
 
 
 @contextmanager

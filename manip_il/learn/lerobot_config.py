@@ -205,8 +205,8 @@ class LeRobotFit:
             wandb=self.wandb,
         )
 
-    def resume_options(self) -> dict[str, Any]:
-        """Return the options that a resumed fit must share with the one before, as JSON knows them."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the options by which a checkpoint names its fit, without those of one machine."""
         policy, scheduler = draccus.encode(self.policy), self.scheduler()
         return {
             "policy": {name: value for name, value in policy.items() if name not in _OF_THE_MACHINE},

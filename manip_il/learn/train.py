@@ -29,7 +29,7 @@ from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
-from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
+from manip_il.learn.batches import Order, generator_of, pictures_to_float, prefetched
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit, without_places
@@ -101,7 +101,7 @@ class Trainer:
         self.digest = self.data.digest
         if drawn is not None:
             self.digest = hashlib.sha256(self.digest.encode() + drawn.tobytes()).hexdigest()
-        self.options = self.lerobot.resume_options()
+        self.options = self.lerobot.to_json()
         if checkpoint is not None:
             check_same_data(checkpoint, self.digest)
         self.origin = Origin.of(
@@ -118,7 +118,7 @@ class Trainer:
         with threads(config.threads):
             self._build(checkpoint)
         world = self.accelerator.num_processes
-        self._order = order_of(len(self.data.train), drawn, self.batch_size * world, config.seed)
+        self._order = Order(len(self.data.train), drawn, self.batch_size * world, config.seed)
 
     def _check_widths(self) -> None:
         """Raise `MismatchError` unless an action has a measured joint for each number, which a delta needs."""
@@ -206,7 +206,7 @@ class Trainer:
     def batch(self, step: int) -> Batch:
         """Return the samples of this process at a step, as they are stored."""
         size, place = self.batch_size, self.accelerator.process_index
-        rows = self._order.batch(step).numpy()[place * size : (place + 1) * size]
+        rows = self._order.batch(step)[place * size : (place + 1) * size]
         return self.data.samples.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:

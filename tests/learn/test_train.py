@@ -340,7 +340,7 @@ def test_curves_for_tensorboard_and_weights_and_biases(fit, tmp_path, curves):
 def test_a_number_that_is_not_finite_is_null_and_lines_that_are_none_are_dropped(tmp_path, value):
     path = tmp_path / "metrics.jsonl"
     lines = [json.dumps({"step": step, "grad_norm": math.nan}) for step in (1, 2, 3)]
-    path.write_text("\n".join(["[" * 100_000, '{"step": "1"}', *lines, ""]))
+    path.write_text("\n".join(["[", '{"step": "1"}', *lines, ""]))
     with json_lines(path, 2) as write:
         write({"step": 3, "loss": 0.5, "grad_norm": value})
     expected = {"step": 3, "loss": 0.5, "grad_norm": None}
