@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from manip_il.algorithms.iterations import Iteration
     from manip_il.algorithms.learning_run import LearningRun
-    from manip_il.learn.reward import Reward
+    from manip_il.learn.reward import LearnedReward
 
 
-def reinforcement(run: LearningRun, reward: Reward) -> Iterator[Iteration]:
+def reinforcement(run: LearningRun, reward: LearnedReward) -> Iterator[Iteration]:
     """Yield every iteration: roll out the learner, improve it by the reward. The run's episodes must have no hold."""
     for i in run.iterations():
         run.rollouts(i)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Protocol, override
+from typing import Any, override
 
 import numpy as np
 import torch
@@ -27,14 +27,6 @@ F32 = NDArray[np.float32]
 PREFERENCE = "preference"  # its type, in config.json
 _KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # of its inputs, in LeRobot's words
 _ROWS = 16_384  # evaluated at once
-
-
-class Reward(Protocol):
-    """A reward of what was seen and done."""
-
-    def __call__(self, states: F32, environment_states: F32, actions: F32) -> F32:
-        """Return the reward of every row, (B,): states (B, n), environment states (B, k), absolute actions (B, n)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -179,7 +171,10 @@ class LearnedReward:
         self.origin.check_fits(spec)
 
     def __call__(self, states: F32, environment_states: F32, actions: F32) -> F32:
-        """Return the reward of every row, (B,); see `Reward`. Raises `MismatchError` for other widths."""
+        """Return the reward of every row, (B,): states (B, n), environment states (B, k), absolute actions (B, n).
+
+        Raises `MismatchError` for other widths.
+        """
         given = (states, environment_states, actions)
         for (key, width), one in zip(self._widths.items(), given, strict=True):
             if one.shape != (len(states), width):

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,21 +35,22 @@ _MAX_HELD_OUT = 1_024  # samples that a validation looks at
 
 @dataclass(frozen=True)
 class Windows:
-    """The frames that each sample is made of. episodes: the episode of every frame, (N,), in stored order.
+    """The frames that each sample is made of. episodes: the episode of every frame, (N,), ascending.
 
     deltas: column -> frames relative to the sample's own, (K,); a column that is not there is taken as it is.
     """
 
     episodes: I64
     deltas: Mapping[str, I64]
-    _first: I64 = field(init=False, repr=False)  # row of the first frame of every frame's episode
-    _last: I64 = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        starts = np.flatnonzero(np.diff(self.episodes, prepend=self.episodes[0] - 1))
-        ends = np.append(starts[1:], len(self.episodes))
-        object.__setattr__(self, "_first", np.repeat(starts, ends - starts))
-        object.__setattr__(self, "_last", np.repeat(ends - 1, ends - starts))
+    @cached_property
+    def _first(self) -> I64:
+        """Row of the first frame of every frame's episode, (N,)."""
+        return np.searchsorted(self.episodes, self.episodes)
+
+    @cached_property
+    def _last(self) -> I64:
+        return np.searchsorted(self.episodes, self.episodes, side="right") - 1
 
     def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
         """Return the rows of one column's frames (B, K), and by LeRobot's name which are padding (B, K).
@@ -163,7 +165,6 @@ class TrainingData:
 
 
 def load_data(
-    roots: Sequence[Path],
     policy: PreTrainedConfig,
     meta: JoinedDatasets,
     *,
@@ -182,7 +183,7 @@ def load_data(
     cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
-    table = joined_columns(roots, [*numbers, *_ALWAYS, *label])
+    table = joined_columns(meta.roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     require_finite(table, numbers)
     if encode is not None:
@@ -200,7 +201,7 @@ def load_data(
         {key: Pictures.decode(meta.datasets, key, on_frames) for key in cameras},
         np.array(meta.tasks, object),
     )
-    return TrainingData(samples, usable[train], usable[held_out], table, _digest(roots, table))
+    return TrainingData(samples, usable[train], usable[held_out], table, _digest(meta.roots, table))
 
 
 def _digest(roots: Sequence[Path], table: Table) -> str:

@@ -88,7 +88,6 @@ class Trainer:
         self.lerobot.set_features(self.meta.features, input_columns(config, first.root, first.info))
         self._check_widths()
         self.data = load_data(
-            sources.roots,
             self.lerobot.policy,
             self.meta,
             eval_split=config.eval_split,
