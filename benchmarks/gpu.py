@@ -1,18 +1,16 @@
 """What a CUDA card does: training from pictures against LeRobot's loader and loop, acting, and drawing by EGL.
 
-python benchmarks/gpu.py [--quick]
+python benchmarks/gpu.py
 
 Samples/s of ACT (two cameras of 96 and of 240 pixels), diffusion and cnn (96), batches of 32, mixed precision where the
 policy has it: `manip_il`'s trainer, whose pictures are decoded once, and LeRobot's DataLoader with a process a core (8
 at most), its processors and an update as `lerobot-train` makes it. Both after a warm-up, by turns, on one dataset of
-films. Then milliseconds an action for 25 episodes in lockstep, on the card and (but diffusion) on the CPU, and pictures/s of
-the renderer. 8 minutes at most. Without a card it says so and ends with 0.
+films. Then milliseconds an action for 25 episodes in lockstep, on the card and the CPU, and pictures/s of the renderer.
+8 minutes at most. Without a card it says so and ends with 0.
 """
 
 from __future__ import annotations
 
-import argparse
-import itertools
 import os
 import statistics
 import subprocess
@@ -20,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +27,12 @@ os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
 import numpy as np
 import torch
 from _machine import describe_machine
+from accelerate import Accelerator
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 import datasets
-from manip_il.collect.expert import Expert
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
@@ -44,7 +43,8 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 
 BATCH, EPISODES_AT_ONCE = 32, 25
-LIMIT = 7.5 * 60  # [s], after which no further row is begun
+SECONDS, REPEATS = 5.0, 3  # of a measurement
+LIMIT = 7 * 60  # [s], after which no further row is begun
 ACT = {"type": "act", "use_amp": True, "pretrained_backbone_weights": None}
 DIFFUSION = {"type": "diffusion", "use_amp": True, "pretrained_backbone_weights": None, "crop_shape": [84, 84]}
 ROWS: dict[str, tuple[int, dict[str, Any]]] = {
@@ -56,42 +56,38 @@ ROWS: dict[str, tuple[int, dict[str, Any]]] = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few episodes, a second a measurement: shows that it runs")
-    quick = parser.parse_args().quick
     if not torch.cuda.is_available():
         print("torch sees no CUDA card here: nothing to measure; see benchmarks/image_loading.py for a CPU")
         return 0
     datasets.disable_progress_bars()
-    began, seconds, repeats = time.monotonic(), 1.0 if quick else 6.0, 1 if quick else 3
+    began = time.monotonic()
     print(f"{torch.cuda.get_device_name()}; {describe_machine()}")
     print(f"training, batches of {BATCH}: samples/s   LeRobot's      ours   ratio (range)   ms an action: card, CPU")
     with tempfile.TemporaryDirectory() as folder:
-        roots = {size: record(Path(folder) / str(size), size, 4 if quick else 20) for size in (96, 240)}
+        roots = {size: record(Path(folder) / str(size), size) for size in (96, 240)}
         for name, (size, options) in ROWS.items():
             if time.monotonic() - began > LIMIT:
-                print(f"{name}: left out, {LIMIT:.0f} s are over")
-                continue
+                break
             config = FitConfig(
                 {**options, "device": "cuda"}, observation="images", steps=10**6, batch_size=BATCH, log_freq=10**9
             )
             trainer = Trainer(Sources((Dataset.open(roots[size]),)), config, Path(folder) / name)
             steps = trainer.run(), lerobots_steps(roots[size], trainer)
-            pairs = [tuple(samples_per_s(step, seconds) for step in steps) for _ in range(repeats)]
+            pairs = [tuple(BATCH * per_s(partial(next, step)) for step in steps) for _ in range(REPEATS)]
             trainer.save()
             saved = Path(folder) / name / "checkpoints/last/pretrained_model"
             devices = ("cuda",) if options is DIFFUSION else ("cuda", "cpu")  # a minute a plan on a CPU
             times = [milliseconds_an_action(saved, device, size) for device in devices]
             print(row(name, pairs, times), flush=True)
         for size in (96, 240):
-            print(f"drawing, {size} x {size} pixels, {os.environ['MUJOCO_GL']}: {pictures_per_s(size, seconds):,.0f}/s")
+            print(f"drawing, {size} x {size} pixels, {os.environ['MUJOCO_GL']}: {pictures_per_s(size):,.0f}/s")
     print(f"{time.monotonic() - began:.0f} s")
     return 0
 
 
-def record(root: Path, size: int, episodes: int) -> Path:
+def record(root: Path, size: int) -> Path:
     words = ["record", "--cameras=front,wrist", f"--image.height={size}", f"--image.width={size}"]
-    words += [f"--dataset.num_episodes={episodes}", f"--dataset.root={root}"]
+    words += ["--dataset.num_episodes=20", f"--dataset.root={root}"]
     command = "import sys; from manip_il.cli.main import main; sys.exit(main())"
     subprocess.run([sys.executable, "-c", command, *words], check=True, capture_output=True)
     return root
@@ -109,31 +105,26 @@ def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
     policy = make_policy(config, ds_meta=meta).train()
     before, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
     optimizer: Any = ours.lerobot.optimizer().build(policy.get_optim_params())
-    scaler = torch.amp.GradScaler("cuda", enabled=config.use_amp)
+    accelerator = Accelerator(mixed_precision="fp16" if config.use_amp else "no")
+    policy, optimizer = accelerator.prepare(policy, optimizer)
     while True:
         for batch in loader:
-            with torch.autocast("cuda", torch.float16, enabled=config.use_amp):
+            with accelerator.autocast():
                 loss, _ = policy.forward(before(batch))
-            scaler.scale(loss).backward()
-            scaler.unscale_(optimizer)
-            torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
-            scaler.step(optimizer)
-            scaler.update()
+            accelerator.backward(loss)
+            accelerator.clip_grad_norm_(policy.parameters(), 10.0)
+            optimizer.step()
             optimizer.zero_grad()
             loss.item()
             yield
 
 
-def samples_per_s(steps: Iterator[Any], seconds: float) -> float:
-    return BATCH * per_s(lambda: next(steps), seconds)
-
-
-def per_s(call: Callable[[], object], seconds: float) -> float:
+def per_s(call: Callable[[], object]) -> float:
     """Calls a second, after two of warm-up."""
     for _ in range(2):
         call()
     count, started = 0, time.perf_counter()
-    while time.perf_counter() - started < seconds:
+    while time.perf_counter() - started < SECONDS:
         call()
         count += 1
     torch.cuda.synchronize()
@@ -146,23 +137,14 @@ def milliseconds_an_action(path: Path, device: str, size: int) -> float:
     shape = (EPISODES_AT_ONCE, size, size, 3)
     images = {camera: rng.integers(256, size=shape, dtype=np.uint8) for camera in policy.cameras}
     around = np.empty((EPISODES_AT_ONCE, 0), np.float32)
-    return 1e3 / (EPISODES_AT_ONCE * per_s(lambda: policy.act(states, around, images), 3.0))
+    return 1e3 / (EPISODES_AT_ONCE * per_s(lambda: policy.act(states, around, images)))
 
 
-def pictures_per_s(size: int, seconds: float) -> float:
+def pictures_per_s(size: int) -> float:
     env, config = ManipEnv(), CameraConfig(("front", "wrist"), size, size)
     env.start(0)
-    expert, states = Expert(env.scene), [env.get_state()]
-    for _ in range(10):
-        env.advance(expert.label(states[-1]).action)
-        states.append(env.get_state())
-    turn = itertools.cycle(states)
-
-    def draw() -> None:
-        env.set_state(next(turn))
-        render.pictures(env.config.robot, env.config.task, env.data, config)
-
-    return len(config.names) * per_s(draw, seconds)
+    draw = partial(render.pictures, env.config.robot, env.config.task, env.data, config)
+    return len(config.names) * per_s(draw)
 
 
 def row(name: str, pairs: list[tuple[float, ...]], times: list[float]) -> str:
