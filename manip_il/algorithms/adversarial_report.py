@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.ticker import EngFormatter
 
-from manip_il.algorithms.iterations import best_validation
+from manip_il.algorithms.learning_run import best_validation
 from manip_il.evaluation.figures import ARMS, CLONING, DAGGER, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import EvalResult, compare_results

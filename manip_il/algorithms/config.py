@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig, MLPOptions
@@ -15,13 +14,8 @@ from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
-    import numpy as np
-    from numpy.typing import NDArray
-
     from manip_il.collect.query import Query
     from manip_il.sim.conditions import Condition
-
-    F64 = NDArray[np.float64]
 
 SCHEDULES = {
     "constant": "constant:0.0 lets the learner drive alone from round 1 on (the paper's parameter-free choice)",
@@ -79,7 +73,30 @@ def _number(text: str) -> float | None:
         return None
 
 
-CORRECTION = 0.25  # of the longest step: where expert and learner differ by more, the label corrects
+@dataclass(frozen=True)
+class Algorithm:
+    """One way to learn: the function of its name, in the module of its name. title: in reports. driver: for the help.
+
+    learner_drives: whether it does in some rounds, so that label, query and beta mean something. takes_images: whether
+    policies may look at pictures.
+    """
+
+    title: str
+    driver: str
+    learner_drives: bool = True
+    takes_images: bool = True
+
+
+ALGORITHMS = {
+    "dagger": Algorithm("DAgger", "the learner"),
+    "cloning": Algorithm("Cloning", "the expert", learner_drives=False),
+    "dart": Algorithm("DART", "the expert with noise like the learner's errors", False, takes_images=False),
+}
+
+if TYPE_CHECKING:
+    Method = str
+else:
+    Method = Literal[*ALGORITHMS]  # the choices of `--method`
 
 
 @dataclass(frozen=True)
@@ -87,7 +104,7 @@ class Sampling:
     """Relative weight of a frame. All equal: each frame once an epoch.
 
     demonstrations: of round 0. corrections: of later rounds, where the expert drove, or its label differs from the
-    executed action by more than `CORRECTION`. rollouts: the others of later rounds.
+    executed action by more than a quarter of the longest step. rollouts: the others of later rounds.
     """
 
     demonstrations: float = option(1.0, "weight of a frame of round 0")
@@ -107,24 +124,6 @@ class Sampling:
         """Whether no kind is preferred."""
         return self.demonstrations == self.corrections == self.rollouts
 
-    def weights(self, table: Mapping[str, NDArray[Any]], scale: F64) -> F64 | None:
-        """Return the weight of every frame of a table with `fitting.COLUMNS`, (N,); None where all are equal.
-
-        scale: see `action_gap`.
-        """
-        if self.is_even:
-            return None
-        import numpy as np
-
-        from manip_il.collect.query import action_gap
-        from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-        from manip_il.mdp import Actor
-
-        gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
-        by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
-        later = np.where(by_expert | (gap > CORRECTION), self.corrections, self.rollouts)
-        return np.where(table[ROUND].reshape(-1) == 0, self.demonstrations, later).astype(np.float64)
-
 
 _AT_LEAST_1 = (
     *("demonstrations", "episodes_per_round", "validation_episodes", "ensemble", "patience"),
@@ -141,7 +140,7 @@ class RunConfig:
     that is round 0's policy, in place of cloning; without datasets, round 0 then has no demonstrations. Later rounds
     begin with its weights, and have its architecture.
 
-    method: a name in `ALGORITHMS` (`check_method`). rounds: after round 0, fewer where label_budget, the sound labels
+    method: a name in `ALGORITHMS`. rounds: after round 0, fewer where label_budget, the sound labels
     of all rounds together, is reached before. beta: the share of a round's steps that the expert drives. label,
     branch_steps: what the expert gives in a state in which it is queried, see `RolloutJob`; branch_steps None: as many
     as the policy plans. query_rule: in which states; None: the default of the label mode, see `query`. ensemble:
@@ -209,7 +208,27 @@ class RunConfig:
             raise UsageError("redraw is for policies on pictures, with --label=per_state and even sampling")
         if self.refit_steps is not None and self.refit == "scratch":
             raise UsageError("refit_steps is for refit=warm; a policy from scratch takes all steps")
+        self._check_method()
         self._check_queries()
+
+    def _check_method(self) -> None:
+        """Options are for the method, and pictures are rendered exactly if the policy takes some."""
+        if self.method not in ALGORITHMS:
+            raise UnknownName("method", self.method, ALGORITHMS)
+        algorithm, queries = ALGORITHMS[self.method], (self.label, self.query_rule, self.beta)
+        if not algorithm.learner_drives and queries != ("per_state", None, _LEARNER_ALONE):
+            raise UsageError(f"method {self.method!r} has the expert drive throughout; leave out label, query and beta")
+        if not self.fit.takes_images:
+            if self.cameras is not None:
+                raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation")
+            return
+        if not algorithm.takes_images:
+            raise UsageError(
+                f"method {self.method!r} measures the learner's errors from state vectors; it is not for a policy on "
+                "images"
+            )
+        if self.cameras is None:
+            raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
 
     def _check_queries(self) -> None:
         rule, kind = self.query_rule, self.query_rule.kind if self.query_rule else "every"
@@ -225,11 +244,6 @@ class RunConfig:
             )
         if kind != "ensemble" and self.ensemble > 1:
             raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
-
-    @property
-    def has_queries(self) -> bool:
-        """Whether label, query or beta is not the default: they are for rounds in which the learner drives."""
-        return (self.label, self.query_rule, self.beta) != ("per_state", None, _LEARNER_ALONE)
 
     def episodes(self, round_: int) -> int:
         """Return episodes of a round."""
@@ -261,15 +275,6 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
 
     policy = policy_config(fit)
     return len(policy.action_delta_indices or [0]), getattr(policy, "drop_n_last_frames", 0)
-
-
-def check_cameras(config: RunConfig) -> None:
-    """Raise `UsageError` unless pictures are rendered exactly where the policy takes some."""
-    takes_images = config.fit.takes_images
-    if takes_images and config.cameras is None:
-        raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
-    if config.cameras is not None and not takes_images:
-        raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation=images")
 
 
 def check_labels(config: RunConfig) -> None:

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from manip_il.collect.environments import make_env
 from manip_il.errors import MismatchError
 from manip_il.learn.action_spaces import Conversion
+from manip_il.learn.network import MLPNetwork
 from manip_il.mdp import Observation
 from manip_il.sim.config import EnvConfig
 
@@ -96,6 +97,12 @@ class ActionRange:
     scale: F32
     low: F32
     high: F32
+
+    @classmethod
+    def of(cls, network: MLPNetwork) -> ActionRange:
+        """Return the units and the range of a network's targets."""
+        names = ("target_mean", "target_scale", "target_low", "target_high")
+        return cls(*(getattr(network, name).numpy().copy() for name in names))
 
     def raw(self, actions: F32) -> F32:
         """Return raw targets (B, n) of normalised actions (B, n)."""

@@ -1,16 +1,18 @@
-"""A reward from pairs and answers, and how well it foretells what it has not learnt from."""
+"""A reward from pairs and answers, how well it foretells what it has not learnt from, and the page that says so."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.intervals import Proportion, format_percent
+from manip_il.evaluation.report import Report, Section
+from manip_il.evaluation.tables import Table
 from manip_il.learn.preference.fitting import BY_CHANCE, Compared, Fit, fit_reward
 from manip_il.learn.preference.network import RewardShape
 from manip_il.preferences.answers import Answers
@@ -18,6 +20,10 @@ from manip_il.preferences.pairs import Clips
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 TIE = 0.01  # difference of the clips' mean progress below which none is the better one
+_MODEL = (
+    f"P(left is better) = {1 - BY_CHANCE:g} sigmoid(R(left) - R(right)) + {BY_CHANCE / 2:g}",
+    "R(clip) = Σ r(state, action)",
+)
 EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of what is foretold about the clip that is likelier to be preferred
 
 
@@ -75,7 +81,7 @@ def fit_answers(
     fit = fit_reward(clips.inputs, compared, shape, seed, on_epoch)
     decided = answers.better != 0.5
     right = (fit.logits > 0) == (answers.better > 0.5)
-    probability = probabilities(fit.logits)
+    probability = (1 - BY_CHANCE) / (1 + np.exp(-np.clip(fit.logits, -50, 50))) + BY_CHANCE / 2
     difference = true_difference(clips)
     true = teachers = None
     ties = 0
@@ -98,11 +104,6 @@ def fit_answers(
     )
 
 
-def probabilities(logits: F64) -> F64:
-    """Return P(left is better) of differences of returns (A,), (A,), as the model of the answers has it."""
-    return (1 - BY_CHANCE) / (1 + np.exp(-np.clip(logits, -50, 50))) + BY_CHANCE / 2
-
-
 def true_difference(clips: Clips) -> F64 | None:
     """Return mean true progress of every pair's left clip minus that of its right one, (P,); None without progress."""
     if clips.progress is None:
@@ -111,13 +112,13 @@ def true_difference(clips: Clips) -> F64 | None:
     return means[:, 0] - means[:, 1]
 
 
-def calibration(probability: F64, better: F64, edges: Sequence[float] = EDGES) -> tuple[Bin, ...]:
+def calibration(probability: F64, better: F64) -> tuple[Bin, ...]:
     """Return how often the likelier clip was preferred, by its probability: of answers left and right, (A,) each."""
     likelier = np.maximum(probability, 1 - probability)
     given = np.where(probability >= 0.5, better, 1 - better)
-    place = np.clip(np.searchsorted(edges, likelier, side="right") - 1, 0, len(edges) - 2)
+    place = np.clip(np.searchsorted(EDGES, likelier, side="right") - 1, 0, len(EDGES) - 2)
     found: list[Bin] = []
-    for number, (low, high) in enumerate(itertools.pairwise(edges)):
+    for number, (low, high) in enumerate(itertools.pairwise(EDGES)):
         inside = place == number
         if inside.any():
             found.append(Bin(low, high, float(likelier[inside].mean()), _proportion(given[inside] > 0.5)))
@@ -130,3 +131,75 @@ def _proportion(right: NDArray[np.bool_]) -> Proportion:
 
 def _counts(one: Proportion) -> dict[str, Any]:
     return {"rate": one.rate, "interval": list(one.interval), "right": one.successes, "of": one.n}
+
+
+def summary_lines(found: Fitted, answers: Answers) -> list[str]:
+    """Return what was learnt as plain lines."""
+    told = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
+    lines = [f"{told}, {answers.skipped:,} skipped, {answers.contradictory:,} pairs with contradictory answers"]
+    lines.append(f"agreement with answers on held-out pairs: {found.answered}")
+    if found.true is not None:
+        lines.append(f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}")
+    return lines
+
+
+def fit_report(
+    found: Fitted,
+    clips: Clips,
+    answers: Answers,
+    who: Sequence[str],
+    command: str,
+    config: Mapping[str, Any],
+    timings: Mapping[str, float],
+) -> Report:
+    """Return the report of a reward. who: answered, one name a file."""
+    sources = tuple((source.root, f"{source.episodes:,}", f"{source.frames:,}") for source in clips.pairs.sources)
+    first, *facts = summary_lines(found, answers)
+    best, what = (found.answered, "the answers") if found.true is None else (found.true, "true progress")
+    agreement = Section(
+        "Agreement",
+        formulas=_MODEL,
+        tables=(_agreement_table(found),),
+        notes=(
+            f"{found.shape.members} networks of {found.shape.depth} x {found.shape.width}; the pairs are dealt into as "
+            "many folds. Each network leaves one fold out, from which its numbers above are; all stopped at epoch "
+            f"{found.fit.epochs}, where the loss on these was lowest. The reward is their mean, which has seen every "
+            "pair.",
+        ),
+    )
+    calibrated = Section(
+        "Calibration",
+        tables=(_calibration_table(found.bins),),
+        notes=(
+            "Of held-out answers left or right, by the probability of the clip that was likelier to be preferred. Mean "
+            f"square of answer minus probability: {found.brier:.3f}.",
+        ),
+    )
+    from_where = Section("Where the clips are from", tables=(Table(("dataset", "episodes", "frames"), sources),))
+    return Report(
+        title=f"A reward from preferences, {clips.pairs.robot} {clips.pairs.task}",
+        verdict=f"On pairs that it did not learn from, the reward agrees with {what} in {format_percent(best.rate)} of "
+        f"{best.n:,}.",
+        facts=(f"{first}, by {', '.join(who)}.", *(f"{fact[:1].upper()}{fact[1:]}." for fact in facts)),
+        command=command,
+        config=config,
+        timings=timings,
+        sections=(agreement, calibrated, from_where),
+    )
+
+
+def _agreement_table(found: Fitted) -> Table:
+    """With what the reward agrees on held-out pairs, and how far the answers do themselves."""
+    rows = [("answers", found.answered, "left or right was answered, and the reward says so")]
+    if found.true is not None:
+        rows.append(("true progress", found.true, f"ties left out, by less than {TIE:g}: {found.ties}"))
+    if found.teachers is not None:
+        rows.append(("the answers themselves with true progress", found.teachers, ""))
+    cells = tuple((name, str(p), f"{p.n:,}", note) for name, p, note in rows)
+    return Table(("with", "agreement", "of", "note"), cells).filled()
+
+
+def _calibration_table(bins: Sequence[Bin]) -> Table:
+    """What was foretold beside what was answered, one row a range of probabilities."""
+    rows = tuple((f"{b.low:.1f} to {b.high:.1f}", f"{b.foretold:.2f}", str(b.given), f"{b.given.n:,}") for b in bins)
+    return Table(("foretold", "mean", "answered so", "of"), rows)

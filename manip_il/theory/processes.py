@@ -112,7 +112,8 @@ def _beside(back: bool) -> tuple[F64, F64, F64]:
 def _ring() -> tuple[F64, F64, F64]:
     """`PLACES` in a ring: the right action leads one or two on, the wrong one back; the expert is in all of them."""
     on = (np.roll(np.eye(PLACES), 1, axis=1) + np.roll(np.eye(PLACES), 2, axis=1)) / 2
-    return np.stack([on, on.T]), np.outer([1.0, 0.0], np.ones(PLACES)), np.full(PLACES, 1 / PLACES)
+    rewards = np.stack([np.ones(PLACES), np.zeros(PLACES)])
+    return np.stack([on, on.T]), rewards, np.full(PLACES, 1 / PLACES)
 
 
 PROCESSES = (

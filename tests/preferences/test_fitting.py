@@ -17,8 +17,7 @@ from manip_il.learn.preference.modeling_preference import write_reward
 from manip_il.learn.preference.network import RewardNetwork, RewardShape, joints_of, shape_for, ways_of
 from manip_il.learn.reward import LearnedReward
 from manip_il.preferences.answers import join_answers
-from manip_il.preferences.fit_report import fit_report
-from manip_il.preferences.fitting import calibration, fit_answers
+from manip_il.preferences.fitting import calibration, fit_answers, fit_report
 from manip_il.preferences.teachers import Teacher, answer_pairs
 
 SHAPE = RewardShape(members=3, width=16)
