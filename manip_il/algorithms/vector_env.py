@@ -102,7 +102,8 @@ class Lockstep(VecEnv):
     """Episodes of `horizon` steps, side by side. Observations (B, d + 2): inputs, absorbing or not, share of time gone.
 
     episodes: each a `RobotEpisode`, or what has its methods. conversion: of the policy's raw targets into actions; the
-    first of the inputs are the measured joints that it needs. `seeds` are those of the next `reset`. simulated: control steps since then. executed: actions (T, B, n) since then.
+    first of the inputs are the measured joints that it needs. `seeds` are those of the next `reset`. simulated: control
+    steps since then. executed: actions (T, B, n) since then.
     """
 
     def __init__(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,20 +23,6 @@ _MODEL = (
     f"P(left is better) = {1 - BY_CHANCE:g} sigmoid(R(left) - R(right)) + {BY_CHANCE / 2:g}",
     "R(clip) = Σ r(state, action)",
 )
-EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of what is foretold about the clip that is likelier to be preferred
-
-
-@dataclass(frozen=True)
-class Bin:
-    """Answers whose likelier clip was foretold with a probability from low to high.
-
-    foretold: its mean; given: the share of answers that preferred that clip.
-    """
-
-    low: float
-    high: float
-    foretold: float
-    given: Proportion
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +40,16 @@ class Fitted:
     true: Proportion | None
     teachers: Proportion | None
     ties: int
-    bins: tuple[Bin, ...]
     brier: float
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers for `fit.json`."""
-        bins = [{"low": b.low, "high": b.high, "foretold": b.foretold, **_counts(b.given)} for b in self.bins]
         return {
             "agreement_with_answers": _counts(self.answered),
             "agreement_with_progress": None if self.true is None else _counts(self.true),
             "answers_agreement_with_progress": None if self.teachers is None else _counts(self.teachers),
             "ties": self.ties,
             "brier": self.brier,
-            "calibration": bins,
             "epochs": self.fit.epochs,
         }
 
@@ -99,7 +81,6 @@ def fit_answers(
         true=true,
         teachers=teachers,
         ties=ties,
-        bins=calibration(probability[decided], answers.better[decided]),
         brier=float(np.mean((probability - answers.better) ** 2)),
     )
 
@@ -110,19 +91,6 @@ def true_difference(clips: Clips) -> F64 | None:
         return None
     means = clips.progress[clips.rows].mean(axis=-1)
     return means[:, 0] - means[:, 1]
-
-
-def calibration(probability: F64, better: F64) -> tuple[Bin, ...]:
-    """Return how often the likelier clip was preferred, by its probability: of answers left and right, (A,) each."""
-    likelier = np.maximum(probability, 1 - probability)
-    given = np.where(probability >= 0.5, better, 1 - better)
-    place = np.clip(np.searchsorted(EDGES, likelier, side="right") - 1, 0, len(EDGES) - 2)
-    found: list[Bin] = []
-    for number, (low, high) in enumerate(itertools.pairwise(EDGES)):
-        inside = place == number
-        if inside.any():
-            found.append(Bin(low, high, float(likelier[inside].mean()), _proportion(given[inside] > 0.5)))
-    return tuple(found)
 
 
 def _proportion(right: NDArray[np.bool_]) -> Proportion:
@@ -163,16 +131,8 @@ def fit_report(
         notes=(
             f"{found.shape.members} networks of {found.shape.depth} x {found.shape.width}; the pairs are dealt into as "
             "many folds. Each network leaves one fold out, from which its numbers above are; all stopped at epoch "
-            f"{found.fit.epochs}, where the loss on these was lowest. The reward is their mean, which has seen every "
-            "pair.",
-        ),
-    )
-    calibrated = Section(
-        "Calibration",
-        tables=(_calibration_table(found.bins),),
-        notes=(
-            "Of held-out answers left or right, by the probability of the clip that was likelier to be preferred. Mean "
-            f"square of answer minus probability: {found.brier:.3f}.",
+            f"{found.fit.epochs}, where the loss on these was lowest. Mean square of answer minus probability: "
+            f"{found.brier:.3f}. The reward is their mean, which has seen every pair.",
         ),
     )
     from_where = Section("Where the clips are from", tables=(Table(("dataset", "episodes", "frames"), sources),))
@@ -184,7 +144,7 @@ def fit_report(
         command=command,
         config=config,
         timings=timings,
-        sections=(agreement, calibrated, from_where),
+        sections=(agreement, from_where),
     )
 
 
@@ -197,9 +157,3 @@ def _agreement_table(found: Fitted) -> Table:
         rows.append(("the answers themselves with true progress", found.teachers, ""))
     cells = tuple((name, str(p), f"{p.n:,}", note) for name, p, note in rows)
     return Table(("with", "agreement", "of", "note"), cells).filled()
-
-
-def _calibration_table(bins: Sequence[Bin]) -> Table:
-    """What was foretold beside what was answered, one row a range of probabilities."""
-    rows = tuple((f"{b.low:.1f} to {b.high:.1f}", f"{b.foretold:.2f}", str(b.given), f"{b.given.n:,}") for b in bins)
-    return Table(("foretold", "mean", "answered so", "of"), rows)

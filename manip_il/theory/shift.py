@@ -58,14 +58,12 @@ class Visited(NamedTuple):
 class Errors:
     """Wrong actions. by_step: share of the running episodes that err at a step, while `FEWEST` run.
 
-    rate: of all states; per_episode: wrong actions in an episode, on average; size: mean distance of an action from its
-    label, in its worst joint [largest steps].
+    rate: of all states; per_episode: wrong actions in an episode, on average.
     """
 
     by_step: tuple[float, ...]
     rate: float
     per_episode: float
-    size: float
 
 
 @dataclass(frozen=True)
@@ -246,5 +244,4 @@ def _errors(actions: Sequence[NDArray[Any]], episodes: Sequence[Episode], env: E
         tuple((wrong / running.clip(min=1))[:shown].tolist()),
         float(wrong.sum() / running.sum()),
         float(wrong.sum() / len(episodes)),
-        float(sizes[known].mean()),
     )
