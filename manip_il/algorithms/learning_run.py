@@ -261,7 +261,9 @@ class LearningRun(Run):
         given = step.get("given", ())
         given = list(given.values()) if isinstance(given, dict) else list(given)  # by path, in runs from before
         if given != self._given:
-            raise MismatchError("content of datasets and policies (sha256)", "this run", self._given, "before", given)
+            ours, theirs = (", ".join(one[:12] for one in hashes) for hashes in (self._given, given))
+            run = f"the run in {self.folder}"
+            raise MismatchError("content of datasets and policies (sha256)", "what is given", ours, run, theirs)
         with readable_state(checkpoint), threads(1):
             self._learner.load(checkpoint / TRAINING_STATE, self._modules)
             self._number, self._simulated = int(step["step"]), int(step["simulated"])
