@@ -17,40 +17,34 @@ if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
     from manip_il.collect.query import Query
     from manip_il.sim.conditions import Condition
 
-SCHEDULES = {
-    "constant": "constant:0.0 lets the learner drive alone from round 1 on (the paper's parameter-free choice)",
-    "linear": "linear:5 falls evenly from 1 in round 0 to 0 in round 5",
-    "exponential": "exponential:0.5 is 0.5 to the power of the round",
-}
+_KINDS = "constant:B, linear:ROUNDS or exponential:B, with B from 0 to 1 and at least 1 round"
 
 
 @dataclass(frozen=True)
 class BetaSchedule:
-    """`kind:parameter`, as in `constant:0`, `linear:5`, `exponential:0.5`. Round 0 is the expert's own: beta is 1.
+    """`kind:parameter`. Round 0 is the expert's own: beta is 1.
 
-    Raises `UnknownName` for the kind, `UsageError` for a parameter out of range.
+    `constant:0` lets the learner drive alone from round 1 on (the paper's parameter-free choice), `linear:5` falls
+    evenly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round. Raises `UsageError`
+    for anything else.
     """
 
     kind: str
     parameter: float
 
     def __post_init__(self) -> None:
-        if self.kind not in SCHEDULES:
-            raise UnknownName("beta schedule", self.kind, SCHEDULES)
-        if not (self.parameter >= 1 if self.kind == "linear" else 0 <= self.parameter <= 1):
-            expected = "at least 1 round" if self.kind == "linear" else "0 to 1"
-            raise UsageError(f"beta is '{self}'; expected {expected} after {self.kind}:")
+        allowed = {"constant": 0 <= self.parameter <= 1, "linear": self.parameter >= 1}
+        if not (allowed | {"exponential": 0 <= self.parameter <= 1}).get(self.kind):
+            raise UsageError(f"beta is '{self}'; expected {_KINDS}")
 
     @classmethod
     def parse(cls, text: str) -> BetaSchedule:
-        """Read what `str` writes; `UsageError` also for a parameter that is missing or no number."""
+        """Read what `str` writes."""
         kind, _, parameter = text.partition(":")
-        number = _number(parameter)
-        if kind not in SCHEDULES and _number(text) is not None:
-            raise UsageError(f"beta is {text!r}; expected constant:{text}, linear:ROUNDS or exponential:B")
-        if kind in SCHEDULES and number is None:
-            raise UsageError(f"beta is {text!r}; expected {kind}:NUMBER ({SCHEDULES[kind]})")
-        return cls(kind, number or 0.0)
+        try:
+            return cls(kind, float(parameter))
+        except ValueError as error:
+            raise UsageError(f"beta is {text!r}; expected {_KINDS}") from error
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.parameter:g}"
@@ -64,13 +58,6 @@ class BetaSchedule:
         if self.kind == "linear":
             return max(0.0, 1.0 - round_ / self.parameter)
         return self.parameter**round_
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
 
 
 @dataclass(frozen=True)
@@ -140,11 +127,10 @@ class RunConfig:
     that is round 0's policy, in place of cloning; without datasets, round 0 then has no demonstrations. Later rounds
     begin with its weights, and have its architecture.
 
-    method: a name in `ALGORITHMS`. rounds: after round 0, fewer where label_budget, the sound labels
-    of all rounds together, is reached before. beta: the share of a round's steps that the expert drives. label,
-    branch_steps: what the expert gives in a state in which it is queried, see `RolloutJob`; branch_steps None: as many
-    as the policy plans. query_rule: in which states; None: the default of the label mode, see `query`. ensemble:
-    policies fitted every round, of which the first drives.
+    rounds: after round 0, fewer if label_budget, the sound labels of all rounds together, is reached before. beta: the
+    share of a round's steps that the expert drives. label, branch_steps: what the expert gives in a state in which it is
+    queried, see `RolloutJob`; branch_steps None: as many as the policy plans. query_rule: in which states; None: the
+    default of the label mode, see `query`. ensemble: policies fitted every round, of which the first drives.
 
     refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
     the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
@@ -198,10 +184,8 @@ class RunConfig:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 to 1")
         if self.disturbed_share and self.env.robot == STOCK:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
-        if self.rounds < 0:
-            raise UsageError(f"rounds is {self.rounds}; expected at least 0")
-        if self.rounds >= MAX_ROUNDS:
-            raise UsageError(f"rounds is {self.rounds}; expected fewer than {MAX_ROUNDS}")
+        if not 0 <= self.rounds < MAX_ROUNDS:
+            raise UsageError(f"rounds is {self.rounds}; expected 0 or more, fewer than {MAX_ROUNDS}")
         if self.redraw < 0:
             raise UsageError(f"redraw is {self.redraw}; expected the number of scenes")
         if self.redraw and (self.cameras is None or self.label != "per_state" or not self.sampling.is_even):

@@ -26,7 +26,7 @@ DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})
         ({"label": "takeover", "beta": BetaSchedule("linear", 3)}, "learner rolls in alone"),
         ({"label": "takeover", "query_rule": Query("every")}, "from the first step on"),
         ({"rounds": -1}, "rounds is -1"),
-        ({"rounds": 100}, "rounds is 100; expected fewer than 100"),
+        ({"rounds": 100}, "rounds is 100; expected 0 or more, fewer than 100"),
         ({"episodes_per_round": 0}, "episodes_per_round is 0"),
         ({"disturbed_share": 1.5}, "disturbed_share is 1.5"),
         ({"refit_steps": 100}, "refit_steps is for refit=warm"),

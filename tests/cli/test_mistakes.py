@@ -154,7 +154,7 @@ def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
             f"{train} --lr=-1": "lr is -1.0; expected more than 0",
             f"{train} --dataset.eval_split=1": "dataset.eval_split is 1.0; expected at least 0",
             f"{train} --seed=5000": "seed is 5000",
-            "dagger --beta=0.5": "beta is '0.5'; expected constant:0.5, linear:ROUNDS or exponential:B",
+            "dagger --beta=0.5": "beta is '0.5'; expected constant:B, linear:ROUNDS or exponential:B",
             "dagger --beta=lineal:5": "did you mean 'linear'?",
             "dagger --rounds=-1": "rounds is -1; expected at least 0",
             "dagger --label=takover": "did you mean 'takeover'?",
