@@ -128,8 +128,8 @@ class RunConfig:
     begin with its weights, and have its architecture.
 
     rounds: after round 0, fewer if label_budget, the sound labels of all rounds together, is reached before. beta: the
-    share of a round's steps that the expert drives. label, branch_steps: what the expert gives in a state in which it is
-    queried, see `RolloutJob`; branch_steps None: as many as the policy plans. query_rule: in which states; None: the
+    share of a round's steps that the expert drives. label, branch_steps: what the expert gives in a state in which it
+    is queried, see `RolloutJob`; branch_steps None: as many as the policy plans. query_rule: in which states; None: the
     default of the label mode, see `query`. ensemble: policies fitted every round, of which the first drives.
 
     refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
