@@ -150,9 +150,10 @@ class ImitationRun(Run):
             if path.is_file():
                 validation = EvalResult.read(path)
             else:
-                driver, name = PolicyDriver((policy.path,), trust=config.fit.trust), f"DAgger round {round_}"
-                numbers = (config.hold, config.validation_episodes, config.seed)
-                validation = self._evaluate(driver, name, config.env, *numbers, config.conditions)
+                driver = PolicyDriver((policy.path,), trust=config.fit.trust)
+                job = RolloutJob(config.env, driver, config.hold, label="last", conditions=config.conditions)
+                name = f"DAgger round {round_}"
+                validation = self._evaluate(job, name, config.validation_episodes, config.seed)
                 validation.write(path)
         here, so_far = self._made[round_], [one for one in self._made.values() if one.round <= round_]
         return RoundResult(

@@ -24,6 +24,7 @@ from manip_il.algorithms.run import Run, Watch
 from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import dataset_sha256
@@ -238,9 +239,9 @@ class LearningRun(Run):
         """Evaluate a policy on the validation's seeds, unless that has been done; keep it if it is the best."""
         config = self.config
         if (found := self._validation(number)) is None:
-            numbers = (HOLD, config.validation_episodes, config.seed)
+            job = RolloutJob(config.env, PolicyDriver((policy,)), HOLD, label="last")
             with self._timed("validate"):
-                found = self._evaluate(PolicyDriver((policy,)), f"iteration {number}", config.env, *numbers)
+                found = self._evaluate(job, f"iteration {number}", config.validation_episodes, config.seed)
             with new_folder(validated(self.folder, number)) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
                 found.write(new / FILE_NAME)

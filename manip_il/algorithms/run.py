@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
@@ -23,8 +22,7 @@ from manip_il.evaluation.runner import evaluate
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import NOMINAL, Condition
-from manip_il.sim.config import EnvConfig
+from manip_il.sim.conditions import NOMINAL
 
 BEST = "best"
 
@@ -59,19 +57,9 @@ class Run:
         taken, self._seconds = self._seconds, {}
         return {stage: round(seconds, digits) for stage, seconds in taken.items()}
 
-    def _evaluate(
-        self,
-        policy: PolicyDriver,
-        name: str,
-        env: EnvConfig,
-        hold: int,
-        count: int,
-        seed: int,
-        conditions: tuple[Condition, ...] = (),
-    ) -> EvalResult:
+    def _evaluate(self, job: RolloutJob, name: str, count: int, seed: int) -> EvalResult:
         """Evaluate a policy on the validation's seeds."""
-        job = RolloutJob(env, policy, hold, label="last", conditions=conditions)  # solved is solved
-        suite = conditions[0].name if conditions else NOMINAL.name
+        suite = job.conditions[0].name if job.conditions else NOMINAL.name
         seeds = stream_seeds("validation", count, seed)
         return evaluate(self._engine, job, seeds, name, self._watch.on_episode, suite=suite)
 
