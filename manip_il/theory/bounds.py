@@ -68,14 +68,13 @@ class Curve:
 
     @property
     def ratios(self) -> list[float]:
-        """Mean gap over mean error at each horizon."""
-        gaps, errors = self._gaps_and_errors.mean(axis=1).T
-        return (gaps / errors).tolist()
+        """Mean gap over mean error at each horizon; NaN if no policy errs."""
+        return _ratios(self._gaps_and_errors.mean(axis=1)).tolist()
 
     @property
     def slope(self) -> float:
-        """The power of the horizon with which gap over error grows."""
-        return float(np.polyfit(np.log(self.horizons), np.log(self.ratios), 1)[0])
+        """The power of the horizon with which gap over error grows; NaN if that is not known at each."""
+        return float(np.append(_powers(self.horizons, np.array(self.ratios)[:, None]), np.nan)[0])
 
     @cached_property
     def interval(self) -> tuple[float, float]:
@@ -83,9 +82,9 @@ class Curve:
         rng = rng_for(0, f"slope of {self.problem}, {self.learner}, {self.fit}")
         horizons, draws, _ = self._gaps_and_errors.shape
         chosen = rng.integers(draws, size=(_BOOTSTRAPS, horizons, draws))
-        gaps, errors = np.moveaxis(self._gaps_and_errors[np.arange(horizons)[:, None], chosen].mean(axis=2), -1, 0)
-        slopes = np.polyfit(np.log(self.horizons), np.log(gaps / errors).T, 1)[0]
-        low, high = np.quantile(slopes, [0.025, 0.975])
+        ratios = _ratios(self._gaps_and_errors[np.arange(horizons)[:, None], chosen].mean(axis=2))
+        slopes = _powers(self.horizons, ratios.T)
+        low, high = np.quantile(slopes, [0.025, 0.975]) if slopes.size else (np.nan, np.nan)
         return float(low), float(high)
 
     @property
@@ -195,3 +194,15 @@ def _fitted(process: Process, horizon: int, draws: int) -> dict[tuple[Learner, F
 def _mended(process: Process, policy: F64) -> F64:
     """Without errors that cost nothing: there, the theorems' expert may act as the policy does."""
     return np.where(process.wrong_costs(policy.shape[-2]) <= 0, 0.0, policy)
+
+
+def _ratios(gaps_and_errors: F64) -> F64:
+    """Gap over error (...) of both, (..., 2); NaN without an error."""
+    gaps, errors = np.moveaxis(gaps_and_errors, -1, 0)
+    return np.divide(gaps, errors, out=np.full(gaps.shape, np.nan), where=errors > 0)
+
+
+def _powers(horizons: Sequence[int], ratios: F64) -> F64:
+    """Slopes in log-log of the columns of ratios (h, n) that are known at each horizon."""
+    known = ratios[:, np.isfinite(ratios).all(axis=0)]
+    return np.polyfit(np.log(horizons), np.log(known), 1)[0] if known.size else np.empty(0)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from manip_il.theory.bounds import clone, constructed, curves, dagger, losses_of
+from manip_il.theory.bounds import Curve, Loss, clone, constructed, curves, dagger, losses_of
 from manip_il.theory.processes import PROCESSES, RIGHT, WRONG, Process
 
 FEW = (10, 40, 160)
@@ -101,3 +101,12 @@ def test_all_data_leave_no_error_and_dagger_finds_what_the_expert_never_shows():
     [before] = losses_of(walk, "DAgger", clone(walk, shown, 1.0))
     [after] = losses_of(walk, "DAgger", dagger(walk, shown, 1.0, 300, [np.random.default_rng(0)]))
     assert after.gap < 0.05 * before.gap
+
+
+def test_a_horizon_at_which_no_policy_errs_has_no_ratio():
+    none, some = Loss(0.0, 0.0, 0.0), Loss(0.1, 0.2, 1.0)
+    curve = Curve("walk", "cloning", "worst", (10, 20), ((none, none), (none, some)))
+    assert np.isnan([curve.ratios[0], curve.slope, *curve.interval]).all()
+    known = Curve("walk", "cloning", "worst", (10, 20), ((none, some), (some, some)))
+    assert known.slope == pytest.approx(0.0, abs=1e-9)
+    assert known.interval == pytest.approx((0.0, 0.0), abs=1e-9)
