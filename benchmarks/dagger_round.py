@@ -18,9 +18,8 @@ from pathlib import Path
 from _machine import describe_machine
 
 from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.imitation import DATASET, round_folder, run_algorithm
 from manip_il.algorithms.rounds import RoundResult
-from manip_il.algorithms.run import DATASET, round_folder
-from manip_il.algorithms.table import run_algorithm
 from manip_il.collect.expert import Expert
 from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.dataset import Dataset

@@ -29,7 +29,7 @@ import manip_il.collect.expert as expert
 import manip_il.collect.job as jobs
 import manip_il.learn.mlp as mlp
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.table import run_algorithm
+from manip_il.algorithms.imitation import run_algorithm
 from manip_il.collect.workers import Engine
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.network import Statistics

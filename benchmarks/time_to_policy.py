@@ -25,7 +25,7 @@ from pathlib import Path
 from _machine import describe_machine
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.table import run_algorithm
+from manip_il.algorithms.imitation import run_algorithm
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.parsing import from_yaml
 from manip_il.collect.workers import Engine, default_workers

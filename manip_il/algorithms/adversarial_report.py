@@ -7,23 +7,24 @@ from typing import Any
 
 from matplotlib.ticker import EngFormatter
 
-from manip_il.algorithms.iterations import best_validation
+from manip_il.algorithms.learning_run import best_validation
 from manip_il.evaluation.figures import ARMS, CLONING, DAGGER, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.evaluation.tables import PolicyRow, policy_table
 
 Records = Sequence[Mapping[str, Any]]
-_PANELS = (
-    ("of the learner's rollouts", {"success": "success", "absorbing": "share of time after success"}),
-    (
-        "discriminator right about",
-        {"discriminator_accuracy_expert": "expert", "discriminator_accuracy_learner": "learner"},
-    ),
-    ("return, learnt reward", {"return": "return"}),
-    ("distance of an iteration [nats]", {"kl": "KL"}),
-    ("log of the actions' spread", {"log_std": "mean over the action"}),
-)
+_PANELS = {
+    "validation": {"validation_success": "success"},
+    "of the learner's rollouts": {"success": "success", "absorbing": "share of time after success"},
+    "discriminator right about": {
+        "discriminator_accuracy_expert": "expert",
+        "discriminator_accuracy_learner": "learner",
+    },
+    "return, learnt reward": {"return": "return"},
+    "distance of an iteration [nats]": {"kl": "KL"},
+    "log of the actions' spread": {"log_std": "mean over the action"},
+}
 
 
 def adversarial_report(
@@ -31,7 +32,10 @@ def adversarial_report(
 ) -> Report:
     """Return the report of a run. found: its validations by iteration, not none. records: lines of metrics.jsonl."""
     best, steps = best_validation(dict(found)), {record["iteration"]: record["steps"] for record in records}
-    names = {number: _name(number, steps) for number in found}
+    names = {
+        number: f"after {steps[number]:,} steps" if steps.get(number) else "last" if number else "policy given"
+        for number in found
+    }
     shown = sorted({min(found), best, max(found)})
     rows = [PolicyRow(names[number], found[number], colour=DAGGER if number else CLONING) for number in shown]
     facts = ["The best policy was chosen on these episodes, so they flatter it; measure it by manip-il eval."]
@@ -39,8 +43,8 @@ def adversarial_report(
         facts.insert(0, compare_results(found[0], found[best], (names[0], names[best])).verdict)
     sections = [Section("Policies on the validation's episodes", tables=(policy_table(rows),), notes=tuple(facts))]
     if records:
-        figures = (_validation_figure(found, steps), _learning_figure(records))
-        sections.append(Section("How it learnt", figures=figures, notes=("Over simulated control steps.",)))
+        notes = ("Over simulated control steps.",)
+        sections.append(Section("How it learnt", figures=(_learning_figure(records),), notes=notes))
     return Report(
         title=title,
         verdict=f"Best {names[best]}: validation success {found[best].success}.",
@@ -51,29 +55,13 @@ def adversarial_report(
     )
 
 
-def _name(number: int, steps: Mapping[int, int]) -> str:
-    return f"after {steps[number]:,} steps" if steps.get(number) else "policy given" if not number else "last"
-
-
-def _validation_figure(found: Mapping[int, EvalResult], steps: Mapping[int, int]) -> Figure:
-    with drawing(1, size=(6.5, 2.4)) as (drawn, axes):
-        axis = axes[0, 0]
-        x = [steps.get(number, 0) for number in found]
-        rates = [one.success for one in found.values()]
-        low, high = ([abs(rate.rate - rate.interval[side]) for rate in rates] for side in (0, 1))
-        axis.errorbar(x, [rate.rate for rate in rates], yerr=(low, high), color=DAGGER, marker="o", ms=4, lw=1.4)
-        axis.set(title="validation success", ylim=(-0.02, 1.02), xlabel="steps")
-        axis.xaxis.set_major_formatter(EngFormatter())
-        return to_figure(drawn, "Validation success over simulated steps, with intervals")
-
-
 def _learning_figure(records: Records) -> Figure:
-    panels = [(title, lines) for title, lines in _PANELS if any(key in record for record in records for key in lines)]
+    panels = {title: lines for title, lines in _PANELS.items() if any(key in one for one in records for key in lines)}
     with drawing(-(-len(panels) // 2), 2, size=(2.6, 2.0)) as (drawn, axes):
-        for axis, (title, lines) in zip(axes.ravel(), panels, strict=False):
+        for axis, (title, lines) in zip(axes.ravel(), panels.items(), strict=False):
             for colour, (key, label) in zip(ARMS, lines.items(), strict=False):
                 points = [(record["steps"], record[key]) for record in records if record.get(key) is not None]
-                axis.plot(*zip(*points, strict=True), color=colour, lw=1.2, label=label) if points else None
+                axis.plot(*zip(*points, strict=True), color=colour, marker=".", lw=1.2, label=label) if points else None
             axis.set(title=title)
             axis.xaxis.set_major_formatter(EngFormatter())
             if len(lines) > 1:

@@ -1,16 +1,10 @@
 """Adversarial inverse reinforcement learning: Fu, Luo & Levine, ICLR 2018, algorithm 1, with PPO for its last step."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
+from manip_il.algorithms.learning_config import LearningConfig
+from manip_il.algorithms.learning_run import Iteration, LearningRun
 from manip_il.learn.discriminators import AirlDiscriminator
-
-if TYPE_CHECKING:
-    from manip_il.algorithms.iterations import Iteration
-    from manip_il.algorithms.learning_config import LearningConfig
-    from manip_il.algorithms.learning_run import LearningRun
 
 
 def airl(run: LearningRun, c: LearningConfig) -> Iterator[Iteration]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig, MLPOptions
@@ -15,48 +14,37 @@ from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
-    import numpy as np
-    from numpy.typing import NDArray
-
     from manip_il.collect.query import Query
     from manip_il.sim.conditions import Condition
 
-    F64 = NDArray[np.float64]
-
-SCHEDULES = {
-    "constant": "constant:0.0 lets the learner drive alone from round 1 on (the paper's parameter-free choice)",
-    "linear": "linear:5 falls evenly from 1 in round 0 to 0 in round 5",
-    "exponential": "exponential:0.5 is 0.5 to the power of the round",
-}
+_KINDS = "constant:B, linear:ROUNDS or exponential:B, with B from 0 to 1 and at least 1 round"
 
 
 @dataclass(frozen=True)
 class BetaSchedule:
-    """`kind:parameter`, as in `constant:0`, `linear:5`, `exponential:0.5`. Round 0 is the expert's own: beta is 1.
+    """`kind:parameter`. Round 0 is the expert's own: beta is 1.
 
-    Raises `UnknownName` for the kind, `UsageError` for a parameter out of range.
+    `constant:0` lets the learner drive alone from round 1 on (the paper's parameter-free choice), `linear:5` falls
+    evenly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round. Raises `UsageError`
+    for anything else.
     """
 
     kind: str
     parameter: float
 
     def __post_init__(self) -> None:
-        if self.kind not in SCHEDULES:
-            raise UnknownName("beta schedule", self.kind, SCHEDULES)
-        if not (self.parameter >= 1 if self.kind == "linear" else 0 <= self.parameter <= 1):
-            expected = "at least 1 round" if self.kind == "linear" else "0 to 1"
-            raise UsageError(f"beta is '{self}'; expected {expected} after {self.kind}:")
+        allowed = {"constant": 0 <= self.parameter <= 1, "linear": self.parameter >= 1}
+        if not (allowed | {"exponential": 0 <= self.parameter <= 1}).get(self.kind):
+            raise UsageError(f"beta is '{self}'; expected {_KINDS}")
 
     @classmethod
     def parse(cls, text: str) -> BetaSchedule:
-        """Read what `str` writes; `UsageError` also for a parameter that is missing or no number."""
+        """Read what `str` writes."""
         kind, _, parameter = text.partition(":")
-        number = _number(parameter)
-        if kind not in SCHEDULES and _number(text) is not None:
-            raise UsageError(f"beta is {text!r}; expected constant:{text}, linear:ROUNDS or exponential:B")
-        if kind in SCHEDULES and number is None:
-            raise UsageError(f"beta is {text!r}; expected {kind}:NUMBER ({SCHEDULES[kind]})")
-        return cls(kind, number or 0.0)
+        try:
+            return cls(kind, float(parameter))
+        except ValueError as error:
+            raise UsageError(f"beta is {text!r}; expected {_KINDS}") from error
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.parameter:g}"
@@ -72,14 +60,30 @@ class BetaSchedule:
         return self.parameter**round_
 
 
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
+@dataclass(frozen=True)
+class Algorithm:
+    """One way to learn: the function of its name, in the module of its name. title: in reports. driver: for the help.
+
+    learner_drives: whether it does in some rounds, so that label, query and beta mean something. takes_images: whether
+    policies may look at pictures.
+    """
+
+    title: str
+    driver: str
+    learner_drives: bool = True
+    takes_images: bool = True
 
 
-CORRECTION = 0.25  # of the longest step: where expert and learner differ by more, the label corrects
+ALGORITHMS = {
+    "dagger": Algorithm("DAgger", "the learner"),
+    "cloning": Algorithm("Cloning", "the expert", learner_drives=False),
+    "dart": Algorithm("DART", "the expert with noise like the learner's errors", False, takes_images=False),
+}
+
+if TYPE_CHECKING:
+    Method = str
+else:
+    Method = Literal[*ALGORITHMS]  # the choices of `--method`
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ class Sampling:
     """Relative weight of a frame. All equal: each frame once an epoch.
 
     demonstrations: of round 0. corrections: of later rounds, where the expert drove, or its label differs from the
-    executed action by more than `CORRECTION`. rollouts: the others of later rounds.
+    executed action by more than a quarter of the longest step. rollouts: the others of later rounds.
     """
 
     demonstrations: float = option(1.0, "weight of a frame of round 0")
@@ -107,24 +111,6 @@ class Sampling:
         """Whether no kind is preferred."""
         return self.demonstrations == self.corrections == self.rollouts
 
-    def weights(self, table: Mapping[str, NDArray[Any]], scale: F64) -> F64 | None:
-        """Return the weight of every frame of a table with `fitting.COLUMNS`, (N,); None where all are equal.
-
-        scale: see `action_gap`.
-        """
-        if self.is_even:
-            return None
-        import numpy as np
-
-        from manip_il.collect.query import action_gap
-        from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-        from manip_il.mdp import Actor
-
-        gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
-        by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
-        later = np.where(by_expert | (gap > CORRECTION), self.corrections, self.rollouts)
-        return np.where(table[ROUND].reshape(-1) == 0, self.demonstrations, later).astype(np.float64)
-
 
 _AT_LEAST_1 = (
     *("demonstrations", "episodes_per_round", "validation_episodes", "ensemble", "patience"),
@@ -141,11 +127,10 @@ class RunConfig:
     that is round 0's policy, in place of cloning; without datasets, round 0 then has no demonstrations. Later rounds
     begin with its weights, and have its architecture.
 
-    method: a name in `ALGORITHMS` (`check_method`). rounds: after round 0, fewer where label_budget, the sound labels
-    of all rounds together, is reached before. beta: the share of a round's steps that the expert drives. label,
-    branch_steps: what the expert gives in a state in which it is queried, see `RolloutJob`; branch_steps None: as many
-    as the policy plans. query_rule: in which states; None: the default of the label mode, see `query`. ensemble:
-    policies fitted every round, of which the first drives.
+    rounds: after round 0, fewer if label_budget, the sound labels of all rounds together, is reached before. beta: the
+    share of a round's steps that the expert drives. label, branch_steps: what the expert gives in a state in which it
+    is queried, see `RolloutJob`; branch_steps None: as many as the policy plans. query_rule: in which states; None: the
+    default of the label mode, see `query`. ensemble: policies fitted every round, of which the first drives.
 
     refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
     the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
@@ -199,17 +184,35 @@ class RunConfig:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 to 1")
         if self.disturbed_share and self.env.robot == STOCK:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
-        if self.rounds < 0:
-            raise UsageError(f"rounds is {self.rounds}; expected at least 0")
-        if self.rounds >= MAX_ROUNDS:
-            raise UsageError(f"rounds is {self.rounds}; expected fewer than {MAX_ROUNDS}")
+        if not 0 <= self.rounds < MAX_ROUNDS:
+            raise UsageError(f"rounds is {self.rounds}; expected 0 or more, fewer than {MAX_ROUNDS}")
         if self.redraw < 0:
             raise UsageError(f"redraw is {self.redraw}; expected the number of scenes")
         if self.redraw and (self.cameras is None or self.label != "per_state" or not self.sampling.is_even):
             raise UsageError("redraw is for policies on pictures, with --label=per_state and even sampling")
         if self.refit_steps is not None and self.refit == "scratch":
             raise UsageError("refit_steps is for refit=warm; a policy from scratch takes all steps")
+        self._check_method()
         self._check_queries()
+
+    def _check_method(self) -> None:
+        """Options are for the method, and pictures are rendered exactly if the policy takes some."""
+        if self.method not in ALGORITHMS:
+            raise UnknownName("method", self.method, ALGORITHMS)
+        algorithm, queries = ALGORITHMS[self.method], (self.label, self.query_rule, self.beta)
+        if not algorithm.learner_drives and queries != ("per_state", None, _LEARNER_ALONE):
+            raise UsageError(f"method {self.method!r} has the expert drive throughout; leave out label, query and beta")
+        if not self.fit.takes_images:
+            if self.cameras is not None:
+                raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation")
+            return
+        if not algorithm.takes_images:
+            raise UsageError(
+                f"method {self.method!r} measures the learner's errors from state vectors; it is not for a policy on "
+                "images"
+            )
+        if self.cameras is None:
+            raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
 
     def _check_queries(self) -> None:
         rule, kind = self.query_rule, self.query_rule.kind if self.query_rule else "every"
@@ -225,11 +228,6 @@ class RunConfig:
             )
         if kind != "ensemble" and self.ensemble > 1:
             raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
-
-    @property
-    def has_queries(self) -> bool:
-        """Whether label, query or beta is not the default: they are for rounds in which the learner drives."""
-        return (self.label, self.query_rule, self.beta) != ("per_state", None, _LEARNER_ALONE)
 
     def episodes(self, round_: int) -> int:
         """Return episodes of a round."""
@@ -261,15 +259,6 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
 
     policy = policy_config(fit)
     return len(policy.action_delta_indices or [0]), getattr(policy, "drop_n_last_frames", 0)
-
-
-def check_cameras(config: RunConfig) -> None:
-    """Raise `UsageError` unless pictures are rendered exactly where the policy takes some."""
-    takes_images = config.fit.takes_images
-    if takes_images and config.cameras is None:
-        raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
-    if config.cameras is not None and not takes_images:
-        raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation=images")
 
 
 def check_labels(config: RunConfig) -> None:

@@ -1,18 +1,13 @@
 """Dataset aggregation: Ross, Gordon & Bagnell 2011, algorithm 3.1, with the expert's demonstrations as round 0."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
-from manip_il.algorithms.rounds import RoundResult, mixture
-
-if TYPE_CHECKING:
-    from manip_il.algorithms.config import RunConfig
-    from manip_il.algorithms.run import Run
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.imitation import ImitationRun, mixture
+from manip_il.algorithms.rounds import RoundResult
 
 
-def dagger(run: Run, c: RunConfig) -> Iterator[RoundResult]:
+def dagger(run: ImitationRun, c: RunConfig) -> Iterator[RoundResult]:
     """Yield every round: roll out the learner, query the expert where it went, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)

@@ -27,7 +27,6 @@ from manip_il.tasks.pick_place import OBJECT
 
 F64 = NDArray[np.float64]
 CARRY = "carry"
-_FEW = 4  # names in a message
 _MOVED = 0.004  # from where it stood, at which an object is on its way [m]
 
 
@@ -44,8 +43,7 @@ class Carried:
 def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Carried]:
     """Return what was carried in a dataset's episodes that reached the goal, in order.
 
-    Raises `ManipError` for a dataset that lacks what tells layouts and paths, naming it, for a robot that is not known
-    here, and where no episode reached the goal; and what reading a `Dataset` raises.
+    Raises `ManipError` for a dataset of another task, and if no episode reached the goal.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -70,7 +68,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
 def follow(episode: int, grid: Grid, positions: F64) -> Carried:
     """Return a path of the object's positions (T, 3) [m] as a demonstration on a grid.
 
-    Raises `ManipError` where it does not lead to the goal on the grid.
+    Raises `ManipError` if it does not lead to the goal on the grid.
     """
     path = grid.snap(positions)
     if len(path) < 2 or path[-1] != grid.goal:
@@ -90,13 +88,10 @@ def carried_stretch(positions: F64, goal: F64) -> F64:
 
 def _places(root: Path, spec: schema.RobotTaskSpec) -> dict[str, int]:
     """Columns of `environment_state` by name; all that is needed is there."""
-    needed = [f"{name}.{axis}" for name in (OBJECT, "goal", *THINGS, EDGE, f"{EDGE}.outwards") for axis in "xyz"]
-    needed += [f"{OBJECT}.width", *(f"{name}.here" for name in (*THINGS, EDGE))]
-    found = {name: column for column, name in enumerate(spec.environment_state_names)}
-    if missing := [name for name in needed if name not in found]:
-        more = f" and {len(missing) - _FEW} more" if len(missing) > _FEW else ""
+    needed = {f"{name}.{axis}" for name in (OBJECT, "goal", *THINGS, EDGE, f"{EDGE}.outwards") for axis in "xyz"}
+    needed |= {f"{OBJECT}.width", *(f"{name}.here" for name in (*THINGS, EDGE))}
+    if not needed <= set(spec.environment_state_names):
         raise ManipError(
-            f"{root} is of the task {spec.task}: its {schema.ENVIRONMENT_STATE} lacks {', '.join(missing[:_FEW])}{more}"
-            f", which tell what a path costs; expected a dataset of manip-il record --task.type={CARRY}"
+            f"{root} is of the task {spec.task}; expected a dataset of manip-il record --task.type={CARRY}"
         )
-    return found
+    return {name: column for column, name in enumerate(spec.environment_state_names)}

@@ -11,22 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.algorithms.inverse import Carried
-from manip_il.algorithms.inverse_figures import cost_figure, trace_figure
+from manip_il.evaluation.figures import CLONING, DAGGER, SOFT, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
 from manip_il.rewards.paths import cheapest_path, plan
+from manip_il.tasks.layout import THINGS
 from manip_il.tasks.reward import FEATURES
 
 F64 = NDArray[np.float64]
 PAGE, FILE_NAME = "report.html", "reward.json"
 _ASSUMES = {
-    "max_margin": (
-        "min over w of  λ/2 |w|² + mean over demonstrations of  [ w·f(demonstration) - min over paths (w·f - margin) ]",
-    ),
-    "bayesian": ("p(w) = Π exp(-w_k / m) / m;   p(demonstration | w) = exp(-w·f) / Σ over its rivals exp(-w·f)",),
-    "max_entropy": ("p(path) = exp(-w·f) / Z(w);   gradient = f(demonstrations) - E[f]",),
+    "max_margin": "min over w of  λ/2 |w|² + mean over demonstrations of  "
+    "[ w·f(demonstration) - min over paths (w·f - margin) ]",
+    "bayesian": "p(w) = Π exp(-w_k / m) / m;   p(demonstration | w) = exp(-w·f) / Σ over its rivals exp(-w·f)",
+    "max_entropy": "p(path) = exp(-w·f) / Z(w);   gradient = f(demonstrations) - E[f]",
 }
+_PANELS = 3
+_SIDE = 80  # points along a side of the map
 
 
 @dataclass(frozen=True)
@@ -86,32 +88,20 @@ class Inverse:
 
 def weight_table(found: Inverse) -> Table:
     """Return the weights, one row a feature."""
-    learnt, (shown, planned) = found.learnt, found.means
-    beside = learnt.beside
-    rows = [
-        (
-            name.replace("_", " "),
-            "not identified" if k in learnt.open else f"{learnt.weights[k]:.2f}",
-            _interval(learnt, k),
-            f"{beside[1][k]:.2f}" if beside else "",
-            f"{shown[k]:.3f}",
-            f"{planned[k]:.3f}",
-        )
-        for k, name in enumerate(FEATURES)
-    ]
-    columns = ("per metre", "weight", f"{LEVEL:.0%} interval", beside[0] if beside else "", "shown [m]", "planned [m]")
+    learnt, (shown, planned), rows = found.learnt, found.means, []
+    for k, name in enumerate(FEATURES):
+        weight, interval = f"{learnt.weights[k]:.2f}", ""
+        if k in learnt.open:
+            weight, interval = "not identified", "[{:.2g}, {:.2g}] (prior)".format(*prior_interval())
+        elif learnt.intervals is not None:
+            interval = "[{:.2f}, {:.2f}]".format(*learnt.intervals[k])
+        rows.append((name.replace("_", " "), weight, interval, f"{shown[k]:.3f}", f"{planned[k]:.3f}"))
+    columns = ("per metre", "weight", f"{LEVEL:.0%} interval", "shown [m]", "planned [m]")
     return Table(columns, tuple(rows)).filled()
 
 
-def _interval(learnt: Learnt, k: int) -> str:
-    if k in learnt.open:
-        low, high = prior_interval()
-        return f"[{low:.2g}, {high:.2g}] (prior)"
-    return "" if learnt.intervals is None else "[{:.2f}, {:.2f}]".format(*learnt.intervals[k])
-
-
 def open_line(found: Inverse) -> str:
-    """Return which weights are not identified, as a sentence; empty where all are."""
+    """Return which weights are not identified, as a sentence; empty if all are."""
     if not found.open_names:
         return ""
     return (
@@ -122,42 +112,68 @@ def open_line(found: Inverse) -> str:
 
 def inverse_report(found: Inverse, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
     """Return the report of what was learnt."""
-    sections = [
-        Section(
-            "What a metre costs",
-            formulas=_ASSUMES[found.learnt.method],
-            tables=(weight_table(found),),
-            notes=tuple(one for one in (*found.learnt.facts, open_line(found)) if one),
+    order = [k for k in np.argsort(-found.weights).tolist() if k != 0 and found.weights[k] > 0][:3]
+    words = ", ".join(f"{found.weights[k]:.1f} {FEATURES[k].replace('_', ' ')}" for k in order)
+    weights = Section(
+        "What a metre costs",
+        formulas=(_ASSUMES[found.learnt.method],),
+        tables=(weight_table(found),),
+        notes=tuple(one for one in (*found.learnt.facts, open_line(found)) if one),
+    )
+    costs = Section(
+        "The cost over the table",
+        figures=(_cost_figure(found),),
+        notes=(
+            "Cost of a metre of path at the height at which the object was carried, from above; things in grey. "
+            "Solid: as demonstrated. Dashed: the cheapest path for these weights.",
         ),
-        Section(
-            "The cost over the table",
-            figures=(cost_figure(found.carried, [nodes for nodes, _ in found.replanned], found.weights),),
-            notes=(
-                "Cost of a metre of path at the height at which the object was carried, from above; things in grey. "
-                "Solid: as demonstrated. Dashed: the cheapest path for these weights.",
-            ),
-        ),
-    ]
-    if found.learnt.draws is not None:
-        figure = trace_figure(found.learnt.draws, FEATURES)
-        sections.append(Section("The chains", figures=(figure,), notes=("Weights over that of length, draw by draw.",)))
+    )
     return Report(
         title="What the demonstrations care about",
-        verdict=_verdict(found),
+        verdict=f"{len(found.carried)} demonstrations pay {found.excess:.1%} more than the cheapest paths for the "
+        "weights that were learnt of them; a metre that costs 1 for its length costs besides: "
+        f"{words or 'nothing'}.",
         command=command,
         config=config,
         timings=timings,
-        sections=tuple(sections),
+        sections=(weights, costs),
     )
 
 
-def _verdict(found: Inverse) -> str:
-    order = [k for k in np.argsort(-found.weights).tolist() if k != 0 and found.weights[k] > 0][:3]
-    words = ", ".join(f"{found.weights[k]:.1f} {FEATURES[k].replace('_', ' ')}" for k in order)
-    return (
-        f"{len(found.carried)} demonstrations pay {found.excess:.1%} more than the cheapest paths for the weights that "
-        f"were learnt of them; a metre that costs 1 for its length costs besides: {words or 'nothing'}."
-    )
+def _cost_figure(found: Inverse) -> Figure:
+    """The cost of a metre over the table in the layouts with the most on it, with both paths."""
+    count = [len(one.grid.layout.places) + (one.grid.layout.edge is not None) for one in found.carried]
+    chosen = np.argsort(-np.array(count), kind="stable")[:_PANELS].tolist()
+    with drawing(len(chosen), size=(3.0, 3.1)) as (drawn, axes):
+        for axis, number in zip(axes[0], chosen, strict=True):
+            one = found.carried[number]
+            image = _draw_cost(axis, one, found.weights)
+            path = one.grid.points[found.replanned[number][0]]
+            axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, lw=1.8, label="demonstrated")
+            axis.plot(*path[:, :2].T, "--", color=CLONING, lw=1.6, label="re-planned")
+            axis.plot(*one.grid.layout.goal[:2], "o", color=CLONING, ms=5)
+            drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8, pad=0.02)
+            axis.set(title=f"episode {one.episode}", xticks=[], yticks=[], aspect="equal")
+            axis.grid(visible=False)
+        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+        return to_figure(drawn, "Cost of a metre of path over the table, with demonstrated and re-planned paths")
+
+
+def _draw_cost(axis: Any, one: Carried, weights: F64) -> Any:
+    """The cost of a metre from above, at the height of the path's middle, and the things."""
+    layout, points = one.grid.layout, one.grid.points
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    x, y = (np.linspace(low[k], high[k], _SIDE) for k in (0, 1))
+    height = float(np.median(one.positions[:, 2]))
+    places = np.stack([*(part.ravel() for part in np.meshgrid(x, y)), np.full(_SIDE**2, height)], axis=1)
+    cost = (layout.densities(places) @ weights).reshape(_SIDE, _SIDE)
+    image = axis.imshow(cost, origin="lower", extent=(low[0], high[0], low[1], high[1]), cmap="Greens")
+    for name, (px, py) in layout.places:
+        half = layout.scale * np.array(THINGS[name].half)
+        box_x, box_y = px + half[0] * np.array([-1, 1, 1, -1, -1]), py + half[1] * np.array([-1, -1, 1, 1, -1])
+        axis.fill(box_x, box_y, color=SOFT, alpha=0.6, lw=0)
+        axis.annotate(name, (px, py), ha="center", va="center", fontsize=6.5)
+    return image
 
 
 def summary_lines(found: Inverse) -> Sequence[str]:

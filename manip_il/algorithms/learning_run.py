@@ -1,4 +1,4 @@
-"""One run of reinforcement learning on disk: environments, learner, and what is kept of every iteration.
+"""The steps that GAIL, AIRL and PPO are made of: environments, learner, and what is kept of every iteration.
 
 checkpoints/last/    the last finished iteration: its policy, and all that the next one needs
 validation/          by iteration, every validated policy and its eval.json
@@ -12,19 +12,15 @@ from __future__ import annotations
 
 import math
 import shutil
-import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from manip_il import checks
-from manip_il.algorithms.iterations import STAGES, Iteration, Stage, best_validation, validated, validations
 from manip_il.algorithms.learning_config import LONGER, LearningConfig
-from manip_il.algorithms.run import BEST, Watch
+from manip_il.algorithms.run import Run, Watch
 from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
@@ -33,9 +29,9 @@ from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import dataset_sha256
 from manip_il.data.dataset import Dataset
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.runner import HOLD, evaluate
+from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork
@@ -52,14 +48,46 @@ from manip_il.learn.training_state import (
     unpublished,
     write_own_files,
 )
-from manip_il.learn.transitions import Demonstrations, Transitions, read_demonstrations
+from manip_il.learn.transitions import Transitions, read_demonstrations
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
 Kept = TypeVar("Kept", bound=Discriminator)
+VALIDATION = "validation"
+STAGES = ("collect", "fit", "validate")
 
 
-class LearningRun:
+@dataclass(frozen=True)
+class Iteration:
+    """Outcome of an iteration; number 0 is what it began with. validation: of its policy, None if none was due.
+
+    steps, episodes: simulated so far. seconds: what collecting, fitting and validating took, 0 of one that was found
+    finished on disk.
+    """
+
+    number: int
+    steps: int
+    episodes: int
+    metrics: dict[str, float]
+    policy: Path
+    validation: EvalResult | None
+    seconds: dict[str, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line of `metrics.jsonl`."""
+        success = None if self.validation is None else self.validation.success
+        return {
+            "iteration": self.number,
+            "steps": self.steps,
+            "episodes": self.episodes,
+            **self.metrics,
+            "validation_success": None if success is None else success.rate,
+            "validation_episodes": None if success is None else success.n,
+            "seconds": self.seconds,
+        }
+
+
+class LearningRun(Run):
     """The steps of one run in `folder`. absorbing: episodes end after success, as the demonstrations do.
 
     reward: the folder of the reward that it learns from, if one was given. Raises what `start_conversion` and
@@ -76,30 +104,29 @@ class LearningRun:
         absorbing: bool = True,
         reward: Path | None = None,
     ):
-        self.config, self.folder = config, folder
-        self._engine, self._watch = engine, watch or Watch()
+        super().__init__(folder, engine, watch)
+        self.config = config
         self._modules: dict[str, Discriminator] = {}
-        self._number, self._simulated, self._metrics = 0, 0, dict[str, float]()
-        self._validated_at = 0
-        self._seconds = dict.fromkeys(STAGES, 0.0)
-        self._given = _hashes(config, reward)
-        spec = Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
-        self._spec = spec
+        self._number, self._simulated, self._validated_at = 0, 0, 0
+        self._metrics: dict[str, float] = {}
+        policies = [one for one in (config.start, reward) if one is not None]
+        self._given = [*map(dataset_sha256, config.datasets), *map(policy_sha256, policies)]
+        self._spec = spec = Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
         self.conversion = start_conversion(config.start, config.action_space, spec)
         demonstrations = read_demonstrations(config.datasets, self.conversion.encode) if config.datasets else None
-        rows = demonstrations.stacked if demonstrations else None
-        self._demonstrations = demonstrations
-        self.horizon = _episode_steps(config, demonstrations)
+        self.horizon = config.episode_steps or config.env.horizon
+        if demonstrations and not config.episode_steps:
+            self.horizon = min(self.horizon, math.ceil(LONGER * demonstrations.longest))
         hold = demonstrations.hold if demonstrations and absorbing else None
         with threads(1), lent_generators(self._stream(0, "weights")):
-            seed = stream_base("training", config.seed)
+            seed, rows = stream_base("training", config.seed), demonstrations.stacked if demonstrations else None
             self._policy = start_policy(config.start, self.conversion.space, spec, seed, rows)
-            self._actions = _action_range(self._policy.model)
+            actions = ActionRange.of(self._policy.model)
             episodes = [RobotEpisode(config.env, hold) for _ in range(config.episodes)]
-            self.envs = Lockstep(episodes, self._actions, self.horizon, self.conversion)
+            self.envs = Lockstep(episodes, actions, self.horizon, self.conversion)
             clone, log_std = config.start is not None, config.first_log_std
             self._learner = Learner(self._policy.model, config.ppo, self.envs, self.horizon, log_std, clone=clone)
-        self._expert = demonstrations.padded(self.horizon, self._actions.normalised) if demonstrations else None
+        self._expert = demonstrations.padded(self.horizon, actions.normalised) if demonstrations else None
 
     def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
         """Return a discriminator that belongs to the run and is saved with it. make: of the actor's network."""
@@ -107,21 +134,16 @@ class LearningRun:
             self._modules["discriminator"] = made = make(self._policy.model)
         return made
 
-    @property
-    def last(self) -> Iteration | None:
-        """The last finished iteration on disk, None where there is none."""
-        checkpoint = last_checkpoint(self.folder, resume=True)
-        if checkpoint is None:
-            return None
-        step = read_step(checkpoint)
-        with readable_state(checkpoint):
-            number, steps, metrics = int(step["step"]), int(step["simulated"]), dict(step["metrics"])
-        return self._iteration(number, steps, metrics, checkpoint / PRETRAINED_MODEL, self._validation(number))
-
     def begin(self) -> Iteration | None:
         """Return what the run goes on from: its last finished iteration, or the policy that it begins with, if any."""
-        if (last := self.last) is not None or self.config.start is None:
-            return last
+        checkpoint = last_checkpoint(self.folder, resume=True)
+        if checkpoint is not None:
+            step = read_step(checkpoint)
+            with readable_state(checkpoint):
+                number, steps, metrics = int(step["step"]), int(step["simulated"]), dict(step["metrics"])
+            return self._iteration(number, steps, metrics, checkpoint / PRETRAINED_MODEL, self._validation(number))
+        if self.config.start is None:
+            return None
         return self._iteration(0, 0, {}, self.config.start, self._validate(0, self.config.start))
 
     def iterations(self) -> Iterator[int]:
@@ -203,8 +225,7 @@ class LearningRun:
     def _iteration(
         self, number: int, steps: int, metrics: dict[str, float], policy: Path, validation: EvalResult | None
     ) -> Iteration:
-        seconds, self._seconds = self._seconds, dict.fromkeys(STAGES, 0.0)
-        seconds = {stage: round(took, 3) for stage, took in seconds.items()}
+        seconds = dict.fromkeys(STAGES, 0.0) | self._take_seconds(3)
         return Iteration(number, steps, number * self.config.episodes, metrics, policy, validation, seconds)
 
     def _validate_if_due(self, policy: Path) -> EvalResult | None:
@@ -215,26 +236,22 @@ class LearningRun:
         return self._validate(self._number, policy)
 
     def _validate(self, number: int, policy: Path) -> EvalResult:
-        """Evaluate a policy on the validation's seeds, unless that has been done; keep it where it is the best."""
+        """Evaluate a policy on the validation's seeds, unless that has been done; keep it if it is the best."""
+        config = self.config
         if (found := self._validation(number)) is None:
-            job = RolloutJob(self.config.env, PolicyDriver((policy,)), HOLD, label="last")
-            seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
+            job = RolloutJob(config.env, PolicyDriver((policy,)), HOLD, label="last")
             with self._timed("validate"):
-                found = evaluate(self._engine, job, seeds, f"iteration {number}", self._watch.on_episode)
-            with new_folder(self._eval_file(number).parent) as new:
+                found = self._evaluate(job, f"iteration {number}", config.validation_episodes, config.seed)
+            with new_folder(validated(self.folder, number)) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
                 found.write(new / FILE_NAME)
         if number == best_validation(validations(self.folder)):
-            with new_folder(self.folder / BEST, replace=True) as new:
-                shutil.copytree(policy, new / PRETRAINED_MODEL)
+            self._keep_best(policy)
         return found
 
     def _validation(self, number: int) -> EvalResult | None:
-        path = self._eval_file(number)
+        path = validated(self.folder, number) / FILE_NAME
         return EvalResult.read(path) if path.is_file() else None
-
-    def _eval_file(self, number: int) -> Path:
-        return validated(self.folder, number) / FILE_NAME
 
     def _resume(self) -> None:
         """Go on from the last finished iteration, whose validation is made up for where it is missing."""
@@ -242,30 +259,24 @@ class LearningRun:
         if checkpoint is None:
             return
         step = read_step(checkpoint)
-        given = checks.mapping(f"{checkpoint}: given", step.get("given"))
-        for name, ours in self._given.items():
-            if ours not in given.values():
-                raise MismatchError("content", name, ours, f"the run in {self.folder}", sorted(given.values()))
+        given = step.get("given", ())
+        given = list(given.values()) if isinstance(given, dict) else list(given)  # by path, in runs from before
+        if given != self._given:
+            ours, theirs = (", ".join(one[:12] for one in hashes) for hashes in (self._given, given))
+            run = f"the run in {self.folder}"
+            raise MismatchError("content of datasets and policies (sha256)", "what is given", ours, run, theirs)
         with readable_state(checkpoint), threads(1):
             self._learner.load(checkpoint / TRAINING_STATE, self._modules)
             self._number, self._simulated = int(step["step"]), int(step["simulated"])
             self._validated_at = int(step["validated_at"])
         self._validate_if_due(checkpoint / PRETRAINED_MODEL)
 
-    @contextmanager
-    def _timed(self, stage: Stage) -> Generator[None]:
-        """Add what a stage takes to the iteration's seconds."""
-        started = time.monotonic()
-        yield
-        self._seconds[stage] += time.monotonic() - started
-
     def _options(self) -> dict[str, Any]:
         """The options that a checkpoint names."""
-        config = self.config
-        kept = replace(config, datasets=(), start=None)
-        values = {name: value for name, value in asdict(kept).items() if name not in ("env", "datasets", "start")}
-        start = None if config.start is None else config.start.resolve().name
-        return {**values, "datasets": [root.resolve().name for root in config.datasets], "init": start}
+        kept = {name: value for name, value in asdict(self.config).items() if name not in ("env", "datasets", "start")}
+        names = [root.resolve().name for root in self.config.datasets]
+        start = self.config.start
+        return kept | {"datasets": names, "init": None if start is None else start.resolve().name}
 
     def _stream(self, number: int, purpose: str) -> int:
         """A seed for one purpose of an iteration."""
@@ -273,21 +284,18 @@ class LearningRun:
         return int(rng_for(base + number, purpose).integers(2**63))
 
 
-def _hashes(config: LearningConfig, reward: Path | None) -> dict[str, str]:
-    """SHA-256 of everything that a run is given, by what it is: checkpoints hold it, and no place of this machine."""
-    found = {f"dataset {i} ({root.resolve().name})": dataset_sha256(root) for i, root in enumerate(config.datasets)}
-    policies = {"init": config.start, "reward": reward}
-    return found | {name: policy_sha256(folder) for name, folder in policies.items() if folder is not None}
+def validations(folder: Path) -> dict[int, EvalResult]:
+    """Return a run's validations by iteration, in order."""
+    return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
 
 
-def _episode_steps(config: LearningConfig, demonstrations: Demonstrations | None) -> int:
-    """Control steps of an episode while learning."""
-    if config.episode_steps or demonstrations is None:
-        return config.episode_steps or config.env.horizon
-    return min(config.env.horizon, math.ceil(LONGER * demonstrations.longest))
+def validated(folder: Path, number: int) -> Path:
+    """Return the folder of a validated iteration: its policy and `eval.json`."""
+    return folder / VALIDATION / f"{number:06d}"
 
 
-def _action_range(network: MLPNetwork) -> ActionRange:
-    """Units and range of the network's targets."""
-    names = ("target_mean", "target_scale", "target_low", "target_high")
-    return ActionRange(*(getattr(network, name).numpy().copy() for name in names))
+def best_validation(found: dict[int, EvalResult]) -> int:
+    """Return the iteration with the highest validation success, the later of equals."""
+    if not found:
+        raise ManipError("the run has no validation; expected one at its end")
+    return max(found, key=lambda number: (found[number].success.rate, number))

@@ -1,4 +1,4 @@
-"""The parts of a round: who drives its rollouts, what comes of them, the policy, and how good that is."""
+"""The parts of a round of imitation: its rollouts, the policy that is fitted, and how good that is."""
 
 from __future__ import annotations
 
@@ -7,43 +7,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # algorithms are read for help and mistakes, too, before anything heavy is imported
-    from manip_il.collect.drivers import Driver
+if TYPE_CHECKING:  # read for help, too, before anything heavy is imported
     from manip_il.evaluation.results import EvalResult
-
-Noise = tuple[tuple[float, ...], ...]  # covariance (n, n) of actions
-
-
-def noisy_expert(noise: Noise) -> Driver:
-    """Execute the expert's labels with Gaussian noise of a covariance (Laskey et al. 2017)."""
-    from manip_il.collect.drivers import NoisyExpertDriver
-
-    return NoisyExpertDriver(noise)
-
-
-def mixture(policy: Fitted, beta: float) -> Driver:
-    """Execute the expert's label with probability beta in each step, else the learner's action (Ross et al. 2011)."""
-    from manip_il.collect.drivers import PolicyDriver
-
-    return PolicyDriver(policy.members, beta, policy.trust)
 
 
 @dataclass(frozen=True)
 class Rollouts:
-    """One round's episodes. dataset: None where the expert gave no label. beta: the expert's share of the steps.
+    """One round's episodes. dataset: None if the expert gave no label. beta: the expert's share of the steps.
 
     labels: sound ones. queries: states in which the expert was queried. episodes, successes: of the rollouts. steps:
     control steps simulated.
     """
 
     round: int
-    dataset: Path | None
-    beta: float
-    labels: int
-    queries: int
-    episodes: int
-    successes: int
-    steps: int
+    dataset: Path | None = None
+    beta: float = 1.0
+    labels: int = 0
+    queries: int = 0
+    episodes: int = 0
+    successes: int = 0
+    steps: int = 0
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, override
+from typing import Any, override
 
 import numpy as np
 from gymnasium import spaces
@@ -18,36 +18,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from manip_il.collect.environments import make_env
 from manip_il.errors import MismatchError
 from manip_il.learn.action_spaces import Conversion
+from manip_il.learn.network import MLPNetwork
 from manip_il.mdp import Observation
 from manip_il.sim.config import EnvConfig
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
-
-
-class Simulated(Protocol):
-    """An environment that learners explore."""
-
-    def start(self, seed: int) -> None:
-        """Begin the episode of a seed."""
-        ...
-
-    def inputs(self) -> F32:
-        """Return what the policy observes now, raw, (d,)."""
-        ...
-
-    def advance(self, action: F64) -> None:
-        """Apply an action (n,) for one control step."""
-        ...
-
-    @property
-    def ended(self) -> bool:
-        """Whether the episode is over before its last step."""
-        ...
-
-    @property
-    def solved(self) -> bool:
-        """Whether the task has been solved at some step."""
-        ...
 
 
 class RobotEpisode:
@@ -97,6 +72,12 @@ class ActionRange:
     low: F32
     high: F32
 
+    @classmethod
+    def of(cls, network: MLPNetwork) -> ActionRange:
+        """Return the units and the range of a network's targets."""
+        names = ("target_mean", "target_scale", "target_low", "target_high")
+        return cls(*(getattr(network, name).numpy().copy() for name in names))
+
     def raw(self, actions: F32) -> F32:
         """Return raw targets (B, n) of normalised actions (B, n)."""
         return np.clip(actions * self.scale + self.mean, self.low, self.high)
@@ -120,14 +101,15 @@ class ActionRange:
 class Lockstep(VecEnv):
     """Episodes of `horizon` steps, side by side. Observations (B, d + 2): inputs, absorbing or not, share of time gone.
 
-    conversion: of the policy's raw targets into actions; the first of the inputs are the measured joints that it needs.
-    `seeds` are those of the next `reset`. simulated: control steps since then. executed: actions (T, B, n) since then.
+    episodes: each a `RobotEpisode`, or what has its methods. conversion: of the policy's raw targets into actions; the
+    first of the inputs are the measured joints that it needs. `seeds` are those of the next `reset`. simulated: control
+    steps since then. executed: actions (T, B, n) since then.
     """
 
     def __init__(
-        self, episodes: Sequence[Simulated], actions: ActionRange, horizon: int, conversion: Conversion | None = None
+        self, episodes: Sequence[Any], actions: ActionRange, horizon: int, conversion: Conversion | None = None
     ):
-        self.episodes: Sequence[Simulated] = list(episodes)
+        self.episodes: Sequence[Any] = list(episodes)
         self.actions, self.horizon, self._conversion = actions, horizon, conversion or Conversion()
         self.seeds: Sequence[int] = range(len(episodes))
         self.simulated, self._step, self._given = 0, 0, np.empty((0, 0), np.float32)
@@ -187,26 +169,23 @@ class Lockstep(VecEnv):
         self._seen = rows
         return rows
 
+    # What else the interface asks for: nobody uses it here.
+
     @override
-    def close(self) -> None:
-        """Close nothing."""
+    def close(self) -> None: ...
 
     @override
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return None for every environment: there is nothing to read by name."""
         return [None] * self.num_envs
 
     @override
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set nothing by name."""
         raise NotImplementedError(attr_name)
 
     @override
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call nothing by name."""
         raise NotImplementedError(method_name)
 
     @override
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for every environment."""
         return [False] * self.num_envs

@@ -15,9 +15,8 @@ from manip_il.learn.fit_config import check_weights
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.iterations import Iteration
     from manip_il.algorithms.learning_config import LearningConfig
-    from manip_il.algorithms.learning_run import LearningRun
+    from manip_il.algorithms.learning_run import Iteration, LearningRun
     from manip_il.algorithms.run import Watch
     from manip_il.collect.workers import Engine
     from manip_il.sim.config import EnvConfig

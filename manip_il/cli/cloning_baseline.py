@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.fitting import fit_round, round_fit
-from manip_il.algorithms.run import round_folder
+from manip_il.algorithms.imitation import fit_round, round_fit, round_folder
 from manip_il.cli.progress import Stages
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import MAX_TRIES, collect_successes, provenance, record

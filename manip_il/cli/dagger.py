@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.algorithms.config import BetaSchedule, RunConfig, Sampling, check_cameras, check_labels
+from manip_il.algorithms.config import ALGORITHMS, BetaSchedule, Method, RunConfig, Sampling, check_labels
 from manip_il.algorithms.rounds import RoundResult, best_round
-from manip_il.algorithms.table import ALGORITHMS, Method, check_method, run_algorithm
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_given, require_dataset, round_policy
 from manip_il.cli.options import Open, command_line, to_plain
@@ -166,10 +165,7 @@ class DaggerOptions(common.EnvOptions):
             "query_rule": None if self.query is None else parse_query(self.query),
         }
         own = {one.name: getattr(self, one.name) for one in fields(RunConfig) if one.name not in made}
-        config = RunConfig(**made, **own)
-        check_cameras(config)
-        check_method(config)
-        return config
+        return RunConfig(**made, **own)
 
     def _pictures(self, start: Path | None) -> tuple[str | None, CameraConfig | None]:
         """Return observation and cameras: those given, else those of the policy to begin with."""
@@ -191,6 +187,7 @@ class DaggerOptions(common.EnvOptions):
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
     """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
+    from manip_il.algorithms.imitation import run_algorithm
     from manip_il.collect.environments import env_fingerprint
 
     fingerprint = env_fingerprint(config.env, config.cameras)

@@ -18,8 +18,7 @@ from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.iterations import Iteration
-    from manip_il.algorithms.learning_run import LearningRun
+    from manip_il.algorithms.learning_run import Iteration, LearningRun
     from manip_il.algorithms.run import Watch
     from manip_il.collect.workers import Engine
     from manip_il.sim.config import EnvConfig
@@ -64,7 +63,7 @@ class LearningOptions:
 
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
-        from manip_il.algorithms.iterations import best_validation, validations
+        from manip_il.algorithms.learning_run import best_validation, validations
         from manip_il.collect.workers import Engine
 
         config = self.learning_config()
@@ -113,7 +112,7 @@ class LearningOptions:
 
     def _report(self, config: LearningConfig, folder: Path) -> None:
         from manip_il.algorithms.adversarial_report import adversarial_report
-        from manip_il.algorithms.iterations import validations
+        from manip_il.algorithms.learning_run import validations
 
         title = f"{self.title} on {config.env.robot} {config.env.task}"
         records, command = read_jsonl(folder / METRICS_FILE), command_line(self.name, self)

@@ -13,8 +13,8 @@ from manip_il.errors import UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.iterations import Iteration
     from manip_il.algorithms.learning_config import LearningConfig
+    from manip_il.algorithms.learning_run import Iteration
     from manip_il.algorithms.run import Watch
     from manip_il.collect.workers import Engine
     from manip_il.sim.config import EnvConfig
@@ -60,10 +60,10 @@ class PpoOptions(LearningOptions):
 
     def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
         """Return the run's iterations, the last finished one of a resumed run first."""
-        from manip_il.algorithms.fixed_reward import reinforcement
         from manip_il.algorithms.learning_run import LearningRun
+        from manip_il.algorithms.ppo import ppo
 
         assert self.reward is not None
         reward = reward_folder(self.reward)
         run = LearningRun(config, folder, engine, watch, absorbing=False, reward=reward)
-        return resumed(run, reinforcement(run, load_reward(self.reward)))
+        return resumed(run, ppo(run, load_reward(self.reward)))

@@ -180,8 +180,7 @@ class PreferencesFitOptions:
         """Fit, measure on held-out pairs, write the reward and the page."""
         from manip_il.learn.reward import shape_for
         from manip_il.preferences.answers import Preferences, join_answers
-        from manip_il.preferences.fit_report import fit_report, summary_lines
-        from manip_il.preferences.fitting import fit_answers
+        from manip_il.preferences.fitting import fit_answers, fit_report, summary_lines
         from manip_il.preferences.pairs import Pairs, join_pairs, read_clips
         from manip_il.seeding import stream_base
 

@@ -50,11 +50,18 @@ class ScoreOptions:
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
         from manip_il.preferences.frames import read_frames
-        from manip_il.preferences.score_report import fact_lines, score_report, worst_table
-        from manip_il.preferences.scores import FILE_NAME, WEIGHTS_FILE, Scores, write_weights
+        from manip_il.preferences.scores import (
+            FILE_NAME,
+            WEIGHTS_FILE,
+            Scores,
+            fact_lines,
+            score_report,
+            worst_table,
+            write_weights,
+        )
 
         begin, data = time.monotonic(), read_frames(self.dataset)
-        scores = Scores(str(self.dataset), self.reward, data.spec, data, self._scores(data))
+        scores = Scores(str(self.dataset), self.reward, data, self._scores(data))
         timings = {"scoring": time.monotonic() - begin}
         with open_output(self) as folder:
             write_json(folder / FILE_NAME, scores.to_json())

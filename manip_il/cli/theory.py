@@ -50,7 +50,7 @@ class TheoryOptions:
         from manip_il.evaluation.results import write_json
         from manip_il.theory.bounds import all_curves
         from manip_il.theory.linear import drifts
-        from manip_il.theory.problems import PROBLEMS
+        from manip_il.theory.processes import PROCESSES
         from manip_il.theory.report import FILE_NAME, PAGE, Theory, summary_lines, theory_report
 
         timings, begin = dict[str, float](), time.monotonic()
@@ -60,7 +60,7 @@ class TheoryOptions:
                 shift = self._shift(self.source)
                 timings["the run"] = time.monotonic() - begin
             begin, curves = time.monotonic(), []
-            with progress(6 * len(PROBLEMS), "theorems") as bar:
+            with progress(6 * len(PROCESSES), "theorems") as bar:
                 for curve in all_curves():
                     curves.append(curve)
                     bar.advance()

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, UnknownName
-from manip_il.preferences.pairs import MOST_PAIRS, Pairs, check_format
+from manip_il.preferences.pairs import Pairs, read_file
 
 FILE_NAME = "preferences.json"
 FORMAT, VERSION = "manip_il preferences", 1
 LEFT, RIGHT, EQUAL, SKIP = ANSWERS = ("left", "right", "equal", "skip")
 BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # how much of the left clip being better an answer says
-_MOST_ANSWERS = 10 * MOST_PAIRS
-_LARGEST = 64 * 1024 * 1024  # [bytes]
-_LONGEST_WHO = 200  # characters
 
 
 @dataclass(frozen=True)
@@ -33,17 +28,8 @@ class Answer:
     when: str | None = None
 
     def __post_init__(self) -> None:
-        checks.whole("number of a pair", self.pair, 0, MOST_PAIRS)
-        if checks.text("answer", self.answer, checks.LONGEST_NAME) not in ANSWERS:
+        if self.answer not in ANSWERS:
             raise UnknownName(f"answer about pair {self.pair}:", self.answer, ANSWERS)
-        if self.when is not None:
-            try:
-                datetime.fromisoformat(checks.text("when", self.when, checks.LONGEST_NAME))
-            except ValueError as error:
-                raise ManipError(f"when is {checks.shorten(self.when)}; expected a time such as {_TIME}") from error
-
-
-_TIME = "2026-01-31T12:00:00Z"
 
 
 @dataclass(frozen=True)
@@ -54,43 +40,31 @@ class Preferences:
     who: str
     answers: tuple[Answer, ...]
 
-    def __post_init__(self) -> None:
-        checks.text("pairs", self.pairs, checks.LONGEST_NAME)
-        checks.text("who", self.who, _LONGEST_WHO)
-        checks.array("answers", self.answers, _MOST_ANSWERS)
-
     def to_json(self) -> dict[str, Any]:
         """Return everything for `preferences.json`."""
-        answers = [{"pair": one.pair, "answer": one.answer, "when": one.when} for one in self.answers]
-        return {"format": FORMAT, "version": VERSION, "pairs": self.pairs, "who": self.who, "answers": answers}
+        return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Preferences:
-        """Return the inverse of `to_json`. Raises `ManipError` for what no preferences hold."""
-        check_format(data, FORMAT, VERSION)
-        if missing := {"pairs", "who", "answers"} - data.keys():
-            raise ManipError(f"preferences without {', '.join(sorted(missing))}")
-        given = checks.array("answers", data["answers"], _MOST_ANSWERS)
-        return cls(data["pairs"], data["who"], tuple(_answer(number, one) for number, one in enumerate(given)))
+        """Return the inverse of `to_json`."""
+        return cls(data["pairs"], data["who"], tuple(Answer(**one) for one in data["answers"]))
 
     @classmethod
     def read(cls, path: Path, pairs: Sequence[Pairs]) -> Preferences:
         """Return the answers in a file, with the numbers that its pairs have among those of all files (`join_pairs`).
 
-        Raises `ManipError` naming the file for what its answers cannot be, or of other pairs.
+        Raises `ManipError` for a file that holds no answers, or answers about other pairs.
         """
-        data = checks.read_json(path, "answers of manip-il preferences ask or answer", _LARGEST)
-        try:
-            found = cls.from_json(data)
-        except ManipError as error:
-            raise ManipError(f"{path}: {error}") from error
-        place = next((number for number, one in enumerate(pairs) if one.sha256 == found.pairs), 0)
-        own, before = pairs[place], sum(map(len, pairs[:place]))
+        found = read_file(path, FORMAT, VERSION, cls.from_json)
+        place = next((number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None)
+        if place is None:
+            own = pairs[0].sha256
+            raise MismatchError("pairs (sha256)", str(path), found.pairs[:12], "the file of pairs", own[:12])
+        before = sum(map(len, pairs[:place]))
         for one in found.answers:
-            if one.pair >= len(own):
-                raise ManipError(f"{path} has an answer about pair {one.pair}; there are pairs 0 to {len(own) - 1}")
-        if found.pairs != own.sha256:
-            raise MismatchError("pairs (sha256)", str(path), found.pairs[:12], "the file of pairs", own.sha256[:12])
+            if not 0 <= one.pair < len(pairs[place]):
+                last = len(pairs[place]) - 1
+                raise ManipError(f"{path} has an answer about pair {one.pair}; there are pairs 0 to {last}")
         return replace(found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers))
 
 
@@ -111,17 +85,10 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
     """Return answers as one; two about a pair are two observations, also where they contradict each other."""
     every = [one for preferences in given for one in preferences.answers]
     kept = [one for one in every if one.answer != SKIP]
-    said = {answer: {one.pair for one in kept if one.answer == answer} for answer in (LEFT, RIGHT)}
+    left, right = ({one.pair for one in kept if one.answer == answer} for answer in (LEFT, RIGHT))
     return Answers(
         np.array([one.pair for one in kept], np.int64),
         np.array([BETTER[one.answer] for one in kept], np.float64),
         len(every) - len(kept),
-        len(said[LEFT] & said[RIGHT]),
+        len(left & right),
     )
-
-
-def _answer(number: int, data: Any) -> Answer:
-    values = checks.mapping(f"answer {number}", data)
-    if not {"pair", "answer"} <= values.keys() <= {"pair", "answer", "when"}:
-        raise ManipError(f"answer {number} has {checks.shorten(sorted(values))}; expected pair, answer, when")
-    return Answer(values["pair"], values["answer"], values.get("when"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Callable
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 
 from manip_il.collect.edits import Source, open_source, render_states
 from manip_il.data import schema
-from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4
 from manip_il.preferences.answers import FORMAT, VERSION
 from manip_il.preferences.pairs import Clips, Pairs
@@ -26,7 +24,6 @@ from manip_il.sim.config import FILM, CameraConfig
 SIDE = 240  # of a film [pixels]
 MOST_FPS = 10  # of a film, at its own speed: a picture takes tens of milliseconds to draw
 _CAMERA = "front"
-_LARGEST_PAGE = 200_000_000  # [bytes]; phones refuse more
 
 
 Films = list[list[bytes]]  # of every pair, left and right: MP4
@@ -35,24 +32,20 @@ Films = list[list[bytes]]  # of every pair, left and right: MP4
 def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], None] = lambda: None) -> Films:
     """Return an MP4 of the left and the right clip of every pair.
 
-    robot: the YAML of the sources' robot, where that does not ship. Raises `RenderError` without off-screen OpenGL and
-    `ManipError` for sources whose states cannot be pictured, or films that are too much for a page.
+    robot: the YAML of the sources' robot, if that does not ship. Raises `RenderError` without off-screen OpenGL and
+    `ManipError` for sources whose states cannot be pictured.
     """
     pairs = clips.pairs
     opened = [open_source(Path(source.root), robot) for source in pairs.sources]
     states = [source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE] for source in opened]
     every = -(-pairs.control_hz // MOST_FPS)
     found: Films = []
-    size = 0
     for number, pair in enumerate(pairs.pairs):
         films: list[bytes] = []
         for side, clip in enumerate(pair):
             rows = clips.rows[number, side] - clips.offsets[clip.source]
             films.append(_film(opened[clip.source], states[clip.source][rows[::every]], pairs.control_hz // every))
         found.append(films)
-        size += sum(map(len, films))
-        if 4 * size > 3 * _LARGEST_PAGE:
-            raise ManipError(f"the films of {len(pairs)} pairs take more than {_LARGEST_PAGE:,} bytes; ask about fewer")
         on_pair()
     return found
 
@@ -66,8 +59,14 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
         "pairs": pairs.sha256,
         "films": [[base64.b64encode(film).decode("ascii") for film in pair] for pair in films],
     }
-    template = _environment().get_template("ask.html.j2")
-    return template.render(
+    environment = Environment(
+        loader=PackageLoader("manip_il.preferences"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    return environment.get_template("ask.html.j2").render(
         title=f"{pairs.robot} {pairs.task}",
         instruction=instruction,
         count=len(pairs),
@@ -80,14 +79,3 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
 def _film(source: Source, states: NDArray[np.float64], fps: int) -> bytes:
     pictures = render_states(source.env, CameraConfig((_CAMERA,), SIDE, SIDE, FILM), states)
     return encode_mp4(list(pictures[schema.IMAGES + _CAMERA]), fps)
-
-
-@cache
-def _environment() -> Environment:
-    return Environment(
-        loader=PackageLoader("manip_il.preferences"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-    )

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from manip_il.data.build import dataset_sha256
 from manip_il.errors import ManipError
-from manip_il.preferences.frames import Frames
-from manip_il.preferences.pairs import Clip, Clips, Pairs, Source, read_all
+from manip_il.preferences.frames import Frames, read_all
+from manip_il.preferences.pairs import Clip, Clips, Pairs, Source
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 Members = Callable[[F32], F64]  # rewards (M, B) of inputs (B, d)
@@ -22,31 +22,31 @@ _TRIES = 100  # draws of a pair that is not there yet
 
 @dataclass(frozen=True, eq=False)
 class Supply:
-    """Datasets that clips are drawn from. long: places of the episodes that hold a whole clip, by source."""
+    """Datasets that clips of `length` control steps are drawn from."""
 
     roots: tuple[Path, ...]
     frames: tuple[Frames, ...]
     length: int
-
-    def __post_init__(self) -> None:
-        if not any(len(places) for places in self.long):
-            longest = max(int(one.lengths.max()) for one in self.frames)
-            raise ManipError(f"--clip is {self.length} control steps; the longest episode has {longest}")
-
-    @property
-    def long(self) -> list[NDArray[np.int64]]:
-        """Places of the episodes that are at least as long as a clip, (e,), by source."""
-        return [np.flatnonzero(one.lengths >= self.length) for one in self.frames]
 
     @property
     def too_short(self) -> int:
         """Number of episodes that no clip is from."""
         return sum(int((one.lengths < self.length).sum()) for one in self.frames)
 
+    def draw(self, source: int, rng: np.random.Generator) -> Clip:
+        """Return one clip of a source: every episode alike, every place in it alike."""
+        lengths = self.frames[source].lengths
+        episode = int(rng.choice(np.flatnonzero(lengths >= self.length)))
+        return Clip(source, episode, int(rng.integers(0, int(lengths[episode]) - self.length + 1)))
+
 
 def open_supply(roots: Sequence[Path], length: int) -> Supply:
-    """Read datasets. Raises `MismatchError` unless they are of one task, `ManipError` where all episodes are short."""
-    return Supply(tuple(roots), tuple(read_all(roots)), length)
+    """Read datasets. Raises `MismatchError` unless they are of one task, `ManipError` if all episodes are short."""
+    supply = Supply(tuple(roots), tuple(read_all(roots)), length)
+    longest = max(int(one.lengths.max()) for one in supply.frames)
+    if longest < length:
+        raise ManipError(f"--clip is {length} control steps; the longest episode has {longest}")
+    return supply
 
 
 def choose_pairs(
@@ -57,8 +57,7 @@ def choose_pairs(
     The disagreement about a pair is the standard deviation over the ensemble of P(left is better) (Christiano et al.
     2017, section 2.2.4; Lee et al. 2021).
     """
-    wanted = count * (POOL if members is not None else 1)
-    drawn = _draw(supply, wanted, rng)
+    drawn = _draw(supply, count * (POOL if members is not None else 1), rng)
     if len(drawn) < count:
         raise ManipError(f"--count is {count}; {len(drawn)} pairs of clips of {supply.length} steps were found")
     spec = supply.frames[0].spec
@@ -67,7 +66,10 @@ def choose_pairs(
         task=spec.task,
         control_hz=spec.fps,
         length=supply.length,
-        sources=tuple(_source(root, one) for root, one in zip(supply.roots, supply.frames, strict=True)),
+        sources=tuple(
+            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.states))
+            for root, one in zip(supply.roots, supply.frames, strict=True)
+        ),
         pairs=tuple(drawn),
         seed=seed,
     )
@@ -88,24 +90,12 @@ def disagreement(clips: Clips, members: Members) -> F64:
 
 def _draw(supply: Supply, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
     """Different pairs of clips; every source is in as many as any other, with another or itself."""
-    long, found = supply.long, dict[tuple[Clip, Clip], None]()
-    sources = [number for number, places in enumerate(long) if len(places)]
-    order = rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist()
-    for left, right in order:
+    found = dict[tuple[Clip, Clip], None]()
+    sources = [number for number, one in enumerate(supply.frames) if one.lengths.max() >= supply.length]
+    for left, right in rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist():
         for _ in range(_TRIES):
-            pair = _clip(supply, long, left, rng), _clip(supply, long, right, rng)
+            pair = supply.draw(left, rng), supply.draw(right, rng)
             if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
                 found[pair] = None
                 break
     return list(found)
-
-
-def _clip(supply: Supply, long: Sequence[NDArray[np.int64]], source: int, rng: np.random.Generator) -> Clip:
-    """One clip: every episode of the source alike, every place in it alike."""
-    episode = int(rng.choice(long[source]))
-    last = int(supply.frames[source].lengths[episode]) - supply.length
-    return Clip(source, episode, int(rng.integers(0, last + 1)))
-
-
-def _source(root: Path, frames: Frames) -> Source:
-    return Source(str(root), dataset_sha256(root), len(frames.firsts), len(frames.states))

@@ -1,16 +1,17 @@
-"""A reward from pairs and answers, and how well it foretells what it has not learnt from."""
+"""A reward from pairs and answers, how well it foretells what it has not learnt from, and the page that says so."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.intervals import Proportion, format_percent
+from manip_il.evaluation.report import Report, Section
+from manip_il.evaluation.tables import Table
 from manip_il.learn.reward import RewardShape
 from manip_il.learn.reward_fit import BY_CHANCE, Compared, Fit, fit_reward
 from manip_il.preferences.answers import Answers
@@ -18,20 +19,10 @@ from manip_il.preferences.pairs import Clips
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 TIE = 0.01  # difference of the clips' mean progress below which none is the better one
-EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of what is foretold about the clip that is likelier to be preferred
-
-
-@dataclass(frozen=True)
-class Bin:
-    """Answers whose likelier clip was foretold with a probability from low to high.
-
-    foretold: its mean; given: the share of answers that preferred that clip.
-    """
-
-    low: float
-    high: float
-    foretold: float
-    given: Proportion
+_MODEL = (
+    f"P(left is better) = {1 - BY_CHANCE:g} sigmoid(R(left) - R(right)) + {BY_CHANCE / 2:g}",
+    "R(clip) = Σ r(state, action)",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,19 +40,16 @@ class Fitted:
     true: Proportion | None
     teachers: Proportion | None
     ties: int
-    bins: tuple[Bin, ...]
     brier: float
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers for `fit.json`."""
-        bins = [{"low": b.low, "high": b.high, "foretold": b.foretold, **_counts(b.given)} for b in self.bins]
         return {
             "agreement_with_answers": _counts(self.answered),
             "agreement_with_progress": None if self.true is None else _counts(self.true),
             "answers_agreement_with_progress": None if self.teachers is None else _counts(self.teachers),
             "ties": self.ties,
             "brier": self.brier,
-            "calibration": bins,
             "epochs": self.fit.epochs,
         }
 
@@ -75,7 +63,7 @@ def fit_answers(
     fit = fit_reward(clips.inputs, compared, shape, seed, on_epoch)
     decided = answers.better != 0.5
     right = (fit.logits > 0) == (answers.better > 0.5)
-    probability = probabilities(fit.logits)
+    probability = (1 - BY_CHANCE) / (1 + np.exp(-np.clip(fit.logits, -50, 50))) + BY_CHANCE / 2
     difference = true_difference(clips)
     true = teachers = None
     ties = 0
@@ -93,14 +81,8 @@ def fit_answers(
         true=true,
         teachers=teachers,
         ties=ties,
-        bins=calibration(probability[decided], answers.better[decided]),
         brier=float(np.mean((probability - answers.better) ** 2)),
     )
-
-
-def probabilities(logits: F64) -> F64:
-    """Return P(left is better) of differences of returns (A,), (A,), as the model of the answers has it."""
-    return (1 - BY_CHANCE) / (1 + np.exp(-np.clip(logits, -50, 50))) + BY_CHANCE / 2
 
 
 def true_difference(clips: Clips) -> F64 | None:
@@ -111,22 +93,67 @@ def true_difference(clips: Clips) -> F64 | None:
     return means[:, 0] - means[:, 1]
 
 
-def calibration(probability: F64, better: F64, edges: Sequence[float] = EDGES) -> tuple[Bin, ...]:
-    """Return how often the likelier clip was preferred, by its probability: of answers left and right, (A,) each."""
-    likelier = np.maximum(probability, 1 - probability)
-    given = np.where(probability >= 0.5, better, 1 - better)
-    place = np.clip(np.searchsorted(edges, likelier, side="right") - 1, 0, len(edges) - 2)
-    found: list[Bin] = []
-    for number, (low, high) in enumerate(itertools.pairwise(edges)):
-        inside = place == number
-        if inside.any():
-            found.append(Bin(low, high, float(likelier[inside].mean()), _proportion(given[inside] > 0.5)))
-    return tuple(found)
-
-
 def _proportion(right: NDArray[np.bool_]) -> Proportion:
     return Proportion(int(right.sum()), max(len(right), 1))
 
 
 def _counts(one: Proportion) -> dict[str, Any]:
     return {"rate": one.rate, "interval": list(one.interval), "right": one.successes, "of": one.n}
+
+
+def summary_lines(found: Fitted, answers: Answers) -> list[str]:
+    """Return what was learnt as plain lines."""
+    told = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
+    lines = [f"{told}, {answers.skipped:,} skipped, {answers.contradictory:,} pairs with contradictory answers"]
+    lines.append(f"agreement with answers on held-out pairs: {found.answered}")
+    if found.true is not None:
+        lines.append(f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}")
+    return lines
+
+
+def fit_report(
+    found: Fitted,
+    clips: Clips,
+    answers: Answers,
+    who: Sequence[str],
+    command: str,
+    config: Mapping[str, Any],
+    timings: Mapping[str, float],
+) -> Report:
+    """Return the report of a reward. who: answered, one name a file."""
+    sources = tuple((source.root, f"{source.episodes:,}", f"{source.frames:,}") for source in clips.pairs.sources)
+    first, *facts = summary_lines(found, answers)
+    best, what = (found.answered, "the answers") if found.true is None else (found.true, "true progress")
+    agreement = Section(
+        "Agreement",
+        formulas=_MODEL,
+        tables=(_agreement_table(found),),
+        notes=(
+            f"{found.shape.members} networks of {found.shape.depth} x {found.shape.width}; the pairs are dealt into as "
+            "many folds. Each network leaves one fold out, from which its numbers above are; all stopped at epoch "
+            f"{found.fit.epochs}, where the loss on these was lowest. Mean square of answer minus probability: "
+            f"{found.brier:.3f}. The reward is their mean, which has seen every pair.",
+        ),
+    )
+    from_where = Section("Where the clips are from", tables=(Table(("dataset", "episodes", "frames"), sources),))
+    return Report(
+        title=f"A reward from preferences, {clips.pairs.robot} {clips.pairs.task}",
+        verdict=f"On pairs that it did not learn from, the reward agrees with {what} in {format_percent(best.rate)} of "
+        f"{best.n:,}.",
+        facts=(f"{first}, by {', '.join(who)}.", *(f"{fact[:1].upper()}{fact[1:]}." for fact in facts)),
+        command=command,
+        config=config,
+        timings=timings,
+        sections=(agreement, from_where),
+    )
+
+
+def _agreement_table(found: Fitted) -> Table:
+    """With what the reward agrees on held-out pairs, and how far the answers do themselves."""
+    rows = [("answers", found.answered, "left or right was answered, and the reward says so")]
+    if found.true is not None:
+        rows.append(("true progress", found.true, f"ties left out, by less than {TIE:g}: {found.ties}"))
+    if found.teachers is not None:
+        rows.append(("the answers themselves with true progress", found.teachers, ""))
+    cells = tuple((name, str(p), f"{p.n:,}", note) for name, p, note in rows)
+    return Table(("with", "agreement", "of", "note"), cells).filled()

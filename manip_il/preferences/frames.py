@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from manip_il.data import schema
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.schema import RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.samples import require_finite
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 _ROUNDS = "round_*/dataset"  # of a run
-_AGREE = ("robot", "task", "fps", "joint_names", "object", "environment_state_names", "action_meaning")
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +26,7 @@ class Frames:
     """The frames of a dataset, or of several joined: states (N, n), environment states (N, k), actions (N, n).
 
     actions: what drove the robot. episodes: number of each frame's, (N,), ascending. progress, success: (N,), None
-    where the dataset has no such column.
+    if the dataset has no such column.
     """
 
     spec: RobotTaskSpec
@@ -37,18 +36,16 @@ class Frames:
     episodes: I64
     progress: F64 | None = None
     success: NDArray[np.bool_] | None = None
-    firsts: I64 = field(init=False, repr=False)  # row of every episode's first frame, (E,)
-    lengths: I64 = field(init=False, repr=False)  # frames of every episode, (E,)
 
-    def __post_init__(self) -> None:
-        count = len(self.states)
-        for name in ("environment_states", "actions", "episodes", "progress", "success"):
-            column = getattr(self, name)
-            if column is not None and len(column) != count:
-                raise MismatchError("frames", "the states", count, name.replace("_", " "), len(column))
-        firsts = np.flatnonzero(np.diff(self.episodes, prepend=-1))
-        object.__setattr__(self, "firsts", firsts)
-        object.__setattr__(self, "lengths", np.diff(firsts, append=count))
+    @cached_property
+    def firsts(self) -> I64:
+        """Row of every episode's first frame, (E,)."""
+        return np.flatnonzero(np.diff(self.episodes, prepend=-1))
+
+    @cached_property
+    def lengths(self) -> I64:
+        """Frames of every episode, (E,)."""
+        return np.diff(self.firsts, append=len(self.states))
 
     @cached_property
     def inputs(self) -> F32:
@@ -84,6 +81,17 @@ def read_frames(root: Path) -> Frames:
     )
 
 
+def read_all(roots: Sequence[Path]) -> list[Frames]:
+    """Return the frames of datasets. Raises `MismatchError` unless they are of one task and their columns agree."""
+    found = [read_frames(root) for root in roots]
+    first, own = str(roots[0]), found[0].spec
+    for root, one in zip(roots, found, strict=True):
+        check_same_spec(first, own, str(root), one.spec)
+        if own.task != one.spec.task and UNKNOWN_TASK not in (own.task, one.spec.task):
+            raise MismatchError("task", first, own.task, str(root), one.spec.task)
+    return found
+
+
 def find_datasets(folders: Sequence[Path]) -> list[Path]:
     """Return the datasets that folders stand for: themselves, or every round's of a run.
 
@@ -93,19 +101,9 @@ def find_datasets(folders: Sequence[Path]) -> list[Path]:
     for folder in folders:
         rounds = [path for path in sorted(folder.glob(_ROUNDS)) if (path / INFO).is_file()]
         if not (folder / INFO).is_file() and not rounds:
-            raise UsageError(
-                f"{folder} {'is' if folder.exists() else 'does not exist; expected'} "
-                f"{'neither a LeRobot dataset nor' if folder.exists() else 'a LeRobot dataset or'} a run with rounds"
-            )
+            state = "holds no dataset" if folder.exists() else "does not exist"
+            raise UsageError(f"{folder} {state}; expected a LeRobot dataset or a run with rounds")
         found += [folder] if (folder / INFO).is_file() else rounds
     if twice := next((path for path in found if found.count(path) > 1), None):
         raise UsageError(f"{twice} is given twice; expected each source once")
     return found
-
-
-def check_same(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:
-    """Raise `MismatchError` unless two datasets are of one task, and their columns mean the same."""
-    for name in _AGREE:
-        one, other = getattr(left, name), getattr(right, name)
-        if one != other and not (name == "task" and UNKNOWN_TASK in (one, other)):
-            raise MismatchError(name.replace("_", " "), left_name, one, right_name, other)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from manip_il.data.atomic import writing
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import MismatchError
+from manip_il.evaluation.report import Report, Section
+from manip_il.evaluation.tables import Table
 from manip_il.preferences.frames import Frames
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
 LAST = 1.0  # of an episode, over which its score is the mean [s]
 BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it an episode may end
+WORST = 10  # episodes that are listed
 _METADATA = b"reward_model_path"  # as LeRobot's own scripts say it
 
 
@@ -42,18 +45,18 @@ class Scores:
 
     root: str
     reward: str
-    spec: RobotTaskSpec
     data: Frames
     frames: F64
 
-    def __post_init__(self) -> None:
-        if self.frames.shape != (count := len(self.data.states),):
-            raise MismatchError("frames", "the dataset", count, "their scores", self.frames.shape)
-
-    @property
+    @cached_property
     def episodes(self) -> F64:
         """Score of every episode, (E,)."""
         return episode_scores(self.frames, self.data)
+
+    @cached_property
+    def true(self) -> F64 | None:
+        """Score of every episode by true progress, (E,); None if there is none."""
+        return None if self.data.progress is None else episode_scores(self.data.progress, self.data)
 
     @property
     def bar(self) -> float:
@@ -62,7 +65,7 @@ class Scores:
 
     @property
     def succeeded(self) -> NDArray[np.bool_] | None:
-        """Whether every episode succeeded at some step, (E,); None where nothing says so."""
+        """Whether every episode succeeded at some step, (E,); None if nothing says so."""
         if self.data.success is None:
             return None
         return np.logical_or.reduceat(self.data.success, self.data.firsts)
@@ -74,18 +77,14 @@ class Scores:
 
     @property
     def true_auc(self) -> float | None:
-        """The same by true progress: what a perfect reward would reach; None where there is none."""
-        if self.data.progress is None:
-            return None
-        return roc_auc(episode_scores(self.data.progress, self.data), self.succeeded)
+        """The same by true progress: what a perfect reward would reach; None if there is none."""
+        return None if self.true is None else roc_auc(self.true, self.succeeded)
 
     @property
     def correlation(self) -> float | None:
-        """Spearman's correlation of the frames' scores with true progress; None where there is none."""
+        """Spearman's correlation of the frames' scores with true progress; None if there is none."""
         if self.data.progress is None or np.ptp(self.data.progress) == 0 or np.ptp(self.frames) == 0:
             return None
-        from scipy.stats import rankdata
-
         return float(np.corrcoef(rankdata(self.frames), rankdata(self.data.progress))[0, 1])
 
     def worst(self, count: int) -> list[int]:
@@ -94,15 +93,14 @@ class Scores:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything for `scores.json`; frames' scores are in the parquet file."""
-        true = episode_scores(self.data.progress, self.data) if self.data.progress is not None else None
-        succeeded, scores, bar = self.succeeded, self.episodes, self.bar
+        true, succeeded, bar = self.true, self.succeeded, self.bar
         numbers = self.data.episodes[self.data.firsts].tolist()
         episodes: list[Mapping[str, Any]] = [
             {
                 "episode": number,
                 "frames": int(self.data.lengths[place]),
-                "score": float(scores[place]),
-                "kept": bool(scores[place] > bar),
+                "score": float(self.episodes[place]),
+                "kept": bool(self.episodes[place] > bar),
                 "progress": None if true is None else float(true[place]),
                 "success": None if succeeded is None else bool(succeeded[place]),
             }
@@ -131,7 +129,7 @@ def episode_scores(values: F64, frames: Frames) -> F64:
 def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
     """Return P(a failed episode's score is below a successful one's), ties half (Mann and Whitney 1947).
 
-    scores, succeeded: of every episode, (E,). None where one kind is missing.
+    scores, succeeded: of every episode, (E,). None if one kind is missing.
     """
     if succeeded is None or succeeded.all() or not succeeded.any():
         return None
@@ -142,7 +140,7 @@ def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
 def write_weights(path: Path, scores: Scores) -> None:
     """Write what LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse` of every frame.
 
-    Beside them `score`, which it does not read. Raises `WriteError` where the disk is full or read-only.
+    Beside them `score`, which it does not read. Raises `WriteError` if the disk is full or read-only.
     """
     data = scores.data
     steps = np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths)
@@ -158,7 +156,51 @@ def write_weights(path: Path, scores: Scores) -> None:
         metadata={_METADATA: scores.reward.encode()},
     )
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.partial")
-        pq.write_table(table, partial)
-        partial.replace(path)
+        pq.write_table(table, path)
+
+
+def worst_table(scores: Scores, count: int = WORST) -> Table:
+    """Return the episodes with the lowest scores, lowest first."""
+    data, true, succeeded = scores.data, scores.true, scores.succeeded
+    rows = tuple(
+        (
+            str(data.episodes[data.firsts[place]]),
+            f"{scores.episodes[place]:.2f}",
+            "" if true is None else f"{true[place]:.2f}",
+            "" if succeeded is None else ("yes" if succeeded[place] else "no"),
+            f"{data.lengths[place]:,}",
+        )
+        for place in scores.worst(count)
+    )
+    return Table(("episode", "score", "true progress", "success", "frames"), rows).filled()
+
+
+def fact_lines(scores: Scores) -> list[str]:
+    """Return which episodes are kept, how well the score finds failed ones, and how it follows true progress."""
+    kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
+    lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}: the frames of the others weigh 0"]
+    if scores.auc is not None:
+        beside = "" if scores.true_auc is None else f", by true progress {scores.true_auc:.3f}"
+        lines.append(f"area under the ROC curve of finding failed episodes: {scores.auc:.3f}{beside}")
+    if scores.correlation is not None:
+        lines.append(f"rank correlation of frames' scores with true progress: {scores.correlation:.3f}")
+    return lines
+
+
+def score_report(scores: Scores, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
+    """Return the report of a dataset's scores."""
+    low = scores.worst(1)[0]
+    meaning = (
+        "An episode's score is the mean of its last second's frames. "
+        f"One that is {BELOW:g} or more below the best quarter's has weight 0."
+    )
+    return Report(
+        title=f"Scores of {scores.root}",
+        verdict=f"Of {len(scores.episodes):,} episodes, number {scores.data.episodes[scores.data.firsts[low]]} has the "
+        f"lowest score: {scores.episodes[low]:.2f}.",
+        facts=(f"Scored by {scores.reward}.", *(f"{line[:1].upper()}{line[1:]}." for line in fact_lines(scores))),
+        command=command,
+        config=config,
+        timings=timings,
+        sections=(Section("The worst episodes", tables=(worst_table(scores),), notes=(meaning,)),),
+    )

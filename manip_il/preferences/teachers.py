@@ -10,7 +10,7 @@ a state, so a clip that is farther on is the better one, and one that gets on fa
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ class Teacher:
     """B-Pref's parameters, in its notation.
 
     beta: rationality; infinite: the better clip always. gamma: a step later counts for the one before. epsilon: share
-    of answers that are the wrong way round. delta_skip: a pair is skipped where both clips have less than this share of
+    of answers that are the wrong way round. delta_skip: a pair is skipped if both clips have less than this share of
     the mean return of all clips.
     """
 
@@ -45,48 +45,42 @@ class Teacher:
         name, colon, number = text.partition(":")
         if name not in TEACHERS:
             raise UnknownName("teacher", name, TEACHERS)
-        teacher, parameter, (low, high) = TEACHERS[name]
-        if not colon:
-            return teacher
-        try:
-            value = checks.number("it", float(number), low, high)
-        except (ValueError, ManipError) as error:
-            expected = f"a number from {low:g} to {high:g}" if parameter else "no number"
-            raise UsageError(f"--teacher is {text!r}; expected {expected} behind {name}:") from error
+        parameter, value, (low, high) = TEACHERS[name]
+        if colon:
+            try:
+                value = checks.number("it", float(number), low, high)
+            except (ValueError, ManipError) as error:
+                expected = f"a number from {low:g} to {high:g}" if parameter else "no number"
+                raise UsageError(f"--teacher is {text!r}; expected {expected} behind {name}:") from error
         if parameter == "temperature":
-            return replace(teacher, name=text, beta=1 / value)
-        return replace(teacher, name=text, **{parameter: value})
+            return cls(text, beta=1 / value)
+        return cls(text, **{parameter: value} if parameter else {})
 
     def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
-        """Return what it answers about every pair. Raises `ManipError` where the sources have no true progress."""
+        """Return what it answers about every pair. Raises `ManipError` if the sources have no true progress."""
         if clips.progress is None:
             raise ManipError("the sources have no column progress, by which teachers compare; ask people")
-        progress = clips.progress[clips.rows]
-        length = clips.pairs.length
-        returns = (progress * self.gamma ** np.arange(length - 1, -1, -1)).sum(-1)
-        chance, mistaken = rng.random(len(returns)), rng.random(len(returns)) < self.epsilon
-        skip = returns.max(axis=1) < self.delta_skip * returns.mean()
-        return [self._answer(*row) for row in zip(returns[:, 0] - returns[:, 1], chance, mistaken, skip, strict=True)]
-
-    def _answer(self, difference: float, chance: float, mistaken: bool, skip: bool) -> str:
-        if skip:
-            return SKIP
+        discounts = self.gamma ** np.arange(clips.pairs.length - 1, -1, -1)
+        returns = (clips.progress[clips.rows] * discounts).sum(-1)
+        difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
+        mistaken = rng.random(len(returns)) < self.epsilon
+        left = difference > 0
+        if not math.isinf(self.beta):
+            left = chance < 1 / (1 + np.exp(-np.clip(self.beta * difference, -50, 50)))
+        found = np.where(left != mistaken, LEFT, RIGHT)
         if math.isinf(self.beta):
-            if abs(difference) < _ALIKE:
-                return EQUAL
-            left = difference > 0
-        else:
-            left = chance < 1 / (1 + math.exp(-min(max(self.beta * difference, -50.0), 50.0)))
-        return LEFT if left != mistaken else RIGHT
+            found[np.abs(difference) < _ALIKE] = EQUAL
+        found[returns.max(axis=1) < self.delta_skip * returns.mean()] = SKIP
+        return found.tolist()
 
 
-# name -> teacher, what a number behind the name sets, and its range
-TEACHERS: dict[str, tuple[Teacher, str, tuple[float, float]]] = {
-    "perfect": (Teacher("perfect"), "", (0.0, -1.0)),
-    "boltzmann": (Teacher("boltzmann", beta=1.0), "temperature", (1e-6, 1e6)),
-    "mistaken": (Teacher("mistaken", epsilon=0.1), "epsilon", (0.0, 1.0)),
-    "myopic": (Teacher("myopic", gamma=0.9), "gamma", (0.0, 1.0)),
-    "skipping": (Teacher("skipping", delta_skip=0.1), "delta_skip", (0.0, 100.0)),
+# name -> what a number behind the name sets, its default, and its range
+TEACHERS: dict[str, tuple[str, float, tuple[float, float]]] = {
+    "perfect": ("", 0.0, (0.0, -1.0)),
+    "boltzmann": ("temperature", 1.0, (1e-6, 1e6)),
+    "mistaken": ("epsilon", 0.1, (0.0, 1.0)),
+    "myopic": ("gamma", 0.9, (0.0, 1.0)),
+    "skipping": ("delta_skip", 0.1, (0.0, 100.0)),
 }
 
 

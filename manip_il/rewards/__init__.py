@@ -1,1 +1,1 @@
-"""Finite Markov decision processes, solved exactly, and rewards inferred from demonstrations in them."""
+"""Rewards inferred from demonstrations: weights of the costs of paths."""

@@ -4,26 +4,30 @@ Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Li
 cheapest for some taste, and its own, a demonstration takes one with a probability in proportion to exp(-w . features).
 So a demonstrator chooses between sensible paths, and the better one is for its taste the likelier; the sum over them is
 exact, and small enough for chains of tens of thousands of steps. Tastes are drawn from the prior, and then from the
-posterior, which finds the paths that nearly tie. The posterior is drawn by Metropolis steps in log w.
+posterior, which finds the paths that nearly tie. The posterior is drawn by random-walk Metropolis in log w, whose steps
+are fitted in a warm-up, then fixed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.rewards.demonstrations import Demonstration, add_rivals, count_features, rivals
-from manip_il.rewards.mcmc import CHAINS, Draws, agreement, effective_size, sample
+from manip_il.rewards.demonstrations import Demonstration, add_rivals, rivals
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
+Density = Callable[[F64], F64]  # logarithms (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
 TASTES = 60  # of the prior, for each demonstration
+CHAINS = 4
 _ROUNDS, _MORE = 3, 30  # rounds of tastes of the posterior
 _DRAWS, _WARM_UP = 10_000, 3_000  # of a chain
-_LEVEL = 0.9  # of credible intervals
+_WANTED = 0.25  # share of steps taken at which a random walk in several dimensions gets on best (Roberts et al. 1997)
+_WINDOW = 100  # steps of the warm-up after which the steps are fitted anew
+_JITTER = 1e-6
 
 
 @dataclass(frozen=True)
@@ -54,21 +58,56 @@ class Choices:
 
 @dataclass(frozen=True)
 class Posterior:
-    """draws: of the weights [1/m]. effective, agreement: draws' worth and R-hat of their logarithms, (K,)."""
+    """Draws of the weights. draws: (C, N, K) of C chains [1/m]. accepted: share of steps taken."""
 
-    draws: Draws
-    effective: F64
-    agreement: F64
+    draws: F64
+    accepted: float
+
+    @property
+    def pooled(self) -> F64:
+        """All chains' draws, (C N, K) [1/m]."""
+        return self.draws.reshape(-1, self.draws.shape[2])
 
     @property
     def mean(self) -> F64:
         """Mean weights, (K,) [1/m]: their cheapest path has the least expected cost."""
-        return self.draws.pooled.mean(axis=0)
+        return self.pooled.mean(axis=0)
 
-    def ratios(self, base: int, level: float = _LEVEL) -> F64:
+    @property
+    def agreement(self) -> F64:
+        """R-hat of the draws' logarithms in halves of chains, (K,); 1 where they agree (Gelman et al. 2013, 11.4)."""
+        points = np.log(self.draws)
+        half = points.shape[1] // 2
+        parts = np.concatenate([points[:, :half], points[:, half : 2 * half]])
+        within = parts.var(axis=1, ddof=1).mean(axis=0)
+        between = parts.mean(axis=1).var(axis=0, ddof=1)
+        return np.sqrt((half - 1) / half + between / np.maximum(within, np.finfo(float).tiny))
+
+    def ratios(self, base: int, level: float) -> F64:
         """Return the credible interval of every weight over that of feature `base`, (K, 2)."""
-        pooled = self.draws.pooled
-        return np.quantile(pooled / pooled[:, [base]], [(1 - level) / 2, (1 + level) / 2], axis=0).T
+        ratios = self.pooled / self.pooled[:, [base]]
+        return np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T
+
+    def thin(self, count: int) -> F64:
+        """Return draws that are evenly apart along the chains, (count, K)."""
+        return self.pooled[np.linspace(0, len(self.pooled) - 1, count).round().astype(np.int64)]
+
+
+def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: float = PRIOR) -> F64:
+    """Return weights drawn from the prior, (count, features) [1/m]."""
+    return rng.exponential(prior, (count, features))
+
+
+def fit(
+    demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR
+) -> tuple[Posterior, list[F64]]:
+    """Return the posterior, and the paths' features that each demonstration's was chosen from, (m, K)."""
+    features = demonstrations[0].problem.features.shape[1]
+    sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
+    for _ in range(_ROUNDS):
+        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
+        sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
+    return draw_posterior(Choices.of(sums), rng, prior), sums
 
 
 def draw_posterior(
@@ -86,22 +125,42 @@ def draw_posterior(
         return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)  # d w = w d log w
 
     start = np.log(prior * rng.uniform(0.5, 1.5, (chains, choices.excess.shape[1])))
-    logs = sample(density, start, count, warm_up, rng)
-    points = logs.points
-    return Posterior(Draws(np.exp(points), logs.accepted), effective_size(points), agreement(points))
+    logs, accepted = sample(density, start, count, warm_up, rng)
+    return Posterior(np.exp(logs), accepted)
 
 
-def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: float = PRIOR) -> F64:
-    """Return weights drawn from the prior, (count, features) [1/m]."""
-    return rng.exponential(prior, (count, features))
+def sample(density: Density, start: F64, count: int, warm_up: int, rng: np.random.Generator) -> tuple[F64, float]:
+    """Return `count` draws of every chain that begins at `start` (C, K), (C, count, K), and the share of steps taken.
+
+    The first `warm_up` steps are thrown away. A step's covariance is that of their second half, scaled so that a
+    quarter of the steps is taken (Haario et al. 2001, but fixed before the first draw that counts).
+    """
+    chains, size = start.shape
+    now, height = start.copy(), density(start)
+    root, scale = np.eye(size), 0.3
+    seen = np.empty((chains, warm_up, size))
+    points, taken = np.empty((chains, count, size)), 0
+    for step in range(-warm_up, count):
+        proposed = now + scale * rng.standard_normal((chains, size)) @ root.T
+        there = density(proposed)
+        accept = np.log(rng.random(chains)) < there - height
+        now, height = np.where(accept[:, None], proposed, now), np.where(accept, there, height)
+        if step >= 0:
+            points[:, step] = now
+            taken += int(accept.sum())
+            continue
+        done = step + warm_up + 1
+        seen[:, done - 1] = now
+        scale *= float(np.exp((accept.mean() - _WANTED) / np.sqrt(done / 10 + 1)))
+        if done % _WINDOW == 0 and done < warm_up:
+            root, scale = _fit_steps(seen[:, done // 2 : done], root, scale)
+    return points, taken / (chains * count)
 
 
-def fit(
-    demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR
-) -> tuple[Posterior, list[F64]]:
-    """Return the posterior, and the paths' features that each demonstration's was chosen from, (m, K)."""
-    sums = rivals(demonstrations, prior_tastes(TASTES, count_features(demonstrations), rng, prior))
-    for _ in range(_ROUNDS):
-        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
-        sums = add_rivals(demonstrations, sums, quick.draws.thin(_MORE))
-    return draw_posterior(Choices.of(sums), rng, prior), sums
+def _fit_steps(seen: F64, root: F64, scale: float) -> tuple[F64, float]:
+    """A Cholesky root of the points' covariance, and the scale that keeps a step's size."""
+    size = seen.shape[2]
+    covariance = np.cov(seen.reshape(-1, size).T).reshape(size, size) + _JITTER * np.eye(size)
+    found = np.linalg.cholesky(covariance).astype(np.float64)
+    same = scale * float(np.linalg.norm(root) / np.linalg.norm(found))
+    return found, min(same, 2.38 / size**0.5)

@@ -1,4 +1,4 @@
-"""Demonstrated paths, and what they leave open about the weights of their costs."""
+"""Demonstrated paths, the paths they were preferred to, and what they leave open about the weights of their costs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError, MismatchError
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
+LENGTH = 0  # the feature that every edge has, over whose weight the others are given
 _FIFTH, _FEW = 5, 5  # of how many demonstrations one is a beginning, and how many are that at least
 _DIGITS = 6  # decimals [m] in which the features of different paths differ
 _SAME = 1e-6  # [m] that sums of a feature may differ by and be the same
@@ -20,18 +20,10 @@ _SAME = 1e-6  # [m] that sums of a feature may differ by and be the same
 
 @dataclass(frozen=True)
 class Demonstration:
-    """A path of nodes (n,) that somebody took from a start to the goal of a problem.
-
-    Raises `ManipError` where it does not end at the goal or goes where no edge leads.
-    """
+    """A path of nodes (n,) that somebody took from a start to the goal of a problem."""
 
     problem: PathProblem
     path: I64
-
-    def __post_init__(self) -> None:
-        if len(self.path) < 2 or self.path[-1] != self.problem.goal:
-            raise ManipError(f"a demonstration of {len(self.path)} nodes does not lead to the goal")
-        _ = self.sums
 
     @property
     def start(self) -> int:
@@ -42,24 +34,6 @@ class Demonstration:
     def sums(self) -> F64:
         """Features summed along it, (K,)."""
         return self.problem.sums(self.path)
-
-
-def count_features(demonstrations: Sequence[Demonstration]) -> int:
-    """Return how many features the demonstrations have. Raises for none at all, or for different numbers."""
-    if not demonstrations:
-        raise ManipError("there is no demonstration to learn from")
-    counts = {one.problem.features.shape[1] for one in demonstrations}
-    if len(counts) > 1:
-        raise MismatchError("number of features", "a demonstration", min(counts), "another", max(counts))
-    return counts.pop()
-
-
-def base_feature(demonstrations: Sequence[Demonstration]) -> int:
-    """Return the first feature that every edge has, such as its length. Raises `ManipError` where there is none."""
-    shortest = np.min([one.problem.features.min(axis=0) for one in demonstrations], axis=0)
-    if not (shortest > 0).any():
-        raise ManipError("no feature is above 0 on every edge, as length is: paths over edges of no cost never end")
-    return int(np.argmax(shortest > 0))
 
 
 def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstration]]:
@@ -89,7 +63,5 @@ def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tas
 
 def open_features(demonstrations: Sequence[Demonstration], sums: Sequence[F64]) -> list[int]:
     """Return the features in which every demonstration agrees with all its rivals (m, K): their weights are open."""
-    differ = np.zeros(count_features(demonstrations), bool)
-    for one, others in zip(demonstrations, sums, strict=True):
-        differ |= np.abs(others - one.sums).max(axis=0) > _SAME
-    return [int(k) for k in np.flatnonzero(~differ)]
+    off = [np.abs(others - one.sums).max(axis=0) for one, others in zip(demonstrations, sums, strict=True)]
+    return [int(k) for k in np.flatnonzero(np.max(off, axis=0) <= _SAME)]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from manip_il.rewards.demonstrations import Demonstration, base_feature, count_features, stages
+from manip_il.rewards.demonstrations import LENGTH, Demonstration, stages
 from manip_il.rewards.soft import soft_plan
 
 F64 = NDArray[np.float64]
@@ -57,13 +57,12 @@ def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float 
 def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     """Return weights (K,) [1/m] from which on the sum over all paths is finite: a step outweighs the choice of it.
 
-    That is log(most edges of a node) over the shortest edge, for the first feature that every edge has; 0 for others.
-    Raises what `base_feature` raises.
+    That is log(most edges of a node) over the shortest edge for length, and 0 for the other features.
     """
-    found, base = np.zeros(count_features(demonstrations)), base_feature(demonstrations)
-    shortest = min(float(one.problem.features[:, base].min()) for one in demonstrations)
+    found = np.zeros(demonstrations[0].problem.features.shape[1])
+    shortest = min(float(one.problem.features[:, LENGTH].min()) for one in demonstrations)
     most = max(int(np.bincount(one.problem.edges[:, 0]).max()) for one in demonstrations)
-    found[base] = _ABOVE * np.log(most) / shortest
+    found[LENGTH] = _ABOVE * np.log(most) / shortest
     return found
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from manip_il.errors import ManipError
 from manip_il.rewards.paths import PathProblem, plan
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+F64 = NDArray[np.float64]
 _ENOUGH = 1e-14  # share that longer paths may still add
 _MOST_EDGES = 20_000  # of a path
 
@@ -59,21 +59,12 @@ class SoftPlan:
         """Return the expected sums of the features on the way from a start, (K,)."""
         return self.visits(start) @ self.problem.features
 
-    def draw(self, start: int, rng: np.random.Generator) -> I64:
-        """Return the nodes of a path drawn from the distribution, (n,)."""
-        forwards, path = self.problem.matrix(self.chances), [start]
-        while path[-1] != self.problem.goal:
-            here = slice(*forwards.indptr[path[-1] : path[-1] + 2])
-            reach = np.cumsum(forwards.data[here])
-            path.append(int(forwards.indices[here][np.searchsorted(reach, rng.random() * reach[-1], side="right")]))
-        return np.array(path, np.int64)
-
 
 def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
     """Return the distribution of paths for weights (K,); the larger they are, the closer it is to the cheapest path.
 
     Raises `ManipError` where the sum over all paths is infinite, because steps cost less than the choice between them
-    adds (the spectral radius of M is 1 or more), and what `PathProblem.costs` raises.
+    adds (the spectral radius of M is 1 or more).
     """
     costs, edges = problem.costs(weights), problem.edges
     hard = plan(problem, weights).costs
@@ -85,11 +76,6 @@ def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
     chances = shares * ahead / np.where(reached, sums, 1.0)[edges[:, 0]]
     values = np.where(reached, known - np.log(np.where(reached, sums, 1.0)), np.inf)
     return SoftPlan(problem, values, chances)
-
-
-def log_likelihood(planned: SoftPlan, weights: F64, path: I64) -> float:
-    """Return the logarithm of the probability of a path of nodes (n,) among all from its start, for weights (K,)."""
-    return float(planned.values[path[0]] - planned.problem.sums(path) @ weights)
 
 
 def _sum_paths(problem: PathProblem, shares: F64) -> F64:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.rewards.paths import PathProblem, cheapest_path, costs_to_go, plan
+from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.tasks.layout import Layout
 from manip_il.tasks.reward import Reward
 
@@ -141,7 +141,7 @@ class Grid:
         """Return the cost of the cheapest path to the goal from every node, (S,), for weights (K,)."""
         costs = self._integrals(self.layout.densities(self._fine) @ weights)
         problem = PathProblem(self._links.edges, costs[:, None], len(self.points), self.goal)
-        return costs_to_go(problem, np.ones(1))
+        return plan(problem, np.ones(1)).costs
 
     def _number(self, index: I64) -> I64:
         """Numbers (n,) of nodes by their places along x, y and z, (n, 3)."""

@@ -10,24 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.rewards.finite import deterministic
 from manip_il.seeding import rng_for
-from manip_il.theory.problems import (
-    PLACES,
-    PROBLEMS,
-    RIGHT,
-    WRONG,
-    Problem,
-    expert_visits,
-    expert_worth,
-    recoverability,
-    wrong_costs,
-)
+from manip_il.theory.processes import PLACES, PROCESSES, Process
 
 F64 = NDArray[np.float64]
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
@@ -38,6 +28,7 @@ _BOOTSTRAPS = 2_000
 _ROUNDING = 1e-9
 Learner = Literal["cloning", "DAgger"]
 Fit = Literal["worst", "even", "constructed"]
+TIES: dict[Fit, float] = {"worst": 1.0, "even": 0.5}  # how often a fit errs in states without data
 
 
 @dataclass(frozen=True)
@@ -70,26 +61,30 @@ class Curve:
     horizons: tuple[int, ...]
     losses: tuple[tuple[Loss, ...], ...]
 
+    @cached_property
+    def _gaps_and_errors(self) -> F64:
+        """Of every horizon and draw, (h, D, 2)."""
+        return np.array([[[loss.gap, loss.error] for loss in draws] for draws in self.losses])
+
     @property
     def ratios(self) -> list[float]:
-        """Mean gap over mean error at each horizon."""
-        return [_ratio(np.array([[loss.gap, loss.error] for loss in draws])) for draws in self.losses]
+        """Mean gap over mean error at each horizon; NaN if no policy errs."""
+        return _ratios(self._gaps_and_errors.mean(axis=1)).tolist()
 
     @property
     def slope(self) -> float:
-        """The power of the horizon with which gap over error grows."""
-        return _power(self.horizons, self.ratios)
+        """The power of the horizon with which gap over error grows; NaN if that is not known at each."""
+        return float(np.append(_powers(self.horizons, np.array(self.ratios)[:, None]), np.nan)[0])
 
-    @property
+    @cached_property
     def interval(self) -> tuple[float, float]:
         """The 95 % interval of the slope, by bootstrap over draws at each horizon."""
         rng = rng_for(0, f"slope of {self.problem}, {self.learner}, {self.fit}")
-        draws = [np.array([[loss.gap, loss.error] for loss in one]) for one in self.losses]
-        slopes = [
-            _power(self.horizons, [_ratio(one[rng.integers(len(one), size=len(one))]) for one in draws])
-            for _ in range(_BOOTSTRAPS if len(draws[0]) > 1 else 1)
-        ]
-        low, high = np.nanquantile(slopes, [0.025, 0.975])
+        horizons, draws, _ = self._gaps_and_errors.shape
+        chosen = rng.integers(draws, size=(_BOOTSTRAPS, horizons, draws))
+        ratios = _ratios(self._gaps_and_errors[np.arange(horizons)[:, None], chosen].mean(axis=2))
+        slopes = _powers(self.horizons, ratios.T)
+        low, high = np.quantile(slopes, [0.025, 0.975]) if slopes.size else (np.nan, np.nan)
         return float(low), float(high)
 
     @property
@@ -108,110 +103,106 @@ class Curve:
 
 
 def all_curves(horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[Curve]:
-    """Yield the curves of every problem, learner and fit."""
-    for problem in PROBLEMS:
-        yield from curves(problem, horizons, draws)
+    """Yield the curves of every process, learner and fit."""
+    for process in PROCESSES:
+        yield from curves(process, horizons, draws)
 
 
-def curves(problem: Problem, horizons: Sequence[int], draws: int) -> Iterator[Curve]:
-    """Yield the curves of both learners on one problem."""
-    fits: tuple[Fit, ...] = ("worst", "even")
-    for fit in fits:
-        pairs = [[_fitted(problem, horizon, fit, draw) for draw in range(draws)] for horizon in horizons]
-        yield Curve(problem.name, "cloning", fit, tuple(horizons), tuple(tuple(c for c, _ in row) for row in pairs))
-        yield Curve(problem.name, "DAgger", fit, tuple(horizons), tuple(tuple(d for _, d in row) for row in pairs))
-    off = tuple((cloning_loss(problem, constructed(problem, h, ERROR / h, off_data=True)),) for h in horizons)
-    own = tuple((dagger_loss(problem, constructed(problem, h, ERROR / h, off_data=False)),) for h in horizons)
-    yield Curve(problem.name, "cloning", "constructed", tuple(horizons), off)
-    yield Curve(problem.name, "DAgger", "constructed", tuple(horizons), own)
+def curves(process: Process, horizons: Sequence[int], draws: int) -> Iterator[Curve]:
+    """Yield the curves of both learners on one process: of both fits, then of policies constructed to err."""
+    found: dict[tuple[Learner, Fit], list[tuple[Loss, ...]]] = {}
+    for horizon in horizons:
+        for name, losses in _fitted(process, horizon, draws).items():
+            found.setdefault(name, []).append(losses)
+        for learner in ("cloning", "DAgger"):
+            policy = constructed(process, horizon, ERROR / horizon, off_data=learner == "cloning")
+            found.setdefault((learner, "constructed"), []).append(losses_of(process, learner, policy[None]))
+    for (learner, fit), losses in found.items():
+        yield Curve(process.name, learner, fit, tuple(horizons), tuple(losses))
 
 
-def cloning_loss(problem: Problem, policy: F64) -> Loss:
-    """Return the loss of a policy (H, S, A) with its error in the expert's states, and Theorem 8.1's bound."""
-    horizon = len(policy)
-    error = _error(policy, expert_visits(problem, horizon))
-    return Loss(error, _gap(problem, policy), horizon**2 * error)
+def losses_of(process: Process, learner: Learner, policies: F64) -> tuple[Loss, ...]:
+    """Return the loss of each policy (B, H, S), with its error and bound by the learner's theorem.
+
+    cloning: error in the expert's states, Theorem 8.1; DAgger: in the policy's own, Theorem 8.2. The gap is what the
+    policy's wrong actions cost in the states that it visits (the performance difference lemma).
+    """
+    horizon, own = policies.shape[1], process.visits(policies) * policies
+    gaps = (own * process.wrong_costs(horizon)).sum(axis=(1, 2))
+    wrong = process.expert_visits(horizon) * policies if learner == "cloning" else own
+    factor = horizon if learner == "cloning" else process.recoverability(horizon)
+    errors = wrong.sum(axis=(1, 2)) / horizon
+    return tuple(Loss(e, g, factor * horizon * e) for e, g in zip(errors.tolist(), gaps.tolist(), strict=True))
 
 
-def dagger_loss(problem: Problem, policy: F64) -> Loss:
-    """Return the loss of a policy (H, S, A) with its error in its own states, and Theorem 8.2's bound."""
-    horizon = len(policy)
-    error = _error(policy, problem.mdp.visits(policy))
-    return Loss(error, _gap(problem, policy), recoverability(problem, horizon) * horizon * error)
-
-
-def constructed(problem: Problem, horizon: int, error: float, *, off_data: bool) -> F64:
-    """Return a policy (H, S, A) that errs with a probability in every state.
+def constructed(process: Process, horizon: int, error: float, *, off_data: bool) -> F64:
+    """Return a policy (H, S) that errs with a probability in every state.
 
     off_data: err always where the expert never is, and so gives no data.
     """
-    policy = np.tile([1 - error, error], (horizon, problem.mdp.states, 1))
+    policy = np.full((horizon, process.states), error)
     if off_data:
-        policy[expert_visits(problem, horizon) == 0] = [0.0, 1.0]
-    return _mended(problem, policy)
+        policy[process.expert_visits(horizon) == 0] = 1.0
+    return _mended(process, policy)
 
 
-def clone(problem: Problem, seen: NDArray[np.bool_], fit: Fit) -> F64:
-    """Return the policy (H, S, A) of greatest likelihood on labels of the states seen (H, S).
+def clone(process: Process, seen: NDArray[np.bool_], ties: F64 | float) -> F64:
+    """Return the policies (..., H, S) of greatest likelihood on labels of the states seen (..., H, S).
 
-    The label where there is one, else the worst action that is left open, or either evenly; where no action is worse
-    than the expert's, as after a fall, it does as the expert.
+    The label where there is one, else wrong in a share `ties`; where no action is worse than the expert's, as after a
+    fall, it does as the expert.
     """
-    policy = deterministic(np.where(seen, RIGHT, WRONG), 2)
-    if fit == "even":
-        policy[~seen] = 0.5
-    return _mended(problem, policy)
+    return _mended(process, np.where(seen, 0.0, ties))
 
 
-def dagger(problem: Problem, seen: NDArray[np.bool_], fit: Fit, count: int, rng: np.random.Generator) -> F64:
-    """Return DAgger's policy (H, S, A), of `count` trajectories a round: the best of all rounds, as in Definition 8.2.
+def dagger(
+    process: Process, seen: NDArray[np.bool_], ties: F64 | float, count: int, rngs: list[np.random.Generator]
+) -> F64:
+    """Return DAgger's policies (B, H, S), of `count` trajectories a round: the best of all rounds (Definition 8.2).
 
-    seen: states (H, S) with labels of the expert's own trajectories, to begin with.
+    seen: states (B, H, S) with labels of the expert's own trajectories, to begin with. rngs: see `Process.seen`.
     """
-    policies = [clone(problem, seen, fit)]
-    for _ in range(ROUNDS):
-        seen = seen | _seen(problem, policies[-1], count, rng)
-        policies.append(clone(problem, seen, fit))
-    return min(policies, key=lambda policy: _error(policy, problem.mdp.visits(policy)))
+    best, least = np.empty(seen.shape), np.full(len(seen), np.inf)
+    for round_ in range(ROUNDS + 1):
+        policy = clone(process, seen, ties)
+        errors = (process.visits(policy) * policy).sum(axis=(1, 2))
+        better = errors < least
+        best[better], least[better] = policy[better], errors[better]
+        if round_ < ROUNDS:
+            seen = seen | process.seen(policy, count, rngs)
+    return best
 
 
-def _fitted(problem: Problem, horizon: int, fit: Fit, draw: int) -> tuple[Loss, Loss]:
+def _fitted(process: Process, horizon: int, draws: int) -> dict[tuple[Learner, Fit], tuple[Loss, ...]]:
     """Losses of cloning and of DAgger on as many trajectories: so many that a share of about `ERROR` / H is unseen."""
-    rng = rng_for(draw, f"trajectories of {horizon} steps, {problem.name}")
+    rngs = [rng_for(draw, f"trajectories of {horizon} steps, {process.name}") for draw in range(draws)]
     count = int(np.ceil(PLACES * np.log(horizon / ERROR)))
-    cloned = cloning_loss(problem, clone(problem, _seen(problem, problem.expert(horizon), count, rng), fit))
     first = round(count / (1 + ROUNDS / MORE))
-    seen = _seen(problem, problem.expert(horizon), first, rng)
-    return cloned, dagger_loss(problem, dagger(problem, seen, fit, first // MORE, rng))
+    expert = np.zeros((1, horizon, process.states))
+    for_clone, for_dagger = (
+        np.concatenate([process.seen(expert, number, [rng]) for rng in rngs]) for number in (count, first)
+    )
+    found: dict[tuple[Learner, Fit], tuple[Loss, ...]] = {}
+    ties = np.repeat(list(TIES.values()), draws)[:, None, None]
+    improved = dagger(process, np.tile(for_dagger, (len(TIES), 1, 1)), ties, first // MORE, rngs)
+    for number, (fit, share) in enumerate(TIES.items()):
+        found["cloning", fit] = losses_of(process, "cloning", clone(process, for_clone, share))
+        found["DAgger", fit] = losses_of(process, "DAgger", improved[number * draws : (number + 1) * draws])
+    return found
 
 
-def _seen(problem: Problem, policy: F64, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Whether some of `count` trajectories of a policy is in a state at a step, (H, S)."""
-    states = problem.sampler.states(policy, count, rng)
-    seen = np.zeros((len(policy), problem.mdp.states), np.bool_)
-    np.put_along_axis(seen, states, True, axis=1)
-    return seen
-
-
-def _mended(problem: Problem, policy: F64) -> F64:
+def _mended(process: Process, policy: F64) -> F64:
     """Without errors that cost nothing: there, the theorems' expert may act as the policy does."""
-    policy = policy.copy()
-    policy[wrong_costs(problem, len(policy)) <= 0] = [1.0, 0.0]
-    return policy
+    return np.where(process.wrong_costs(policy.shape[-2]) <= 0, 0.0, policy)
 
 
-def _error(policy: F64, visits: F64) -> float:
-    return float((visits * policy[..., WRONG]).sum() / len(policy))
+def _ratios(gaps_and_errors: F64) -> F64:
+    """Gap over error (...) of both, (..., 2); NaN without an error."""
+    gaps, errors = np.moveaxis(gaps_and_errors, -1, 0)
+    return np.divide(gaps, errors, out=np.full(gaps.shape, np.nan), where=errors > 0)
 
 
-def _gap(problem: Problem, policy: F64) -> float:
-    return expert_worth(problem, len(policy)) - problem.mdp.worth(policy)
-
-
-def _ratio(gaps_and_errors: F64) -> float:
-    gap, error = gaps_and_errors.mean(axis=0)
-    return float(gap / error) if error > 0 else float("nan")
-
-
-def _power(horizons: Sequence[int], ratios: Sequence[float]) -> float:
-    return float(np.polyfit(np.log(horizons), np.log(ratios), 1)[0])
+def _powers(horizons: Sequence[int], ratios: F64) -> F64:
+    """Slopes in log-log of the columns of ratios (h, n) that are known at each horizon."""
+    known = ratios[:, np.isfinite(ratios).all(axis=0)]
+    return np.polyfit(np.log(horizons), np.log(known), 1)[0] if known.size else np.empty(0)

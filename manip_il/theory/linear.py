@@ -23,7 +23,6 @@ BACK = 0.5  # what the expert leaves of a state in one step
 GUST = 1e-3  # standard deviation of what disturbs a rollout, each step
 NOISE = 0.1  # standard deviation of the noise on the expert's actions in demonstrations, as DART adds
 _LATE = 10  # steps over which the growth is measured, the last ones
-Size = Literal["scalar", "plane"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class System:
     The pole is that of the direction in which demonstrations say little.
     """
 
-    size: Size
+    size: Literal["scalar", "plane"]
     pole: float
 
     @property
@@ -53,11 +52,24 @@ class System:
         return at
 
     def expert(self, states: F64) -> F64:
-        """Return the expert's actions, (B, n)."""
+        """Return the expert's actions, (..., n)."""
         return states @ (BACK * np.eye(len(self.open_loop)) - self.open_loop).T
 
+    def clone(self, shown: F64, states: F64, step: int) -> F64:
+        """Return a clone's actions (B, n) in states (B, n), learnt from demonstrated states (STEPS, D, n).
 
-SYSTEMS = tuple(System(size, pole) for size in ("scalar", "plane") for pole in (0.8, 1.0, 1.25))
+        scalar: a policy for each step, as the theorems have them, linear between the nearest states demonstrated at
+        that step. plane: one linear policy by least squares, the smallest of those that fit equally well.
+        """
+        if self.size == "scalar":
+            known = np.sort(shown[step, :, 0])
+            return np.interp(states[:, 0], known, self.expert(known[:, None])[:, 0])[:, None]
+        rows = shown.reshape(-1, shown.shape[-1])
+        return states @ np.linalg.lstsq(rows, self.expert(rows), rcond=1e-9)[0]
+
+
+SIZES: tuple[Literal["scalar", "plane"], ...] = ("scalar", "plane")
+SYSTEMS = tuple(System(size, pole) for size in SIZES for pole in (0.8, 1.0, 1.25))
 
 
 @dataclass(frozen=True)
@@ -90,48 +102,17 @@ def drifts() -> list[Drift]:
 
 def _drift(system: System, noise: float) -> Drift:
     rng = rng_for(0, f"linear {system.size} {system.pole} {noise}")
-    states = _demonstrations(system, noise, rng)
-    clone = _LinearClone(states, system.expert(states)) if system.size == "plane" else _NearestClone(system, states)
+    now, shown = system.starts(DEMONSTRATIONS, rng), list[F64]()
+    for _ in range(STEPS):
+        shown.append(now)
+        action = system.expert(now) + noise * rng.standard_normal(now.shape)
+        now = now @ system.open_loop.T + action
+    demonstrated, apart, errors = np.stack(shown), list[float](), list[F64]()
     expert = learner = system.starts(ROLLOUTS, rng)
-    apart, errors = list[float](), list[F64]()
     for t in range(STEPS):
         gust = GUST * rng.standard_normal(expert.shape)
-        errors.append(clone.act(expert, t) - system.expert(expert))
-        learner = learner @ system.open_loop.T + clone.act(learner, t) + gust
+        errors.append(system.clone(demonstrated, expert, t) - system.expert(expert))
+        learner = learner @ system.open_loop.T + system.clone(demonstrated, learner, t) + gust
         expert = expert @ system.open_loop.T + system.expert(expert) + gust
         apart.append(float(np.sqrt(((learner - expert) ** 2).sum(axis=1).mean())))
     return Drift(system, noise, float(np.sqrt((np.stack(errors) ** 2).sum(axis=2).mean())), tuple(apart))
-
-
-def _demonstrations(system: System, noise: float, rng: np.random.Generator) -> F64:
-    """States of the expert's demonstrations, (STEPS, DEMONSTRATIONS, n)."""
-    now, found = system.starts(DEMONSTRATIONS, rng), list[F64]()
-    for _ in range(STEPS):
-        found.append(now)
-        action = system.expert(now) + noise * rng.standard_normal(now.shape)
-        now = now @ system.open_loop.T + action
-    return np.stack(found)
-
-
-class _NearestClone:
-    """A policy for each step, as the theorems have them: the action of the nearest state demonstrated at that step."""
-
-    def __init__(self, system: System, states: F64):
-        self._states = np.sort(states[..., 0], axis=1)
-        self._actions = system.expert(self._states[..., None])[..., 0]
-
-    def act(self, states: F64, step: int) -> F64:
-        """Return actions (B, 1), between two demonstrated states on the line through them."""
-        return np.interp(states[:, 0], self._states[step], self._actions[step])[:, None]
-
-
-class _LinearClone:
-    """A linear policy by least squares, the smallest of those that fit equally well."""
-
-    def __init__(self, states: F64, actions: F64):
-        rows = states.reshape(-1, states.shape[-1])
-        self._gain = np.linalg.lstsq(rows, actions.reshape(len(rows), -1), rcond=1e-9)[0]
-
-    def act(self, states: F64, step: int) -> F64:
-        """Return actions (B, n), the same at every step."""
-        return states @ self._gain

@@ -6,17 +6,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from manip_il.evaluation.figures import ARMS, CLONING, DAGGER, SOFT, Figure, drawing, to_figure
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.theory.bounds import DRAWS, ERROR, Curve
-from manip_il.theory.figures import clouds_figure, errors_figure, linear_figure, theorem_figure
-from manip_il.theory.linear import GUST, Drift
-from manip_il.theory.problems import PROBLEMS, recoverability
-from manip_il.theory.shift import WRONG, Shift
+from manip_il.theory.linear import GUST, SYSTEMS, Drift
+from manip_il.theory.processes import PROCESSES
+from manip_il.theory.shift import WRONG, RoundShift, Shift
 
 PAGE, FILE_NAME = "report.html", "theory.json"
 _FITS = {"worst": "fitted", "even": "fitted, ties even", "constructed": "constructed"}
+_LOOKS = {"cloning": (CLONING, "o"), "DAgger": (DAGGER, "s")}
+_SIZES = {"scalar": "one dimension", "plane": "two, demonstrations on a line"}
+_LEAST = 1e-7  # of a distance on a logarithmic axis
+_CLOUDS, _POINTS = 5, 1_500  # rounds whose clouds are shown, and points of a cloud
+_DATA = "#b9bfc6"
 
 
 @dataclass(frozen=True)
@@ -33,9 +40,9 @@ class Theory:
         return sum(curve.above for curve in self.curves)
 
     @property
-    def fitted(self) -> tuple[Curve, ...]:
-        """The curves that the theorems speak of: fitted policies, the worst that their data leave open."""
-        return tuple(curve for curve in self.curves if curve.fit == "worst")
+    def fitted(self) -> dict[tuple[str, str], Curve]:
+        """The curves that the theorems speak of, by process and learner: fits to data, the worst that these allow."""
+        return {(curve.problem, curve.learner): curve for curve in self.curves if curve.fit == "worst"}
 
     def to_json(self) -> dict[str, Any]:
         """Return everything for `theory.json`."""
@@ -49,16 +56,20 @@ class Theory:
 
 def slope_table(theory: Theory) -> Table:
     """Return the slopes of fitted policies, one row a process."""
-    by = {(curve.problem, curve.learner): curve for curve in theory.fitted}
     rows = []
-    for problem in PROBLEMS:
-        horizons = by[problem.name, "cloning"].horizons
-        u = recoverability(problem, horizons[-1])
-        cells = [_slope(by[problem.name, learner]) for learner in ("cloning", "DAgger")]
-        rows.append((problem.name, f"{u:g} at H = {horizons[-1]}", *(str(s) for s in problem.slopes), *cells))
+    for process in PROCESSES:
+        cloned, improved = (theory.fitted[process.name, learner] for learner in ("cloning", "DAgger"))
+        last = cloned.horizons[-1]
+        u = f"{process.recoverability(last):g} at H = {last}"
+        rows.append((process.name, u, *map(str, process.slopes), _slope(cloned), _slope(improved)))
     return Table(
         ("process", "recoverability u", "cloning, theorem", "DAgger, theorem", "cloning", "DAgger"), tuple(rows)
     )
+
+
+def summary_lines(theory: Theory) -> Sequence[str]:
+    """Return the slopes as a table, and how many policies are above their bound, as plain lines."""
+    return [*slope_table(theory).aligned_lines(), f"policies above their bound: {theory.above}"]
 
 
 def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
@@ -71,9 +82,13 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timin
     if theory.shift is not None:
         sections = [*_arm(theory.shift), *sections]
         facts.append(_shift_fact(theory.shift))
+    slopes = {key: curve.slope for key, curve in theory.fitted.items()}
+    walk, rope = PROCESSES[0].name, PROCESSES[1].name
     return Report(
         title="What is proved of imitation, seen",
-        verdict=_verdict(theory),
+        verdict="Where the expert mends a mistake, cloning's gap grows with the horizon to the power of "
+        f"{slopes[walk, 'cloning']:.1f} and DAgger's to the power of {slopes[walk, 'DAgger']:.1f}; on a {rope} both to "
+        f"{slopes[rope, 'DAgger']:.1f}.",
         facts=tuple(facts),
         command=command,
         config=config,
@@ -82,14 +97,8 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timin
     )
 
 
-def _verdict(theory: Theory) -> str:
-    by = {(curve.problem, curve.learner): curve.slope for curve in theory.fitted}
-    first = PROBLEMS[0].name
-    return (
-        f"Where the expert mends a mistake, cloning's gap grows with the horizon to the power of "
-        f"{by[first, 'cloning']:.1f} and DAgger's to the power of {by[first, 'DAgger']:.1f}; on a tightrope both to "
-        f"{by['tightrope', 'DAgger']:.1f}."
-    )
+def _slope(curve: Curve) -> str:
+    return "{:.2f} [{:.2f}, {:.2f}]".format(curve.slope, *curve.interval)
 
 
 def _theorems(theory: Theory) -> Section:
@@ -97,14 +106,14 @@ def _theorems(theory: Theory) -> Section:
         "Cloning and DAgger over the horizon",
         lead=(
             "Three finite processes, solved exactly, on which the expert always acts right. A wrong action "
-            + "; ".join(f"{problem.words} ({problem.name})" for problem in PROBLEMS)
+            + "; ".join(f"{process.words} ({process.name})" for process in PROCESSES)
             + ".",
         ),
         formulas=(
             "Theorem 8.1, cloning:  J(π*) - J(π) ≤ H² ε,  ε: share of the expert's states in which π errs",
             "Theorem 8.2, DAgger:  J(π*) - J(π) ≤ u H ε,  ε: share of π's own states in which it errs",
         ),
-        figures=(theorem_figure(theory.curves),),
+        figures=(_theorem_figure(theory.curves),),
         tables=(slope_table(theory),),
         notes=(
             "Slopes of gap over error in log-log, with 95 % bootstrap intervals over the draws of data. u is what one "
@@ -119,6 +128,30 @@ def _theorems(theory: Theory) -> Section:
     )
 
 
+def _theorem_figure(curves: Sequence[Curve]) -> Figure:
+    """Gap over error against the horizon: one panel a process, both learners, beside their bounds."""
+    with drawing(len(PROCESSES), size=(3.2, 3.0)) as (drawn, axes):
+        for axis, process in zip(axes[0], PROCESSES, strict=True):
+            own = [curve for curve in curves if curve.problem == process.name]
+            horizons = np.array(own[0].horizons)
+            u = [process.recoverability(int(horizon)) for horizon in horizons]
+            axis.plot(horizons, horizons**2.0, ":", color=CLONING, lw=1.2, label="bound 8.1: H²")
+            axis.plot(horizons, horizons * u, ":", color=DAGGER, lw=1.2, label="bound 8.2: u H")
+            for curve in own:
+                colour, marker = _LOOKS[curve.learner]
+                if curve.fit == "constructed":
+                    axis.plot(horizons, curve.ratios, "-", color=colour, lw=4, alpha=0.2)
+                    continue
+                fill, more = (colour, "") if curve.fit == "worst" else ("white", ", ties even")
+                axis.plot(horizons, curve.ratios, marker, color=colour, mfc=fill, ms=4.5, label=curve.learner + more)
+            axis.set(xscale="log", yscale="log", xlabel="horizon H", title=process.name)
+            axis.set_xticks([10, 40, 160, 640], ["10", "40", "160", "640"])
+            axis.minorticks_off()
+        axes[0, 0].set_ylabel("gap / ε")
+        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        return to_figure(drawn, "Gap over error against the horizon, three processes, cloning and DAgger, with bounds")
+
+
 def _numbers(theory: Theory) -> Section:
     rows = [
         (
@@ -131,7 +164,7 @@ def _numbers(theory: Theory) -> Section:
         )
         for curve in theory.curves
     ]
-    first, last = theory.curves[0].horizons[0], theory.curves[0].horizons[-1]
+    first, *_, last = theory.curves[0].horizons
     columns = ("policy", "slope", f"gap / ε, H = {first}", f"H = {last}", "largest ε H", "above its bound")
     return Section("The numbers behind the points", tables=(Table(columns, tuple(rows)),))
 
@@ -157,7 +190,7 @@ def _linear(theory: Theory) -> Section:
             "is stable, as under servos that hold joint targets, and grows by the open loop's factor a step where it "
             "is not, however small the clone's error in the expert's states.",
         ),
-        figures=(linear_figure(theory.drifts),),
+        figures=(_linear_figure(theory.drifts),),
         tables=(Table(columns, tuple(rows)),),
         notes=(
             "Noise on the demonstrations (DART, dashed) shows the expert's corrections, and the clone learns them. For "
@@ -166,25 +199,37 @@ def _linear(theory: Theory) -> Section:
     )
 
 
+def _linear_figure(drifts: Sequence[Drift]) -> Figure:
+    """How far clones get from the expert, step by step: one panel a size of system."""
+    poles = sorted({system.pole for system in SYSTEMS})
+    with drawing(len(_SIZES), size=(4.4, 3.1)) as (drawn, axes):
+        for axis, (size, title) in zip(axes[0], _SIZES.items(), strict=True):
+            for drift in drifts:
+                if drift.system.size == size:
+                    style = {"color": ARMS[poles.index(drift.system.pole)], "ls": "--" if drift.noise else "-"}
+                    words = f"{drift.system.words}, open loop {drift.system.pole:g}"
+                    label = words + (", noisy demonstrations" if drift.noise else "")
+                    apart = np.maximum(drift.apart, _LEAST)
+                    axis.plot(range(1, len(apart) + 1), apart, lw=1.6, label=label, **style)
+            axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
+            axis.set(yscale="log", xlabel="step", title=title, ylim=(_LEAST, 100))
+        axes[0, 0].set_ylabel("distance from the expert")
+        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        return to_figure(drawn, "Distance of clones from the expert over the steps, of stable and unstable systems")
+
+
 def _arm(shift: Shift) -> list[Section]:
     columns = (
-        "policy",
-        "success",
-        "wrong, expert's states",
-        "wrong, own states",
-        "distance from data",
-        "AUC (expert's)",
-        "gap [steps]",
-        "bound u H ε [steps]",
+        *("policy", "success", "wrong, expert's states", "wrong, own states", "distance from data"),
+        *("gap [steps]", "bound u H ε [steps]"),
     )
     rows = [
         (
-            "cloning (round 0)" if one.round == 0 else f"round {one.round}",
+            _name(one),
             str(one.success),
             "" if one.on_expert is None else format_percent(one.on_expert.rate),
             format_percent(one.on_own.rate),
             f"{one.distance:.2f}",
-            f"{one.auc:.2f} ({one.auc_expert:.2f})",
             f"{shift.gap(one):.1f}",
             f"{shift.bound(one):,.0f}",
         )
@@ -193,13 +238,12 @@ def _arm(shift: Shift) -> list[Section]:
     return [
         Section(
             f"The arm: {shift.env.robot} {shift.env.task}",
-            figures=(errors_figure(shift),),
+            figures=(_errors_figure(shift),),
             tables=(Table(columns, tuple(rows)),),
             notes=(
                 f"An action is wrong if a joint is farther off the expert's label than {WRONG:g} of its largest step. "
                 "Distance: of the states that the policy visits to the nearest in the data it was fitted on, median; 1 "
-                "is that of the expert's own new episodes. AUC: of a classifier that tells its states from the data, "
-                "in brackets the expert's; DAgger's data hold the mistakes of earlier rounds, too, so it is above 0.5.",
+                "is that of the expert's own new episodes.",
                 f"Costs are control steps until solved, {shift.env.horizon} where it is not; the expert takes "
                 f"{shift.expert_cost:.1f}. u is the most that one wrong action was seen to cost the expert: "
                 f"{shift.u} steps, a lower bound. A bound above the horizon says nothing of this policy: the theorem "
@@ -208,7 +252,7 @@ def _arm(shift: Shift) -> list[Section]:
         ),
         Section(
             "Distribution shift: where the hand was",
-            figures=(clouds_figure(shift),),
+            figures=(_clouds_figure(shift.rounds),),
             notes=("Grey: the data that the policy was fitted on. Colour: where it took the hand itself.",),
         ),
     ]
@@ -224,11 +268,41 @@ def _shift_fact(shift: Shift) -> str:
     )
 
 
-def _slope(curve: Curve) -> str:
-    low, high = curve.interval
-    return f"{curve.slope:.2f} [{low:.2f}, {high:.2f}]"
+def _name(one: RoundShift) -> str:
+    return "cloning (round 0)" if one.round == 0 else f"round {one.round}"
 
 
-def summary_lines(theory: Theory) -> Sequence[str]:
-    """Return the slopes as a table, and how many policies are above their bound, as plain lines."""
-    return [*slope_table(theory).aligned_lines(), f"policies above their bound: {theory.above}"]
+def _errors_figure(shift: Shift) -> Figure:
+    """The share of wrong actions at each step, in the expert's states and in the policy's own: round 0, best round."""
+    best = max(range(len(shift.rounds)), key=lambda index: (shift.rounds[index].success.rate, index))
+    chosen = [shift.rounds[index] for index in dict.fromkeys((0, best))]
+    with drawing(len(chosen), size=(4.4, 2.9)) as (drawn, axes):
+        for axis, one in zip(axes[0], chosen, strict=True):
+            colour = CLONING if one.round == 0 else DAGGER
+            axis.plot(100 * np.array(one.on_own.by_step), color=colour, lw=1.8, label="in its own states")
+            if one.on_expert is not None:
+                axis.plot(100 * np.array(one.on_expert.by_step), color=SOFT, lw=1.4, label="in the expert's states")
+            axis.set(xlabel="control step", title=_name(one), ylim=(0, 100), xlim=(0, shift.env.horizon))
+            axis.legend(loc="upper right")
+        axes[0, 0].set_ylabel("wrong actions [%]")
+        return to_figure(drawn, "Share of wrong actions by step, for cloning and for the best round")
+
+
+def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
+    """Where the hand was, in the data and when the policy drove: from above and from the side, by round."""
+    if len(rounds) > _CLOUDS:  # the first ones closest together: there most changes
+        rounds = [rounds[index] for index in (0, 1, 2, (len(rounds) + 2) // 2, len(rounds) - 1)]
+    with drawing(len(rounds), 2, size=(9.0 / len(rounds), 2.2), share=True) as (drawn, axes):
+        for column, one in enumerate(rounds):
+            for row, across in enumerate(((1, 0), (0, 2))):
+                axis = axes[row, column]
+                for places, colour in ((one.data, _DATA), (one.hand, CLONING if one.round == 0 else DAGGER)):
+                    shown = places[:: max(1, len(places) // _POINTS)]
+                    axis.scatter(*shown[:, across].T, s=2.5, color=colour, alpha=0.55, lw=0, rasterized=True)
+                axis.set_aspect("equal", adjustable="box")
+                axis.tick_params(labelsize=7.5)
+            axes[0, column].set_title(_name(one), fontsize=9.5)
+        axes[0, 0].invert_xaxis()
+        axes[0, 0].set_ylabel("from above: x over y [m]", fontsize=8.5)
+        axes[1, 0].set_ylabel("from the side: z over x [m]", fontsize=8.5)
+        return to_figure(drawn, "Places of the hand in the data and in the policy's rollouts, by round")

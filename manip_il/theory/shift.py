@@ -14,9 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
-from scipy.stats import rankdata
 
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_actions, env_spec
@@ -24,7 +22,6 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.dataset import joined_columns
-from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.policy import LearnedPolicy
@@ -32,11 +29,10 @@ from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.config import EnvConfig
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+F64 = NDArray[np.float64]
 EPISODES = 50  # of the expert and of every round's policy
 WRONG = 0.25  # of the largest step: an action that is farther off the label, in any joint, is wrong
 FEWEST = 5  # episodes that still run at a step, for its share of wrong actions to be shown
-SHRUNK = 0.1  # share of the identity in the classifier's covariances
 MOST_STATES = 4_000  # of a kind, that are compared
 _HAND = ("ee.x", "ee.y", "ee.z")
 _OBSERVED = (schema.STATE, schema.ENVIRONMENT_STATE)
@@ -52,33 +48,29 @@ class RoundData(NamedTuple):
 
 
 class Visited(NamedTuple):
-    """States of some episodes: what a policy observes (N, d), the hand (N, 3) [m], and the episode of each (N,)."""
+    """States of some episodes: what a policy observes (N, d), and the hand (N, 3) [m]."""
 
     observed: F64
     hand: F64
-    episodes: I64
 
 
 @dataclass(frozen=True)
 class Errors:
     """Wrong actions. by_step: share of the running episodes that err at a step, while `FEWEST` run.
 
-    rate: of all states; per_episode: wrong actions in an episode, on average; size: mean distance of an action from its
-    label, in its worst joint [largest steps].
+    rate: of all states; per_episode: wrong actions in an episode, on average.
     """
 
     by_step: tuple[float, ...]
     rate: float
     per_episode: float
-    size: float
 
 
 @dataclass(frozen=True)
 class RoundShift:
     """One round's policy. on_expert: None for a policy on pictures; on_own: in the states that it visits itself.
 
-    distance: of its states from the data, median to the nearest; of the expert's, in new episodes, it is 1. auc: of a
-    classifier that tells its states from the data, 0.5 where it cannot; auc_expert: the same of the expert's. cost:
+    distance: of its states from the data, median to the nearest; of the expert's, in new episodes, it is 1. cost:
     [control steps]. data, hand: where the hand was in the data and in its rollouts, (N, 3) [m].
     """
 
@@ -87,8 +79,6 @@ class RoundShift:
     on_expert: Errors | None
     on_own: Errors
     distance: float
-    auc: float
-    auc_expert: float
     cost: float
     data: F64
     hand: F64
@@ -130,8 +120,6 @@ class Shift:
             "on_expert": None if one.on_expert is None else vars(one.on_expert),
             "on_own": vars(one.on_own),
             "distance": one.distance,
-            "auc": one.auc,
-            "auc_expert": one.auc_expert,
             "cost": one.cost,
             "gap": self.gap(one),
             "bound": self.bound(one),
@@ -176,10 +164,8 @@ def measure_shift(
                 one.round,
                 Proportion.of([episode.success for episode in learner]),
                 _errors_on(one.policy, expert, env),
-                _own_errors(learner, env),
-                _apart(states.observed, data.observed, fresh.observed),
-                _told_apart(states, data),
-                _told_apart(fresh, data),
+                _errors([episode.columns[schema.EXECUTED_ACTION] for episode in learner], learner, env),
+                relative_distance(states.observed, data.observed, fresh.observed),
                 _cost(learner, env.horizon),
                 data.hand,
                 states.hand,
@@ -201,70 +187,32 @@ def _cost(episodes: Sequence[Episode], horizon: int) -> float:
 
 
 def _visited(episodes: Sequence[Episode], names: Sequence[str]) -> Visited:
-    columns = {key: np.concatenate([one.columns[key] for one in episodes]) for key in _OBSERVED}
-    return _states(columns, np.repeat(np.arange(len(episodes)), [len(one) for one in episodes]), names)
+    return _states({key: np.concatenate([one.columns[key] for one in episodes]) for key in _OBSERVED}, names)
 
 
 def _stored(round_: RoundData, names: Sequence[str]) -> Visited:
     """States of the data that a round's policy was fitted on, but those after success, which rollouts here end at."""
-    table = joined_columns(round_.datasets, [*_OBSERVED, schema.SUCCESS, EPISODE_INDEX])
+    table = joined_columns(round_.datasets, [*_OBSERVED, schema.SUCCESS])
     rows = np.flatnonzero(~table[schema.SUCCESS].ravel().astype(np.bool_))
     if len(rows) > MOST_STATES:
         rows = np.sort(rng_for(round_.round, "states of the data").choice(rows, MOST_STATES, replace=False))
-    return _states({key: table[key][rows] for key in _OBSERVED}, table[EPISODE_INDEX].ravel()[rows], names)
+    return _states({key: table[key][rows] for key in _OBSERVED}, names)
 
 
-def _states(columns: Mapping[str, NDArray[Any]], episodes: I64, names: Sequence[str]) -> Visited:
+def _states(columns: Mapping[str, NDArray[Any]], names: Sequence[str]) -> Visited:
     observed = np.concatenate([columns[key] for key in _OBSERVED], axis=1).astype(np.float64)
     hand = columns[schema.ENVIRONMENT_STATE][:, [names.index(name) for name in _HAND]].astype(np.float64)
-    return Visited(observed, hand, episodes)
+    return Visited(observed, hand)
 
 
-def _apart(states: F64, data: F64, fresh: F64) -> float:
-    """Median distance of states to their nearest in the data, in units of the expert's new ones'."""
-    scale = _units(data)
+def relative_distance(states: F64, data: F64, fresh: F64) -> float:
+    """Return the median distance of states (N, d) to their nearest in the data (M, d), 1 for the expert's new ones.
+
+    fresh: those, (F, d). In standard deviations of the data's columns.
+    """
+    scale = np.maximum(data.std(axis=0), 1e-6)
     own, usual = (np.median(cdist(rows / scale, data / scale).min(axis=1)) for rows in (states, fresh))
     return float(own / usual) if usual > 0 else float("inf")
-
-
-def _told_apart(states: Visited, data: Visited) -> float:
-    """Area under the ROC curve of a quadratic classifier of states and data, fitted to half of the episodes.
-
-    Two Gaussians (quadratic discriminant analysis), covariances shrunk towards the columns' own variances.
-    """
-    rng = rng_for(0, "classifier of states")
-    halves = [_halves(one, rng) for one in (data, states)]
-    size = min(len(half) for pair in halves for half in pair)
-    (data_in, data_out), (own_in, own_out) = [[rng.permutation(half)[:size] for half in pair] for pair in halves]
-    scale = _units(np.concatenate([data_in, own_in]))
-    densities = [_gaussian(known / scale) for known in (own_in, data_in)]
-    own, other = ([density(rows / scale) for density in densities] for rows in (own_out, data_out))
-    ranks = rankdata(np.concatenate([own[0] - own[1], other[0] - other[1]]))[:size]
-    return float((ranks.mean() - (size + 1) / 2) / size)
-
-
-def _gaussian(rows: F64) -> Callable[[F64], F64]:
-    """Logarithm of a Gaussian's density, but for a constant, fitted to rows (N, d) in units of their scale."""
-    covariance = (1 - SHRUNK) * np.atleast_2d(np.cov(rows.T)) + SHRUNK * np.eye(rows.shape[1])
-    low = np.linalg.cholesky(covariance)
-    mean, size = rows.mean(axis=0), np.log(np.diag(low)).sum()
-    return lambda others: -0.5 * (solve_triangular(low, (others - mean).T, lower=True) ** 2).sum(axis=0) - size
-
-
-def _halves(states: Visited, rng: np.random.Generator) -> list[F64]:
-    """States of half of the episodes, and of the others."""
-    episodes = np.unique(states.episodes)
-    chosen = np.isin(states.episodes, rng.permutation(episodes)[: max(1, len(episodes) // 2)])
-    return [states.observed[chosen], states.observed[~chosen]]
-
-
-def _units(rows: F64) -> F64:
-    """The standard deviation of each column, of what does not change a tiny one."""
-    return np.maximum(rows.std(axis=0), 1e-6)
-
-
-def _own_errors(episodes: Sequence[Episode], env: EnvConfig) -> Errors:
-    return _errors([one.columns[schema.EXECUTED_ACTION] for one in episodes], episodes, env)
 
 
 def _errors_on(policy: Path, episodes: Sequence[Episode], env: EnvConfig) -> Errors | None:
@@ -296,5 +244,4 @@ def _errors(actions: Sequence[NDArray[Any]], episodes: Sequence[Episode], env: E
         tuple((wrong / running.clip(min=1))[:shown].tolist()),
         float(wrong.sum() / running.sum()),
         float(wrong.sum() / len(episodes)),
-        float(sizes[known].mean()),
     )

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.algorithms.config import BetaSchedule
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UsageError
 
 
 @pytest.mark.parametrize(
@@ -42,20 +42,9 @@ def test_the_expert_drives_all_of_round_0_and_never_more_later(text: str):
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        *((text, f"beta is '{text}'; expected") for text in ("linear:0", "linear:-3", "constant:1.1")),
-        *((text, f"beta is '{text}'; expected") for text in ("exponential:-0.1", "constant:nan")),
-        ("linear", "beta is 'linear'; expected linear:NUMBER"),
-        ("constant:", "beta is 'constant:'; expected constant:NUMBER"),
-        ("exponential:half", "beta is 'exponential:half'; expected exponential:NUMBER"),
-    ],
+    "text",
+    ["linear:0", "linear:-3", "constant:1.1", "exponential:-0.1", "constant:nan", "linear", "constant:", "linaer:5"],
 )
-def test_a_parameter_that_is_missing_or_out_of_range_is_refused_and_shown_how(text: str, says: str):
-    with pytest.raises(UsageError, match=says):
+def test_a_schedule_that_is_none_is_refused_and_shown_how(text: str):
+    with pytest.raises(UsageError, match=f"beta is '{text}'; expected constant:B, linear:ROUNDS or exponential:B"):
         BetaSchedule.parse(text)
-
-
-def test_an_unknown_schedule_answers_with_the_nearest():
-    with pytest.raises(UnknownName, match="did you mean 'linear'"):
-        BetaSchedule.parse("linaer:5")

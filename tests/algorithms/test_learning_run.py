@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +13,10 @@ import numpy as np
 import pytest
 
 from manip_il.algorithms.airl import airl
-from manip_il.algorithms.fixed_reward import reinforcement
 from manip_il.algorithms.gail import gail
-from manip_il.algorithms.iterations import Iteration, best_validation, validations
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.algorithms.learning_run import LearningRun
+from manip_il.algorithms.learning_run import Iteration, LearningRun, best_validation, validations
+from manip_il.algorithms.ppo import ppo
 from manip_il.cli.main import main
 from manip_il.collect.workers import Engine
 from manip_il.errors import MismatchError, UsageError
@@ -122,7 +122,7 @@ def test_a_reward_that_is_given_sees_steps_as_datasets_have_them(config, cloned,
         return -np.abs(actions - states).sum(1).astype(np.float32)
 
     config = replace(config, datasets=(), start=cloned, episode_steps=10, steps=60, warmup=0)
-    results = list(reinforcement(LearningRun(config, tmp_path, Engine(), absorbing=False), reward))
+    results = list(ppo(LearningRun(config, tmp_path, Engine(), absorbing=False), reward))
     assert [one.steps for one in results] == [40, 80]
     assert seen == [[40, 8, 8]] * 2
 
@@ -136,9 +136,14 @@ def test_a_run_does_not_go_on_with_other_demonstrations_or_another_start(config,
     for changed in (demos / "meta" / "stats.json", start / "config.json"):
         before = changed.read_text()
         changed.write_text(before + " ")
-        with pytest.raises(MismatchError, match="content differs"):
+        with pytest.raises(MismatchError, match="content of datasets and policies"):
             run(config, tmp_path / "run", count=1)
         changed.write_text(before)
+    step = tmp_path / "run/checkpoints/last/training_state/training_step.json"
+    for path in (tmp_path / "run").rglob("*.json"):
+        assert str(tmp_path) not in path.read_text(), "no file of a run names the machine's folders"
+    saved = json.loads(step.read_text())
+    step.write_text(json.dumps(saved | {"given": dict(zip("ab", saved["given"], strict=True))}))  # as they were named
     assert [one.number for one in run(config, tmp_path / "run", count=1)] == [2]
 
 

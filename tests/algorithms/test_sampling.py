@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from manip_il.algorithms.config import Sampling
+from manip_il.algorithms.imitation import frame_weights
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor
 
@@ -25,13 +26,8 @@ def table() -> dict[str, np.ndarray]:
 
 
 def test_frames_weigh_what_their_kind_does(table):
-    weights = Sampling(demonstrations=1, corrections=3, rollouts=0.5).weights(table, SCALE)
-    assert weights is not None
+    weights = frame_weights(Sampling(demonstrations=1, corrections=3, rollouts=0.5), table, SCALE)
     assert weights.tolist() == [1, 0.5, 3, 3, 3]
-
-
-def test_without_a_preference_there_are_no_weights(table):
-    assert Sampling(2, 2, 2).weights(table, SCALE) is None
 
 
 @pytest.mark.parametrize(

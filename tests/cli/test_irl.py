@@ -24,7 +24,7 @@ def test_the_methods_of_the_command_are_those_there_are():
         ("irl nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
         (f"irl {SAMPLE} --method=max_entrpy", "unknown method 'max_entrpy' (did you mean 'max_entropy'?)", 2),
         (f"irl {SAMPLE} --seed=-1", "seed is -1", 2),
-        (f"irl {SAMPLE}", "lacks vase.x, vase.y, vase.z, laptop.x and", 1),
+        (f"irl {SAMPLE}", "expected a dataset of manip-il record --task.type=carry", 1),
     ],
 )
 def test_bad_input_is_one_line(line, says, code, here, error):

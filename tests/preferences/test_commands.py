@@ -68,7 +68,7 @@ def test_true_progress_scores_without_a_reward(here, capsys):
         ("preferences pairs good --output=x.txt", "--output is x.txt; expected a file, NAME.json", 2),
         ("preferences pairs good --clip=99", "the longest episode has 30", 1),
         ("preferences ask nowhere.json", "nowhere.json does not exist; expected pairs.json", 2),
-        ("preferences answer good/meta/info.json", "format is None; expected 'manip_il pairs'", 1),
+        ("preferences answer good/meta/info.json", "format is None, version None; expected 'manip_il pairs'", 1),
         ("preferences answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
         ("preferences fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
         ("preferences fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),

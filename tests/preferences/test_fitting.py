@@ -15,8 +15,7 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.reward import LearnedReward, RewardNetwork, RewardShape, joints_of, shape_for, ways_of, write_reward
 from manip_il.learn.reward_fit import Compared, answer_losses, deal, fit_reward
 from manip_il.preferences.answers import join_answers
-from manip_il.preferences.fit_report import fit_report
-from manip_il.preferences.fitting import calibration, fit_answers
+from manip_il.preferences.fitting import fit_answers, fit_report
 from manip_il.preferences.teachers import Teacher, answer_pairs
 
 SHAPE = RewardShape(members=3, width=16)
@@ -171,12 +170,7 @@ def test_weights_that_are_not_finite_are_refused_when_they_are_used(folder, tmp_
         LearnedReward.load(tmp_path).of_inputs(clips.inputs)
 
 
-def test_calibration_counts_every_answer_once_by_the_likelier_clip():
-    bins = calibration(np.array([0.95, 0.05, 0.55, 1.0]), np.array([1.0, 0.0, 0.0, 1.0]))
-    assert [(b.low, b.given.successes, b.given.n) for b in bins] == [(0.5, 0, 1), (0.9, 3, 3)]
-
-
 def test_the_page_says_what_was_held_out_and_by_whom_it_was_answered(fitted, clips, answers):
     page = fit_report(fitted, clips, answers, ["Ada"], "manip-il preferences fit", {}, {}).render()
-    for words in ("Calibration", "by Ada", f"epoch {fitted.fit.epochs}", "agrees with true progress in"):
+    for words in ("by Ada", f"epoch {fitted.fit.epochs}", "agrees with true progress in"):
         assert words in page

@@ -88,17 +88,10 @@ def test_pairs_are_the_same_from_their_file(clips, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"format": "else"}, "format is 'else'; expected 'manip_il pairs'"),
-        ({"version": 9}, "version is 9; this program reads 1"),
-        ({"pairs": [[[0, 0, 0], [0, 0, 0]]]}, "pair 0 is twice the clip"),
-        ({"pairs": [[[2, 0, 0], [0, 0, 0]]]}, "pair 0: source is 2; expected a whole number from 0 to 1"),
-        ({"pairs": [[[0, 99, 0], [0, 0, 0]]]}, "pair 0: episode is 99"),
-        ({"pairs": [[[0, 0, "0"], [0, 0, 0]]]}, "pair 0: first is '0'"),
-        ({"pairs": [[[0, 0, 0]]]}, "expected two of"),
-        ({"pairs": 3}, "pairs is 3; expected a list"),
-        ({"sources": []}, "sources are empty"),
-        ({"clip": 0}, "clip is 0"),
-        ({"task": "../x"}, "task is '../x'"),
+        ({"format": "else"}, "format is 'else', version 1; expected 'manip_il pairs', version 1"),
+        ({"version": 9}, "version 9; expected"),
+        ({"pairs": [[[0, 0, 0]]]}, "holds no manip_il pairs"),
+        ({"sources": 3}, "holds no manip_il pairs"),
     ],
 )
 def test_a_file_that_holds_no_pairs_is_refused_in_one_line(change, says, clips, tmp_path):
@@ -108,12 +101,6 @@ def test_a_file_that_holds_no_pairs_is_refused_in_one_line(change, says, clips, 
         Pairs.read(path)
     assert says in str(refused.value)
     assert str(path) in str(refused.value)
-
-
-def test_a_clip_beyond_the_end_of_its_episode_is_refused(clips):
-    tree = clips.pairs.to_json() | {"pairs": [[[0, 0, 25], [0, 0, 0]]]}
-    with pytest.raises(ManipError, match=r"pair 0: .*good has no 10 frames from frame 25 of episode 0"):
-        _ = Clips(Pairs.from_json(tree), clips.frames).rows
 
 
 def test_a_dataset_that_was_changed_since_is_refused(clips):

@@ -18,8 +18,7 @@ from lerobot.rewards.sarm.rabc import RABCWeights
 from manip_il.errors import ManipError
 from manip_il.learn.weights import rabc_weights
 from manip_il.preferences.frames import Frames, read_frames
-from manip_il.preferences.score_report import score_report
-from manip_il.preferences.scores import Scores, episode_scores, roc_auc, write_weights
+from manip_il.preferences.scores import Scores, episode_scores, roc_auc, score_report, write_weights
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,7 @@ def scored(datasets) -> Scores:
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in (good, bad)]) for name in columns}
     data = Frames(good.spec, episodes=np.concatenate([good.episodes, bad.episodes + 8]), **joined)
     noise = np.random.default_rng(0).normal(size=len(data.states)) * 0.02
-    return Scores("both", "a test", data.spec, data, np.clip(joined["progress"] + noise, 0, 1))
+    return Scores("both", "a test", data, np.clip(joined["progress"] + noise, 0, 1))
 
 
 def test_the_area_under_the_curve_is_the_share_of_pairs_in_order():
@@ -47,7 +46,7 @@ def test_the_area_does_not_change_with_the_scale_of_the_scores(rows):
 
 
 def test_an_episode_is_scored_by_its_last_second(scored):
-    data, fps = scored.data, scored.spec.fps
+    data, fps = scored.data, scored.data.spec.fps
     rows = data.rows(3)
     assert episode_scores(scored.frames, data)[3] == pytest.approx(scored.frames[rows][-fps:].mean())
 

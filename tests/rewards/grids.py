@@ -8,6 +8,7 @@ import numpy as np
 
 from manip_il.rewards.demonstrations import Demonstration
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
+from manip_il.rewards.soft import SoftPlan
 
 
 def grid(rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int = 2, step: float = 1.0) -> PathProblem:
@@ -37,6 +38,27 @@ def acyclic(rng: np.random.Generator, nodes: int = 7, features: int = 3, share: 
     """A random graph without circles: edges lead to higher numbers, one chain through all; the last is the goal."""
     pairs = [(i, j) for i in range(nodes) for j in range(i + 1, nodes) if j == i + 1 or rng.random() < share]
     return PathProblem(np.array(pairs), rng.random((len(pairs), features)), nodes, nodes - 1)
+
+
+def all_paths(problem: PathProblem, start: int) -> list[np.ndarray]:
+    """Every path (n,) from a start to the goal of a problem without circles."""
+    found, unfinished = [], [[start]]
+    while unfinished:
+        path = unfinished.pop()
+        if path[-1] == problem.goal:
+            found.append(np.array(path, np.int64))
+        else:
+            unfinished += [[*path, int(to)] for to in problem.edges[problem.edges[:, 0] == path[-1], 1]]
+    return found
+
+
+def draw(planned: SoftPlan, start: int, rng: np.random.Generator) -> np.ndarray:
+    """Nodes (n,) of a path drawn from the distribution."""
+    problem, path = planned.problem, [start]
+    while path[-1] != problem.goal:
+        edges = np.flatnonzero(problem.edges[:, 0] == path[-1])
+        path.append(int(problem.edges[rng.choice(edges, p=planned.chances[edges]), 1]))
+    return np.array(path)
 
 
 def demonstrations(count: int, weights: np.ndarray, seed: int = 0, **kwargs) -> list[Demonstration]:

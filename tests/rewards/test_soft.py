@@ -5,21 +5,19 @@ import pytest
 from scipy.special import logsumexp
 
 from manip_il.errors import ManipError
-from manip_il.rewards.calibration import all_paths
-from manip_il.rewards.paths import PathProblem, costs_to_go
-from manip_il.rewards.soft import log_likelihood, soft_plan
-from tests.rewards.grids import acyclic, grid
+from manip_il.rewards.paths import PathProblem, plan
+from manip_il.rewards.soft import soft_plan
+from tests.rewards.grids import acyclic, all_paths, draw, grid
 
 WEIGHTS = np.array([1.0, 0.3, 2.0])
 
 
-def test_values_likelihoods_and_features_are_sums_over_all_paths():
+def test_values_and_features_are_sums_over_all_paths():
     problem = acyclic(np.random.default_rng(0))
     paths, planned = all_paths(problem, 0), soft_plan(problem, WEIGHTS)
     costs = np.array([problem.sums(path) @ WEIGHTS for path in paths])
     chances = np.exp(-costs) / np.exp(-costs).sum()
     assert planned.values[0] == pytest.approx(-logsumexp(-costs))
-    assert [log_likelihood(planned, WEIGHTS, path) for path in paths] == pytest.approx(np.log(chances))
     assert planned.features(0) == pytest.approx(chances @ [problem.sums(path) for path in paths])
 
 
@@ -47,13 +45,13 @@ def test_who_leaves_a_node_takes_one_of_its_edges_and_arrives_once():
 def test_drawn_paths_have_the_expected_features():
     problem, rng = grid(np.random.default_rng(3)), np.random.default_rng(0)
     planned = soft_plan(problem, 3 * WEIGHTS)
-    drawn = np.array([problem.sums(planned.draw(0, rng)) for _ in range(2_000)])
+    drawn = np.array([problem.sums(draw(planned, 0, rng)) for _ in range(2_000)])
     assert drawn.mean(axis=0) == pytest.approx(planned.features(0), abs=4 * drawn.std(axis=0).max() / np.sqrt(2_000))
 
 
 def test_large_weights_leave_the_cheapest_path():
     problem = grid(np.random.default_rng(4))
-    assert soft_plan(problem, 1e3 * WEIGHTS).values / 1e3 == pytest.approx(costs_to_go(problem, WEIGHTS), abs=0.01)
+    assert soft_plan(problem, 1e3 * WEIGHTS).values / 1e3 == pytest.approx(plan(problem, WEIGHTS).costs, abs=0.01)
 
 
 def test_a_sum_over_all_paths_that_is_infinite_is_said():

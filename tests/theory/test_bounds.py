@@ -1,25 +1,68 @@
 """The theorems hold for every policy, and what grows with the horizon grows as they say."""
 
+import itertools
+
 import numpy as np
 import pytest
 
-from manip_il.theory.bounds import clone, cloning_loss, constructed, curves, dagger, dagger_loss
-from manip_il.theory.problems import PROBLEMS, RIGHT, WRONG, expert_visits, recoverability, wrong_costs
+from manip_il.theory.bounds import Curve, Loss, clone, constructed, curves, dagger, losses_of
+from manip_il.theory.processes import PROCESSES, RIGHT, WRONG, Process
 
 FEW = (10, 40, 160)
 
 
-@pytest.fixture(params=PROBLEMS, ids=lambda problem: problem.name.replace(" ", "_"))
-def problem(request):
+@pytest.fixture(params=PROCESSES, ids=lambda process: process.name.replace(" ", "_"))
+def process(request) -> Process:
     """Each process in turn."""
     return request.param
 
 
+def small(seed: int = 0) -> Process:
+    """A process of three states, whose actions lead evenly to some of them."""
+    rng = np.random.default_rng(seed)
+    leads = rng.random((2, 3, 3)) < 0.6
+    leads[..., 0] = True
+    rewards = rng.random((2, 3))
+    rewards[WRONG] *= rewards[RIGHT]
+    return Process("small", "", leads / leads.sum(axis=2, keepdims=True), rewards, np.array([0.5, 0.2, 0.3]), (0, 0))
+
+
+def returns(process: Process, policy: np.ndarray) -> float:
+    """The expected sum of rewards of a policy (H, S), over all its paths."""
+    horizon, total = len(policy), 0.0
+    for states in itertools.product(range(process.states), repeat=horizon):
+        for actions in itertools.product((RIGHT, WRONG), repeat=horizon):
+            chance, reward = process.start[states[0]], 0.0
+            for t, (state, action) in enumerate(zip(states, actions, strict=True)):
+                chance *= policy[t, state] if action == WRONG else 1 - policy[t, state]
+                reward += process.rewards[action, state]
+                chance *= process.moves[action, state, states[t + 1]] if t + 1 < horizon else 1.0
+            total += chance * reward
+    return total
+
+
+def test_the_gap_is_the_difference_of_returns_over_all_paths():
+    one, rng = small(), np.random.default_rng(1)
+    policies = rng.random((3, 4, one.states))
+    expert = returns(one, np.zeros((4, one.states)))
+    gaps = [loss.gap for loss in losses_of(one, "DAgger", policies)]
+    assert gaps == pytest.approx([expert - returns(one, policy) for policy in policies])
+    assert one.visits(policies).sum(axis=2) == pytest.approx(np.ones((3, 4)))
+
+
+def test_trajectories_are_where_the_policy_is_and_the_same_seed_draws_the_same(process):
+    policy = np.full((2, 6, process.states), 0.3)
+    seen = [process.seen(policy, 4_000, [np.random.default_rng(5)]) for _ in range(2)]
+    assert (seen[0] == seen[1]).all()
+    assert (seen[0][0] == seen[0][1]).all()  # one generator's policies meet the same chances
+    assert (seen[0] == (process.visits(policy) > 1e-12)).mean() > 0.999
+
+
 @pytest.mark.slow
-def test_slopes_are_the_theorems_and_nothing_is_above_its_bound(problem):
-    found = {(curve.learner, curve.fit): curve for curve in curves(problem, FEW, 12)}
+def test_slopes_are_the_theorems_and_nothing_is_above_its_bound(process):
+    found = {(curve.learner, curve.fit): curve for curve in curves(process, FEW, 12)}
     assert sum(curve.above for curve in found.values()) == 0
-    for learner, slope in zip(("cloning", "DAgger"), problem.slopes, strict=True):
+    for learner, slope in zip(("cloning", "DAgger"), process.slopes, strict=True):
         assert found[learner, "worst"].slope == pytest.approx(slope, abs=0.2)
         assert found[learner, "constructed"].slope == pytest.approx(slope, abs=0.06)
         low, high = found[learner, "worst"].interval
@@ -27,49 +70,43 @@ def test_slopes_are_the_theorems_and_nothing_is_above_its_bound(problem):
         assert high - low < 0.4
 
 
-def test_any_policy_keeps_to_both_bounds(problem):
+def test_any_policy_keeps_to_both_bounds(process):
     rng = np.random.default_rng(0)
     for horizon in (3, 12):
-        for _ in range(20):
-            wrong = rng.random((horizon, problem.mdp.states)) ** rng.integers(1, 20)
-            policy = np.stack([1 - wrong, wrong], axis=2)
-            policy[wrong_costs(problem, horizon) <= 0] = [1.0, 0.0]
-            assert not cloning_loss(problem, policy).above
-            assert not dagger_loss(problem, policy).above
-
-
-def test_a_policy_that_errs_with_a_probability_loses_what_dynamic_programming_says(problem):
-    horizon, error = 8, 0.01
-    policy = constructed(problem, horizon, error, off_data=False)
-    visits = problem.mdp.visits(policy)
-    loss = dagger_loss(problem, policy)
-    by_hand = (visits * policy[..., WRONG] * wrong_costs(problem, horizon)).sum()
-    assert loss.gap == pytest.approx(by_hand)  # the performance difference lemma
-    assert loss.error == pytest.approx((visits * policy[..., WRONG]).sum() / horizon)
+        wrong = rng.random((20, horizon, process.states)) ** rng.integers(1, 20, (20, 1, 1))
+        policies = np.where(process.wrong_costs(horizon) <= 0, 0.0, wrong)
+        for learner in ("cloning", "DAgger"):
+            assert not any(loss.above for loss in losses_of(process, learner, policies))
 
 
 def test_u_is_what_one_wrong_step_costs():
-    walk, rope, chain = PROBLEMS
-    assert [recoverability(one, 50) for one in (walk, rope, chain)] == pytest.approx([2, 50, 1])
+    assert [one.recoverability(50) for one in PROCESSES] == pytest.approx([2, 50, 1])
 
 
-def test_a_clone_does_as_the_expert_where_it_has_data_and_the_worst_elsewhere(problem):
+def test_a_clone_does_as_the_expert_where_it_has_data_and_errs_as_often_as_said_elsewhere(process):
     horizon = 6
-    seen = np.random.default_rng(0).random((horizon, problem.mdp.states)) < 0.5
-    costly = wrong_costs(problem, horizon) > 0
-    worst, even = (clone(problem, seen, fit) for fit in ("worst", "even"))
-    assert (worst[seen, RIGHT] == 1).all()
-    assert (worst[~seen & costly, WRONG] == 1).all()
-    assert (even[~seen & costly, WRONG] == 0.5).all()
-    assert (worst[~costly, RIGHT] == 1).all()
+    seen = np.random.default_rng(0).random((horizon, process.states)) < 0.5
+    costly = process.wrong_costs(horizon) > 0
+    for ties in (1.0, 0.5):
+        assert (clone(process, seen, ties) == np.where(costly & ~seen, ties, 0.0)).all()
+    assert (constructed(process, horizon, 0.01, off_data=False) == np.where(costly, 0.01, 0.0)).all()
 
 
 def test_all_data_leave_no_error_and_dagger_finds_what_the_expert_never_shows():
-    walk, horizon = PROBLEMS[0], 12
-    everywhere = np.ones((horizon, walk.mdp.states), np.bool_)
-    assert cloning_loss(walk, clone(walk, everywhere, "worst")).gap == 0
-    shown = expert_visits(walk, horizon) > 0
-    shown[:, :20] = False  # a fifth of the places is not in the demonstrations
-    before = dagger_loss(walk, clone(walk, shown, "worst"))
-    after = dagger_loss(walk, dagger(walk, shown, "worst", 300, np.random.default_rng(0)))
+    walk, horizon = PROCESSES[0], 12
+    everywhere = np.ones((1, horizon, walk.states), np.bool_)
+    assert losses_of(walk, "cloning", clone(walk, everywhere, 1.0))[0].gap == 0
+    shown = walk.expert_visits(horizon)[None] > 0
+    shown[..., :20] = False  # a fifth of the places is not in the demonstrations
+    [before] = losses_of(walk, "DAgger", clone(walk, shown, 1.0))
+    [after] = losses_of(walk, "DAgger", dagger(walk, shown, 1.0, 300, [np.random.default_rng(0)]))
     assert after.gap < 0.05 * before.gap
+
+
+def test_a_horizon_at_which_no_policy_errs_has_no_ratio():
+    none, some = Loss(0.0, 0.0, 0.0), Loss(0.1, 0.2, 1.0)
+    curve = Curve("walk", "cloning", "worst", (10, 20), ((none, none), (none, some)))
+    assert np.isnan([curve.ratios[0], curve.slope, *curve.interval]).all()
+    known = Curve("walk", "cloning", "worst", (10, 20), ((none, some), (some, some)))
+    assert known.slope == pytest.approx(0.0, abs=1e-9)
+    assert known.interval == pytest.approx((0.0, 0.0), abs=1e-9)
