@@ -16,6 +16,10 @@ from manip_il.option import option
 REMOTES = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
 
 
+def _require_source(path: Path) -> None:
+    require_folder(path, "the folder of a dataset, a run or a policy")
+
+
 @dataclass
 class PushOptions:
     """Push a dataset, or a policy with its run, to the Hugging Face Hub, an object store, another machine or a folder.
@@ -26,15 +30,11 @@ class PushOptions:
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
-    source: Path = option(MISSING, "folder of a dataset, a run or a policy", positional=True)
+    source: Path = option(MISSING, "folder of a dataset, a run or a policy", positional=True, check=_require_source)
     remote: str = option(MISSING, REMOTES, positional=True)
     dry_run: bool = option(False, "only list what would be uploaded and removed")
     journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
     private: bool = option(False, "make a new repository on the Hub private")
-
-    def check(self) -> None:
-        """Refuse a missing folder."""
-        require_folder(self.source, "the folder of a dataset, a run or a policy")
 
     def run(self) -> None:
         """Examine, list, upload, switch over; print what was done."""

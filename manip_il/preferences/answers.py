@@ -79,7 +79,7 @@ class Preferences:
 
         Raises `ManipError` naming the file for what its answers cannot be, or of other pairs.
         """
-        data = checks.read_json(path, "answers of manip-il preferences ask or answer", _LARGEST)
+        data = checks.read_json(path, "answers of manip-il reward ask or answer", _LARGEST)
         try:
             found = cls.from_json(data)
         except ManipError as error:

@@ -1,4 +1,4 @@
-"""The page of `manip-il preferences fit`."""
+"""The page of `manip-il reward fit`."""
 
 from __future__ import annotations
 

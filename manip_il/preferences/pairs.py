@@ -135,7 +135,7 @@ class Pairs:
     @classmethod
     def read(cls, path: Path) -> Pairs:
         """Return the pairs in a file. Raises `ManipError` naming it for what they cannot be."""
-        data = checks.read_json(path, "pairs of manip-il preferences pairs", _LARGEST)
+        data = checks.read_json(path, "pairs of manip-il reward pairs", _LARGEST)
         try:
             return cls.from_json(data)
         except ManipError as error:

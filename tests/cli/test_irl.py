@@ -1,11 +1,11 @@
-"""`manip-il irl`: bad input is one line; the reward it writes is one that the task takes."""
+"""`manip-il reward irl`: bad input is one line; the reward it writes is one that the task takes."""
 
 import json
 from pathlib import Path
 
 import pytest
-
 from manip_il.cli.irl import METHODS, IrlOptions
+
 from manip_il.cli.main import main
 from manip_il.rewards import methods
 from manip_il.tasks.reward import FEATURES, Reward
@@ -38,7 +38,7 @@ def test_a_reward_is_learnt_from_demonstrations_and_taken_by_the_task(tmp_path, 
     shown, folder = tmp_path / "carry", tmp_path / "irl"
     words = ["--robot.type=panda", "--task.type=carry", "--dataset.num_episodes=3", f"--dataset.root={shown}"]
     assert main(["record", *words, "--dataset.repo_id=a/carry", "--workers=1"]) == 0
-    assert main(["irl", str(shown), "--method=max_margin", f"--output_dir={folder}"]) == 0
+    assert main(["reward", "irl", str(shown), "--method=max_margin", f"--output_dir={folder}"]) == 0
     out, err = capsys.readouterr()
     found = json.loads((folder / "reward.json").read_text())
     assert (found["method"], found["demonstrations"]) == ("max_margin", 3)

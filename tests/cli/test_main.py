@@ -10,18 +10,22 @@ import pytest
 from manip_il.cli.main import COMMANDS, Command, main
 from manip_il.robots import ROBOTS
 
+from . import fake_command
+
 HERE = Path(__file__).parent
 PREPARE = f"""
 import sys
 sys.path.insert(0, {str(HERE)!r})
 from manip_il.cli.main import COMMANDS, Command, main
+import fake_command
+sys.modules["manip_il.cli.fake_command"] = fake_command
 COMMANDS["fake"] = Command("fake_command:FakeOptions", "do what the tests ask")
 """
 
 
 @pytest.fixture(autouse=True)
 def fake(monkeypatch):
-    monkeypatch.syspath_prepend(str(HERE))
+    monkeypatch.setitem(sys.modules, "manip_il.cli.fake_command", fake_command)
     monkeypatch.setitem(COMMANDS, "fake", Command("fake_command:FakeOptions", "do what the tests ask"))
 
 
@@ -64,7 +68,7 @@ def test_the_module_runs_as_a_program():
             ["fake", "--dataset.num_episode=1"],
             2,
             "manip-il: error: unknown option '--dataset.num_episode' (did you mean '--dataset.num_episodes'?); "
-            "manip-il fake --help lists all",
+            "manip-il fake --help=all lists all",
         ),
         (
             ["--seed=1", "record"],

@@ -7,13 +7,14 @@ import re
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from manip_il.cli.common_options import TaskGroup
+from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
 from manip_il.cli.main import main
-from manip_il.cli.outputs import read_jsonl
+from manip_il.cli.outputs import ResumableOutput, read_jsonl
 from manip_il.cli.study import ROUND_0, expert_trials, same_start, share_start
 from manip_il.cli.study_file import read_plan
 from manip_il.data.dataset import joined_columns
@@ -68,7 +69,7 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
     def run(options: DaggerOptions) -> None:
         asked.append(options)
         successes = (0.2, 0.4, 0.6) if options.method == "dagger" else (0.2, 0.2, 0.4)
-        make_run(options.output_dir, policy, options.seed, successes)
+        make_run(options.output.output_dir, policy, options.settings["seed"], successes)
 
     monkeypatch.setattr(DaggerOptions, "run", run)
     monkeypatch.setattr("manip_il.cli.study.share_start", lambda options, others: False)  # made runs begin whole
@@ -76,16 +77,18 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
 
 
 def study(*words: str) -> int:
-    return main(["study", "x.yaml", "--output_dir=s", "--workers=1", *words])
+    return main(["compare", "x.yaml", "--output_dir=s", "--workers=1", *words])
 
 
 def test_every_arm_runs_with_every_training_seed_and_its_own_options(here, runs):
     assert study() == 0
     expected = [(seed, method) for seed in range(2) for method in ("cloning", "dagger")]
-    assert [(options.seed, options.method) for options in runs] == expected
-    assert [str(options.output_dir) for options in runs] == [f"s/{method}/seed_{seed}" for seed, method in expected]
-    assert all(options.env.horizon == 8 and options.policy == {"width": 16} for options in runs)
-    assert all(options.resume and options.workers == 1 for options in runs)
+    assert [(options.settings["seed"], options.method) for options in runs] == expected
+    assert [str(options.output.output_dir) for options in runs] == [
+        f"s/{method}/seed_{seed}" for seed, method in expected
+    ]
+    assert all(options.env["horizon"] == 8 and options.fit["policy"] == {"width": 16} for options in runs)
+    assert all(options.output.resume and options.engine.workers == 1 for options in runs)
 
 
 def test_the_answer_is_printed_and_written(here, runs, capsys):
@@ -113,10 +116,10 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     for path in (here / "s" / "dagger" / "seed_1").iterdir():
         path.rename(here / path.name)
     assert study("--resume=true") == 0
-    assert [str(options.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
+    assert [str(options.output.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
     assert len(evaluated) == 4  # its policies came out the same
     assert study("--resume=true", "--training_seeds=3") == 0
-    assert [str(options.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
+    assert [str(options.output.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 
@@ -224,7 +227,7 @@ def test_the_expert_is_tested_where_a_test_changes_something(here):
 @pytest.mark.slow
 def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys, error):
     (tmp_path / "x.yaml").write_text(TINY)
-    words = ["study", str(tmp_path / "x.yaml"), "--workers=1"]
+    words = ["compare", str(tmp_path / "x.yaml"), "--workers=1"]
     process = start(*words, f"--output_dir={tmp_path / 'cut'}", log=tmp_path / "log")
     while not (tmp_path / "cut" / "dagger" / "seed_0" / "metrics.jsonl").is_file():
         assert process.is_alive(), "it ended before it was killed"
@@ -261,16 +264,24 @@ def answer(folder: Path):
 @pytest.fixture
 def options(tmp_path: Path) -> DaggerOptions:
     return DaggerOptions(
-        task=TaskGroup("reach"),
-        demonstrations=2,
-        rounds=1,
-        episodes_per_round=2,
-        policy={"width": 16},
-        steps=20,
-        validation_episodes=2,
-        output_dir=tmp_path / "first",
-        workers=1,
+        env={"task": "reach"},
+        settings={"demonstrations": 2, "rounds": 1, "episodes_per_round": 2, "validation_episodes": 2},
+        fit={"policy": {"width": 16}, "steps": 20},
+        engine=EngineOptions(workers=1),
+        output=ResumableOutput(tmp_path / "first"),
     )
+
+
+def changed(options: DaggerOptions, **changes: Any) -> DaggerOptions:
+    """These options with others, by the names of the dataclass or of what was given."""
+    own = {name: value for name, value in changes.items() if name == "method"}
+    fit = {name: value for name, value in changes.items() if name in ("steps", "policy")}
+    settings = {name: value for name, value in changes.items() if name not in (*own, *fit)}
+    return replace(options, **own, settings=options.settings | settings, fit=options.fit | fit)
+
+
+def at(options: DaggerOptions, folder: Path, *, resume: bool = False) -> DaggerOptions:
+    return replace(options, output=ResumableOutput(folder, resume=resume))
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -279,32 +290,33 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 def test_what_differs_after_the_first_round_begins_alike_and_nothing_else(options):
     for changes in ({"method": "cloning"}, {"label": "takeover"}, {"refit": "warm"}, {"rounds": 9}):
-        assert same_start(options, replace(options, **changes)), changes
+        assert same_start(options, changed(options, **changes)), changes
     for changes in ({"seed": 1}, {"steps": 21}, {"policy": {}}, {"label_budget": 9}, {"ensemble": 2}):
-        assert not same_start(options, replace(options, **changes)), changes
+        assert not same_start(options, changed(options, **changes)), changes
 
 
 @pytest.mark.slow
 def test_a_shared_start_ends_with_the_same_bytes_and_is_charged_for_it(options, tmp_path):
     options.run()
-    arm = replace(options, method="cloning", output_dir=tmp_path / "shared")
-    alone = replace(arm, output_dir=tmp_path / "alone")
+    shared, single = tmp_path / "shared", tmp_path / "alone"
+    arm = at(changed(options, method="cloning"), shared)
+    alone = at(arm, single)
     alone.run()
-    assert share_start(arm, [replace(options, seed=3), options])
-    assert bytes_of(arm.output_dir / ROUND_0) == bytes_of(alone.output_dir / ROUND_0)
-    replace(arm, resume=True).run()
+    assert share_start(arm, [changed(options, seed=3), options])
+    assert bytes_of(shared / ROUND_0) == bytes_of(single / ROUND_0)
+    at(arm, shared, resume=True).run()
     for part in (ROUND_0, "round_001"):
-        assert bytes_of(arm.output_dir / part) == bytes_of(alone.output_dir / part)
-    rounds = [read_jsonl(run.output_dir / METRICS_FILE) for run in (options, arm)]
+        assert bytes_of(shared / part) == bytes_of(single / part)
+    rounds = [read_jsonl(run.output.output_dir / METRICS_FILE) for run in (options, arm)]
     assert rounds[0][0] == rounds[1][0]
     assert len(rounds[1]) == 2
-    assert set(joined_columns([arm.output_dir / "dataset"], ("actor",))["actor"].ravel()) == {0}
+    assert set(joined_columns([shared / "dataset"], ("actor",))["actor"].ravel()) == {0}
 
 
 def test_a_run_that_is_there_is_left_alone_and_so_is_one_without_a_twin(options, tmp_path):
-    assert not share_start(options, [replace(options, output_dir=tmp_path / "nowhere")])
-    assert not options.output_dir.exists()
-    options.output_dir.mkdir()
+    assert not share_start(options, [at(options, tmp_path / "nowhere")])
+    assert not options.output.output_dir.exists()
+    options.output.output_dir.mkdir()
     assert not share_start(options, [options])
 
 
@@ -318,4 +330,4 @@ def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_pa
         assert (plan.baseline is None) == (len({env.task for env in plan.envs.values()}) > 1)
         assert all(len(found) >= len(plan.experts) - 1 for found in expert_trials(plan).values())
         first = path.read_text().splitlines()[0]
-        assert first == f"# manip-il study configs/studies/{path.name} --output_dir=runs/{path.stem}"
+        assert first == f"# manip-il compare configs/studies/{path.name} --output_dir=runs/{path.stem}"

@@ -205,6 +205,6 @@ def test_calibration_counts_every_answer_once_by_the_likelier_clip():
 
 
 def test_the_page_says_what_was_held_out_and_by_whom_it_was_answered(fitted, clips, answers):
-    page = fit_report(fitted, clips, answers, ["Ada"], "manip-il preferences fit", {}, {}).render()
+    page = fit_report(fitted, clips, answers, ["Ada"], "manip-il reward fit", {}, {}).render()
     for words in ("Calibration", "by Ada", f"epoch {fitted.fit.epochs}", "agrees with true progress in"):
         assert words in page
