@@ -220,7 +220,7 @@ def _report(error: BaseException, words: list[str]) -> int:
 
 def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
     if isinstance(error, Interrupted):
-        return f"; kept: {error.kept}; continue with: {error.resume_command or resume_command(words)}"
+        return f"; kept: {error.kept}; continue with: {resume_command(words)}"
     try:
         name, rest = _split(words)
         options: Any = parse(load(name), rest)

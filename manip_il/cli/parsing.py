@@ -63,11 +63,14 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Mapping[str, Any]]]
     return _make(cls, _read_layers(layers, _known(cls)), _known(cls))
 
 
-def check_values(options: Any) -> None:
-    """Refuse values out of bounds, and what the options' own `check` refuses: paths that are not there, most of all."""
+def check_values(options: Any, prefix: str | None = None) -> None:
+    """Refuse values out of bounds, and what the options' own `check` refuses: paths that are not there, most of all.
+
+    prefix: of the names in messages, in place of two dashes.
+    """
     for one in options_of(type(options)):
         value = one.value(options)
-        check_bound(one.label, value, one.metadata)
+        check_bound(one.label if prefix is None else prefix + one.name, value, one.metadata)
         for item in value if one.is_list else [value]:
             if item is not None and "check" in one.metadata:
                 one.metadata["check"](item)

@@ -1,25 +1,19 @@
-"""A study of `manip-il compare`: the same runs for several arms and training seeds, tested and compared.
-
-Arms that differ only after round 0 share it: the same options and seed would give the same bytes.
-"""
+"""A study of `manip-il compare`: the same runs for several arms and training seeds, tested and compared."""
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manip_il.cli.arms import ROUND_0, ArmOptions, with_start_cost, with_start_policy
+from manip_il.cli.arms import ArmOptions, with_start_cost, with_start_policy
 from manip_il.cli.compare import CompareOptions, check_policies
-from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
-from manip_il.cli.options import command_line, options_of, to_plain
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, atomic_write, read_jsonl, save_options
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, atomic_write
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.study_file import ExpertTest, Plan, check_same_file, keep_file, read_plan
-from manip_il.data.atomic import new_folder
 from manip_il.errors import NoEffect
 from manip_il.seeding import stream_seeds
 
@@ -30,12 +24,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.study import Study
     from manip_il.evaluation.trial import Trial
     from manip_il.sim.config import EnvConfig
-
-# Options on which round 0 (demonstrations and the first fit) does not depend
-_AFTER_ROUND_0 = (
-    *("method", "rounds", "episodes_per_round", "disturbed_share", "beta", "label", "query", "branch_steps"),
-    *("refit", "refit_steps", "output_dir", "resume", "overwrite", "workers", "engine"),
-)
 
 
 def run_study(options: CompareOptions, file: Path) -> None:
@@ -88,16 +76,9 @@ class _Study:
             # the report is what a run writes last
             if not ((folder / REPORT_FILE).is_file() and run_finished(folder)):
                 say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
-                self._run(plan, name, seed)
+                self._options(plan, name, seed).run()
             member = self._member(plan, name, seed)
             member.select(plan.rule, plan.rule.limit({member.name: member.history}))
-
-    def _run(self, plan: Plan, name: str, seed: int) -> None:
-        options = self._options(plan, name, seed)
-        if isinstance(options, DaggerOptions):
-            others = [self._options(plan, other, seed) for other in plan.arms if other != name]
-            share_start(options, [one for one in others if isinstance(one, DaggerOptions)])
-        options.run()
 
     def _options(self, plan: Plan, name: str, seed: int) -> ArmOptions:
         own = with_start_policy(plan.arms[name], lambda arm: self._folder(arm, seed))
@@ -195,29 +176,3 @@ def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
         return Trial.of(env, seeds, test.suite)
     except NoEffect:
         return None
-
-
-def same_start(left: DaggerOptions, right: DaggerOptions) -> bool:
-    """Return whether two runs have the same round 0."""
-    options = [one for one in options_of(DaggerOptions) if one.name not in _AFTER_ROUND_0]
-    return all(one.value(left) == one.value(right) for one in options)
-
-
-def share_start(options: DaggerOptions, others: Iterable[DaggerOptions]) -> bool:
-    """Begin a run that is not there yet with round 0 of another that has the same; return whether there was one.
-
-    Its line of metrics comes along, so that the run is charged for what its round 0 took.
-    """
-    target = options.output.output_dir
-    if target.exists():
-        return False
-    for other in others:
-        source = other.output.output_dir
-        records = read_jsonl(source / METRICS_FILE)
-        if same_start(options, other) and records and (source / ROUND_0).is_dir():
-            with new_folder(target) as folder:
-                shutil.copytree(source / ROUND_0, folder / ROUND_0, symlinks=True)
-                atomic_write(folder / METRICS_FILE, json.dumps(records[0]) + "\n")
-                save_options(folder, options)
-            return True
-    return False

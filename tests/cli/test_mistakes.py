@@ -100,7 +100,7 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             "data from-mcap missing out --maping=m.yaml": "(did you mean '--mapping'?)",
             "data to-mcap": "DATASET is missing",
             "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: data build, ",
-            "data merge a --output=x": "a is the only one; expected two or more datasets",
+            "data merge SAMPLE --output=x": "is the only one; expected two or more datasets",
             "doctor x --repair": "'doctor' has a new name: manip-il data check, and manip-il data repair",
             "mcap export a b": "'mcap export' has a new name: manip-il data to-mcap",
             "score --help": "'score' has a new name: manip-il data score",

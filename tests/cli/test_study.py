@@ -5,22 +5,17 @@ from __future__ import annotations
 import json
 import re
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from manip_il.cli.common_options import EngineOptions
-from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
+from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import main
-from manip_il.cli.outputs import ResumableOutput, read_jsonl
-from manip_il.cli.study import ROUND_0, expert_trials, same_start, share_start
+from manip_il.cli.study import expert_trials
 from manip_il.cli.study_file import read_plan
-from manip_il.data.dataset import joined_columns
 from manip_il.errors import MismatchError
 
-from .made_runs import files, make_run
+from .made_runs import make_run
 
 FILE = """
 common:
@@ -72,7 +67,6 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
         make_run(options.output.output_dir, policy, options.settings["seed"], successes)
 
     monkeypatch.setattr(DaggerOptions, "run", run)
-    monkeypatch.setattr("manip_il.cli.study.share_start", lambda options, others: False)  # made runs begin whole
     return asked
 
 
@@ -259,65 +253,6 @@ def answer(folder: Path):
         return [strip(inner) for inner in value] if isinstance(value, list) else value
 
     return strip(data)
-
-
-@pytest.fixture
-def options(tmp_path: Path) -> DaggerOptions:
-    return DaggerOptions(
-        env={"task": "reach"},
-        settings={"demonstrations": 2, "rounds": 1, "episodes_per_round": 2, "validation_episodes": 2},
-        fit={"policy": {"width": 16}, "steps": 20},
-        engine=EngineOptions(workers=1),
-        output=ResumableOutput(tmp_path / "first"),
-    )
-
-
-def changed(options: DaggerOptions, **changes: Any) -> DaggerOptions:
-    """These options with others, by the names of the dataclass or of what was given."""
-    own = {name: value for name, value in changes.items() if name == "method"}
-    fit = {name: value for name, value in changes.items() if name in ("steps", "policy")}
-    settings = {name: value for name, value in changes.items() if name not in (*own, *fit)}
-    return replace(options, **own, settings=options.settings | settings, fit=options.fit | fit)
-
-
-def at(options: DaggerOptions, folder: Path, *, resume: bool = False) -> DaggerOptions:
-    return replace(options, output=ResumableOutput(folder, resume=resume))
-
-
-def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {name: data for name, data in files(folder).items() if name.endswith((".safetensors", ".parquet"))}
-
-
-def test_what_differs_after_the_first_round_begins_alike_and_nothing_else(options):
-    for changes in ({"method": "cloning"}, {"label": "takeover"}, {"refit": "warm"}, {"rounds": 9}):
-        assert same_start(options, changed(options, **changes)), changes
-    for changes in ({"seed": 1}, {"steps": 21}, {"policy": {}}, {"label_budget": 9}, {"ensemble": 2}):
-        assert not same_start(options, changed(options, **changes)), changes
-
-
-@pytest.mark.slow
-def test_a_shared_start_ends_with_the_same_bytes_and_is_charged_for_it(options, tmp_path):
-    options.run()
-    shared, single = tmp_path / "shared", tmp_path / "alone"
-    arm = at(changed(options, method="cloning"), shared)
-    alone = at(arm, single)
-    alone.run()
-    assert share_start(arm, [changed(options, seed=3), options])
-    assert bytes_of(shared / ROUND_0) == bytes_of(single / ROUND_0)
-    at(arm, shared, resume=True).run()
-    for part in (ROUND_0, "round_001"):
-        assert bytes_of(shared / part) == bytes_of(single / part)
-    rounds = [read_jsonl(run.output.output_dir / METRICS_FILE) for run in (options, arm)]
-    assert rounds[0][0] == rounds[1][0]
-    assert len(rounds[1]) == 2
-    assert set(joined_columns([shared / "dataset"], ("actor",))["actor"].ravel()) == {0}
-
-
-def test_a_run_that_is_there_is_left_alone_and_so_is_one_without_a_twin(options, tmp_path):
-    assert not share_start(options, [at(options, tmp_path / "nowhere")])
-    assert not options.output.output_dir.exists()
-    options.output.output_dir.mkdir()
-    assert not share_start(options, [options])
 
 
 def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_path):
