@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -159,7 +159,11 @@ def policy_help(words: Iterable[str]) -> str:
         return ""
     from manip_il.learn.lerobot_config import option_lines
 
-    rows = option_lines(kind)
-    width = max(len(left) for left, _ in rows) + 2
-    lines = "\n".join(f"  {left:{width}}[{right}]" for left, right in rows)
+    lines = table({left: f"[{right}]" for left, right in option_lines(kind)})
     return f"\n\noptions of {kind}:\n{lines}"
+
+
+def table(rows: Mapping[str, str]) -> str:
+    """Return lines of help: a name, and what it means."""
+    width = max(map(len, rows)) + 2
+    return "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows.items())

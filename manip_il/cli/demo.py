@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il import checks
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
 from manip_il.cli.dagger import DaggerOptions, learning_curve, round_timings, run_rounds
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, atomic_write
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.tables import PolicyRow
     from manip_il.evaluation.trial import Trial
 
-TIMINGS_FILE = "timings.json"
 RUN = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # in place of `manip-il dagger`'s own
 FIT = {"steps": 3_000, "batch_size": 256}
 _OF_RUN = (*RUN, "episodes_per_round", "disturbed_share", "seed")
@@ -67,15 +64,12 @@ class DemoOptions:
 
     def run(self) -> None:
         """Run what is not there yet, print the table, write the report."""
-        started = time.monotonic()
         config = self._dagger().config()
         with self.output.open(self) as folder:
             kept = f"every finished episode, round and evaluation, in {folder}"
             with Stages(kept) as stages, self.engine.open() as engine:
                 engine.warm_up(learned=True)
-                demo = _Demo(self, config, engine, stages)
-                demo.add_time("start", time.monotonic() - started)
-                demo.run()
+                _Demo(self, config, engine, stages).run()
 
     @property
     def seed(self) -> int:
@@ -111,8 +105,7 @@ class _Demo:
     def __init__(self, options: DemoOptions, config: RunConfig, engine: Engine, stages: Stages) -> None:
         self.options, self.config, self.engine, self.stages = options, config, engine, stages
         self.folder = options.output.output_dir
-        path = self.folder / TIMINGS_FILE
-        self.timings = read_timings(path) if path.is_file() else {}
+        self.timings: dict[str, float] = {}  # of the parts [s], in this run
 
     def run(self) -> None:
         """Run every part, then print the table and write the report."""
@@ -245,23 +238,9 @@ class _Demo:
 
     @contextmanager
     def _timed(self, part: str) -> Generator[None]:
-        """Add the time of a part, also where it is interrupted, to that of earlier runs."""
         started = time.monotonic()
-        try:
-            yield
-        finally:
-            self.add_time(part, time.monotonic() - started)
-
-    def add_time(self, part: str, seconds: float) -> None:
-        """Add the time of a part [s] and write the file."""
-        self.timings[part] = round(self.timings.get(part, 0.0) + seconds, 2)
-        atomic_write(self.folder / TIMINGS_FILE, json.dumps(self.timings, indent=1) + "\n")
-
-
-def read_timings(path: Path) -> dict[str, float]:
-    """Return the time of every part [s]."""
-    timings = checks.read_json(path, f"the {TIMINGS_FILE} of a demo")
-    return {name: checks.number(f"{path}: {name}", seconds, 0) for name, seconds in timings.items()}
+        yield
+        self.timings[part] = time.monotonic() - started
 
 
 def demo_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:

@@ -133,8 +133,8 @@ class EvalOptions:
         elif self.replay is not None:
             eval_files.replay(self.evaluation[0], self.replay, self.policy.path, self.video, trust=self.trust)
         elif self.evaluation:
+            merged = eval_files.merge(self.evaluation)
             with self.output.open(self) as folder:
-                merged = eval_files.merge(self.evaluation)
                 self._keep(merged, folder)
                 self._report(merged, folder)
         else:

@@ -13,13 +13,14 @@ import select
 import sys
 import threading
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from manip_il import __version__
 from manip_il.cli import progress
+from manip_il.cli.common_options import table
 from manip_il.cli.interrupt import Interrupted, resume_command
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import check_values, parse
@@ -128,21 +129,12 @@ def script() -> NoReturn:
 
     Nothing is lost by that: what every command writes outlives a kill.
     """
-    _reopen_streams()
     code = main()
     busy = any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
     if code == EXIT_INTERRUPTED and busy:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
-
-
-def _reopen_streams() -> None:
-    """Make /dev/null of the streams that the shell closed (`>&-`): else the next file opened would take their place."""
-    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
-        if getattr(sys, name) is None:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free, so this one
-            setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
 def load(name: str) -> type:
@@ -248,7 +240,7 @@ def _help() -> str:
     return (
         f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
         "Robot-arm imitation learning without teleoperation.\n\n"
-        f"commands:\n{_table(single | groups)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
+        f"commands:\n{table(single | groups)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
         f"example: {PROGRAM} demo --output_dir=runs/demo"
     )
@@ -256,12 +248,7 @@ def _help() -> str:
 
 def _group_help(group: str) -> str:
     rows = {name: COMMANDS[name].summary for name in _inside(group)}
-    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
-
-
-def _table(rows: Mapping[str, str]) -> str:
-    width = max(map(len, rows)) + 2
-    return "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows.items())
+    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{table(rows)}"
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
@@ -281,7 +268,7 @@ def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
     more = cls.more_help(words) if hasattr(cls, "more_help") else ""
     return (
         f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{inspect.getdoc(cls)}\n\n"
-        f"options:\n{_table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {cls.example}"
+        f"options:\n{table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {cls.example}"
     )
 
 

@@ -8,25 +8,21 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
-from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
 
 from manip_il import __version__
 from manip_il.checks import shorten
 from manip_il.cli.options import Option, choices, decode, expected, fields_of, options_of, to_plain, without_none
-from manip_il.errors import UsageError, did_you_mean, nearest
+from manip_il.errors import UsageError, did_you_mean, nearest, nearest_names
 from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
 _FEW = 3
-_NEAR = 0.65  # ratio of difflib from which on a name is offered
-_AS_NEAR = 0.1  # of the best one: others that are offered beside it
 _PATHS = (Path, list[Path])
-_LONGEST = 100  # [characters] of a name that is compared
 type Known = Mapping[str, Option]
 
 
@@ -259,23 +255,16 @@ def _unexpected_word(word: str, known: Known, command: str) -> UsageError:
     return UsageError(f"{text}; options are written --name=value, and {_help(command)} lists them")
 
 
-def nearest_options(name: str, known: Iterable[str]) -> list[str]:
+def nearest_options(name: str, known: Collection[str]) -> list[str]:
     """Return the options that a name may have meant, nearest first: `num_episodes` finds `dataset.num_episodes`."""
-    scores = {option: _likeness(name[:_LONGEST].replace("-", "_"), option) for option in known}
-    best = max(scores.values(), default=0.0)
-    near = [option for option, score in scores.items() if score >= max(_NEAR, best - _AS_NEAR)]
-    return sorted(near, key=lambda option: -scores[option])[:_FEW]
-
-
-def _likeness(name: str, option: str) -> float:
-    """Return the likeness of two dotted names, 0 to 2; 1 and more where their last words are equal."""
-    leaf, other = name.rpartition(".")[2], option.rpartition(".")[2]
-    whole = SequenceMatcher(None, name, option).ratio()
-    if leaf == other:
-        return 1 + whole
-    if len(leaf) >= 3 and (other.startswith(leaf) or leaf.startswith(f"{other}_")):
-        return max(0.8, whole)
-    return max(whole, 0.95 * SequenceMatcher(None, leaf, other).ratio())
+    by_leaf: dict[str, list[str]] = {}
+    for option in known:
+        by_leaf.setdefault(option.rpartition(".")[2], []).append(option)
+    name = name.replace("-", "_")
+    leaf = name.rpartition(".")[2]
+    leaves = [leaf] if leaf in by_leaf else nearest_names(leaf, by_leaf)
+    of_leaf = [option for one in leaves for option in by_leaf[one]]
+    return list(dict.fromkeys([*of_leaf, *nearest_names(name, known)]))[:_FEW]
 
 
 def _help(command: str) -> str:

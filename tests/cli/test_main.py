@@ -112,20 +112,6 @@ def test_a_reader_that_goes_away_is_no_error():
     process.stderr.close()
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
-def test_a_stream_that_the_shell_closed_is_no_error(closed, tmp_path):
-    code = PREPARE + (
-        "from manip_il.cli import main as program, progress\n"
-        "def work(words):\n"
-        "    with open('made', 'w') as file, progress.progress(1, 'work') as bar:\n"
-        "        bar.advance(); progress.warn('none'); progress.say('said'); file.write('done')\n"
-        "program._dispatch = work\n"
-        "program.script()\n"
-    )
-    done = subprocess.run(["sh", "-c", f'exec "$0" -c "$1" {closed}', sys.executable, code], cwd=tmp_path, check=False)
-    assert (done.returncode, (tmp_path / "made").read_text()) == (0, "done")
-
-
 @pytest.mark.parametrize("command", ["record", "eval"])
 def test_help_says_every_kind_of_robot_and_the_stock_tasks(command, capsys):
     assert main([command, "--help"]) == 0

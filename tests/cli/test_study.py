@@ -160,7 +160,7 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
         ("dagger:\n", "dagger: 3\n", "arms.dagger: expected a mapping"),
         ("  dagger:", "  ../dagger:", "named '../dagger', which becomes a folder"),
         ("  dagger:", "  evaluations:", "and not evaluations"),
-        ("target: 0.6", "target: 60", "target is 60.0; expected a share"),
+        ("target: 0.6", "target: 60", "target is 60.0; expected 0.0 to 1.0"),
         ("target: 0.6", "baseline: clonning", "did you mean 'cloning'?"),
         ("at: labels", "at: label", "did you mean 'labels'?"),
         ("training_seeds: 2", "training_seeds: 0", "training_seeds is 0"),
