@@ -27,6 +27,7 @@ class Defaults(NamedTuple):
     save_freq: int
 
 
+ActionSpace = Literal["joint_target", "joint_delta", "ee_delta"]
 LEROBOT = Defaults(100_000, 8, 20_000)
 DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}  # where they are not LeRobot's
 
@@ -64,7 +65,7 @@ class FitConfig:
         "an option of the policy by its name: type (mlp, cnn or one of LeRobot's), path of a policy to start from, or "
         "one that --policy.type=TYPE --help lists",
     )
-    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option(
+    action_space: ActionSpace | None = option(
         None, "what is learnt, out of the same dataset; by default joint_delta by mlp and cnn, else joint_target"
     )
     observation: Literal["state", "images", "both"] | None = option(

@@ -22,7 +22,7 @@ SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 @pytest.mark.parametrize(
     ("words", "says", "code"),
     [
-        ("", "--dataset.root names no dataset", 2),
+        ("", "--dataset.root is missing", 2),
         ("--dataset.root=nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
         (f"--dataset.root={SAMPLE} --init=nowhere", "no policy in nowhere", 2),
         (f"--dataset.root={SAMPLE} --steps=0", "steps is 0; expected at least 1", 2),
@@ -32,7 +32,7 @@ SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
     ],
 )
 def test_bad_input_is_one_line(name, words, says, code, here, error):
-    assert main([name, *words.split(), "--quiet"]) == code
+    assert main(["rl", name, *words.split(), "--quiet"]) == code
     assert says in error()
     assert not any(here.glob("runs/*/checkpoints"))
 

@@ -67,7 +67,7 @@ def test_a_policy_brings_its_robot_and_task(policy, tmp_path, capsys):
 
 def test_another_robots_policy_is_refused_before_the_first_step(policy, tmp_path, error, monkeypatch):
     monkeypatch.setattr(ManipEnv, "advance", None)
-    words = [*WORDS[:1], "--robot.type=panda", f"--policy.path={policy}", f"--output_dir={tmp_path / 'c'}"]
+    words = [*WORDS[:2], "--robot.type=panda", f"--policy.path={policy}", f"--output_dir={tmp_path / 'c'}"]
     assert main(words) == 1
     assert "robot differs: the policy has fetch" in error()
     assert not (tmp_path / "c").exists()

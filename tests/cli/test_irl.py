@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-from manip_il.cli.irl import METHODS, IrlOptions
 
 from manip_il.cli.main import main
+from manip_il.cli.reward import METHODS, IrlOptions
 from manip_il.rewards import methods
 from manip_il.tasks.reward import FEATURES, Reward
 
@@ -21,10 +21,10 @@ def test_the_methods_of_the_command_are_those_there_are():
 @pytest.mark.parametrize(
     ("line", "says", "code"),
     [
-        ("irl nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
-        (f"irl {SAMPLE} --method=max_entrpy", "unknown method 'max_entrpy' (did you mean 'max_entropy'?)", 2),
-        (f"irl {SAMPLE} --seed=-1", "seed is -1", 2),
-        (f"irl {SAMPLE}", "lacks vase.x, vase.y, vase.z, laptop.x and", 1),
+        ("reward irl nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        (f"reward irl {SAMPLE} --method=max_entrpy", "unknown method 'max_entrpy' (did you mean 'max_entropy'?)", 2),
+        (f"reward irl {SAMPLE} --seed=-1", "seed is -1", 2),
+        (f"reward irl {SAMPLE}", "lacks vase.x, vase.y, vase.z, laptop.x and", 1),
     ],
 )
 def test_bad_input_is_one_line(line, says, code, here, error):
