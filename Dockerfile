@@ -74,6 +74,6 @@ ENV PATH=/opt/manip-il/bin:$PATH \
 USER 1000:1000
 # An interrupted command says what it has kept and how to go on.
 STOPSIGNAL SIGINT
-HEALTHCHECK --interval=10m --timeout=2m CMD ["manip-il", "health"]
+HEALTHCHECK --interval=10m --timeout=2m CMD ["manip-il", "eval", "--check"]
 ENTRYPOINT ["manip-il"]
 CMD ["--help"]

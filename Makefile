@@ -34,8 +34,8 @@ setup: .venv/.installed  ## the environment, in .venv; as root also OpenGL and F
 	$(UV) pip install --quiet --python $(BIN)/python --no-deps --require-hashes -r robots.lock
 	touch $@
 
-demo: setup  ## the whole story, small: runs/quickstart/report.html
-	$(BIN)/manip-il quickstart --output_dir=runs/quickstart $(DEMO)
+demo: setup  ## the whole story, small: runs/demo/report.html
+	$(BIN)/manip-il demo --output_dir=runs/demo $(DEMO)
 
 demo-eyes: setup  ## a policy from pictures, from nothing, in half an hour: runs/eyes/test/report.html
 	$(BIN)/manip-il dagger --config_path=configs/panda_dagger.yaml --output_dir=runs/eyes_state

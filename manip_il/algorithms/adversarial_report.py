@@ -1,4 +1,4 @@
-"""The page of `manip-il gail`, `airl` and `ppo`."""
+"""The page of `manip-il rl gail`, `airl` and `ppo`."""
 
 from __future__ import annotations
 

@@ -144,10 +144,12 @@ class RunConfig:
     env: EnvConfig = field(default_factory=EnvConfig)
     method: str = "dagger"
     demonstrations: int = option(50, "successful expert episodes to begin with (round 0)")
-    rounds: int = option(5, "DAgger rounds after round 0")
+    rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more", grows=True)
     episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones")
     label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")
-    beta: BetaSchedule = _LEARNER_ALONE
+    beta: BetaSchedule = option(
+        lambda: _LEARNER_ALONE, "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B"
+    )
     label: Literal["per_state", "takeover", "branch"] = option(
         "per_state",
         "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
@@ -170,7 +172,7 @@ class RunConfig:
         0, "scenes drawn anew from round 0's states for a policy on pictures, and as many a state in later rounds"
     )
     conditions: tuple[Condition, ...] = ()
-    seed: int = 0
+    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
     datasets: tuple[Path, ...] = ()
     start: Path | None = None
 

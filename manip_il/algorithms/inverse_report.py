@@ -1,4 +1,4 @@
-"""The page and the file of `manip-il irl`."""
+"""The page and the file of `manip-il reward irl`."""
 
 from __future__ import annotations
 

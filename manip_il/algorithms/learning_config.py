@@ -45,7 +45,7 @@ class LearningConfig:
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     validation_every: int = option(20_000, "steps from one validation to the next")
     validation_episodes: int = option(200, "episodes of a validation, by which the best policy is chosen")
-    seed: int = 0
+    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
 
     def __post_init__(self) -> None:
         from manip_il.seeding import stream_base  # here, as help needs no numpy

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
-from manip_il.cli.adversarial import AdversarialOptions, AirlOptions, DatasetGroup, GailOptions
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.learning import LearningOptions
+from manip_il.cli.learning import AirlOptions, GailOptions, GivenGroup, PpoOptions
 from manip_il.cli.parsing import from_layers
-from manip_il.cli.ppo import PpoOptions
 from manip_il.errors import MismatchError, UnknownName, UsageError
 
 if TYPE_CHECKING:
@@ -21,8 +19,9 @@ if TYPE_CHECKING:
 
 ROUND_0 = "round_000"
 ALGORITHM = "algorithm"  # the key of an arm that names one of these
-ALGORITHMS: Mapping[str, type[LearningOptions]] = {one.name: one for one in (GailOptions, AirlOptions, PpoOptions)}
+LearningOptions = GailOptions | PpoOptions  # an AirlOptions is a GailOptions
 ArmOptions = DaggerOptions | LearningOptions
+ALGORITHMS: Mapping[str, type[LearningOptions]] = {"gail": GailOptions, "airl": AirlOptions, "ppo": PpoOptions}
 
 
 def read_arm(common: tuple[str, Mapping[str, Any]], own: tuple[str, Mapping[str, Any]]) -> ArmOptions:
@@ -46,7 +45,8 @@ def first_arm(options: ArmOptions, arms: Mapping[str, ArmOptions]) -> str | None
     """
     if isinstance(options, DaggerOptions):
         return None
-    named = [str(path) for path in (*options.roots, options.init) if path is not None]
+    roots = options.dataset.root if isinstance(options, GailOptions) else []
+    named = [str(path) for path in (*roots, options.init) if path is not None]
     known = [name for name, other in arms.items() if isinstance(other, DaggerOptions)]
     if len(set(named)) != 1 or named[0] not in known:
         raise UsageError(
@@ -73,9 +73,9 @@ def with_start_policy(options: ArmOptions, folder_of: Callable[[str], Path]) -> 
         return options
     if options.init is not None:
         options = replace(options, init=folder_of(str(options.init)) / ROUND_0 / "policy")
-    if isinstance(options, AdversarialOptions):
-        roots = [folder_of(str(root)) / ROUND_0 / "dataset" for root in options.roots]
-        options = replace(options, dataset=DatasetGroup(roots))
+    if isinstance(options, GailOptions):
+        roots = [folder_of(str(root)) / ROUND_0 / "dataset" for root in options.dataset.root]
+        options = replace(options, dataset=GivenGroup(roots))
     return options
 
 

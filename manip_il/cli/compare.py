@@ -1,4 +1,4 @@
-"""`manip-il compare`: two policies or runs on the same seeds, and the confidence in their difference."""
+"""`manip-il compare`: two policies or runs on the same seeds and the confidence in their difference, or a study."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.dagger import FREE
 from manip_il.cli.inputs import check_policy
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE, open_output, require_output
+from manip_il.cli.options import Given, command_line, group, to_plain
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.policy_folder import require_source
@@ -29,53 +28,82 @@ AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; seconds "
     "of collecting and fitting), or an amount, as in labels:5000"
 )
+_YAML = (".yaml", ".yml")
+
+
+@dataclass
+class TrialGroup:
+    """`--eval.*` of policies that are compared."""
+
+    n_episodes: int = option(500, "test episodes, the same for both sides", at_least=1)
+
+
+def _require_side(path: Path) -> None:
+    if path.suffix not in _YAML:
+        require_source(path)
+    elif not path.is_file():
+        raise UsageError(f"{path} does not exist; expected the YAML of a study, such as configs/studies/*.yaml")
 
 
 @dataclass
 class CompareOptions:
-    """Compare two policies, runs, or folders of several training seeds, on the same test seeds.
+    """Compare two policies, runs, or folders of several training seeds, on the same test seeds; or run a whole study.
 
     Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with such things named seed_0, seed_1
     and so on. Two eval.json are compared as they are; all else is evaluated first. Writes compare.json and report.html.
+
+    One YAML in place of two sides is a study: every arm is run with several training seeds, all are tested on the same
+    unseen seeds, and compared. It holds `common` and `arms` (options of manip-il dagger), training_seeds, eval,
+    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json, table.md and
+    report.html the results.
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
-    left: Path = option(MISSING, "one side", positional=True)
-    right: Path = option(MISSING, "the other side", positional=True)
+    first: ClassVar[tuple[str, ...]] = ("at", "eval.n_episodes", "suite", "output_dir", "resume", "training_seeds")
+    sides: list[Path] = option(
+        MISSING, "two sides, or the YAML of a study", positional=True, check=_require_side, free=True
+    )
     checkpoint: Literal["best", "last"] = option("best", "of a run: best on validation, or the last round")
     at: str = option("end", AT_HELP)
-    eval: common.TrialGroup = field(default_factory=common.TrialGroup)
-    suite: str = option("nominal", common.SUITE_HELP)
-    robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
-    task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
-    env: common.EnvGroup = field(default_factory=common.EnvGroup)
-    seed: int = option(0, "shifts the stream of test seeds, 0 to 1000")
-    engine: Literal["local", "ray"] = common.engine_option()
-    workers: int | None = common.workers_option()
+    eval: TrialGroup = field(default_factory=TrialGroup)
+    suite: str = common.suite_option()
+    env: Given = common.env_given(of_policy=True)
+    seed: int = option(0, "shifts the stream of test seeds, 0 to 1000", at_least=0, at_most=1000)
+    training_seeds: int | None = option(
+        None, "of a study, in place of the file's; a resumed one may have more", at_least=1, free=True
+    )
+    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
     trust: bool = common.trust_option()
-    output_dir: Path = option(Path("runs/compare"), "folder of compare.json")
-    resume: bool = option(False, "continue an interrupted comparison")
-    overwrite: bool = option(False, "replace an existing comparison")
+    output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        for side in (self.left, self.right):
-            require_source(side)
-        from manip_il.evaluation.rounds import Rule  # here, as what is above needs no statistics
-        from manip_il.evaluation.suites import require_suite
+        from manip_il.evaluation.rounds import Rule  # here, as help needs no statistics
 
+        self.output.check()
+        if self._is_study:
+            return
+        if len(self.sides) != 2 or any(side.suffix in _YAML for side in self.sides):
+            raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML of one study")
+        left, right = self.sides
         Rule.parse(self.checkpoint, self.at)
-        if self.eval.n_episodes < 1:
-            raise UsageError(f"--eval.n_episodes is {self.eval.n_episodes}; expected at least 1")
-        if self.left.resolve() == self.right.resolve():
-            raise UsageError(f"{self.left} is compared with itself; give two different ones")
-        common.require_workers(self.workers)
-        require_suite(self.suite)
-        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+        if left.resolve() == right.resolve():
+            raise UsageError(f"{left} is compared with itself; give two different ones")
+
+    @property
+    def _is_study(self) -> bool:
+        return len(self.sides) == 1 and self.sides[0].suffix in _YAML
 
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
-        from manip_il.collect.workers import Engine
+        if self._is_study:
+            from manip_il.cli.study import run_study
+
+            run_study(self, self.sides[0])
+        else:
+            self._compare(*self.sides)
+
+    def _compare(self, left: Path, right: Path) -> None:
         from manip_il.evaluation.arm import read_arm, require_pair
         from manip_il.evaluation.compare_report import compare_report, comparison_table
         from manip_il.evaluation.comparison import FILE_NAME, Comparison, seeds_facts
@@ -84,7 +112,7 @@ class CompareOptions:
         from manip_il.evaluation.tables import print_table
 
         rule = Rule.parse(self.checkpoint, self.at)
-        both = [read_arm(self.left), read_arm(self.right)]
+        both = [read_arm(left), read_arm(right)]
         require_pair(*both)
         members = [member for arm in both for member in arm.members]
         warn(
@@ -93,9 +121,9 @@ class CompareOptions:
         limit = rule.limit({member.name: member.history for member in members})
         arms = [arm.map(lambda member: member.select(rule, limit)) for arm in both]
         trial = self._trial([member for arm in arms for member in arm.members])
-        with open_output(self, FREE) as folder:
+        with self.output.open(self) as folder:
             kept = f"every finished evaluation, in {folder}"
-            with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+            with Stages(kept) as stages, self.engine.open() as engine:
                 last = (trial, folder, engine, stages)
                 arms = [arm.map(lambda one: one.measure(*last)) for arm in arms]
             comparison = Comparison(*arms)
@@ -129,24 +157,24 @@ class CompareOptions:
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
         trial = Trial.of(common_env(members, self._policy_env), seeds, self.suite, policies.values(), self.trust)
-        check_policies(policies, trial, self.output_dir, self.engine)
+        check_policies(policies, trial, self.output.output_dir, self.engine.engine)
         return trial
 
     def _policy_env(self, policy: Path) -> EnvConfig:
         from manip_il.learn.checkpoint import Checkpoint
 
-        origin = Checkpoint.open(policy).origin
-        return self.env.config(self.robot.type, self.task.type, origin, self.task.object, self.task.reward)
+        return common.env_config(self.env, Checkpoint.open(policy).origin)
 
     def _next(self, comparison: Comparison) -> str:
         loser: Arm = comparison.left if comparison.difference > 0 else comparison.right
         if any(member.policy is None for arm in comparison.arms for member in arm.members):
-            return "manip-il study --help  (does it hold for other training seeds?)"
+            return "manip-il compare STUDY.yaml  (does it hold for other training seeds?)"
+        folder = self.output.output_dir
         if self.suite == "nominal":
-            output_dir = Path(f"{self.output_dir}_disturbed")
-            return command_line("compare", replace(self, suite="disturbed", output_dir=output_dir))
-        folder = f"--output_dir={self.output_dir}_films"
-        return shlex.join(["manip-il", "eval", f"--policy.path={loser.members[0].policy}", "--eval.films=3", folder])
+            output = replace(self.output, output_dir=Path(f"{folder}_disturbed"))
+            return command_line("compare", replace(self, suite="disturbed", output=output))
+        words = [f"--policy.path={loser.members[0].policy}", "--eval.films=3", f"--output_dir={folder}_films"]
+        return shlex.join(["manip-il", "eval", *words])
 
 
 def check_policies(policies: dict[str, Path], trial: Trial, folder: Path, engine: str) -> None:

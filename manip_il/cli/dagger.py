@@ -4,30 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from manip_il import checks
-from manip_il.algorithms.config import ALGORITHMS, BetaSchedule, Method, RunConfig, Sampling, check_labels
+from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, Sampling, check_labels
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_given, require_dataset, round_policy
-from manip_il.cli.options import Open, command_line, to_plain
-from manip_il.cli.outputs import (
-    CONFIG_FILE,
-    REPORT_FILE,
-    append_jsonl,
-    atomic_write,
-    open_output,
-    read_jsonl,
-    require_output,
-)
+from manip_il.cli.options import Given, command_line, given, group, to_plain
+from manip_il.cli.outputs import CONFIG_FILE, REPORT_FILE, ResumableOutput, append_jsonl, atomic_write, read_jsonl
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say, say_policy
 from manip_il.errors import ManipError
-from manip_il.learn.fit_config import DEFAULTS, FitConfig, check_weights
-from manip_il.option import option, option_of
+from manip_il.learn.fit_config import FitConfig, check_weights
+from manip_il.option import option
 from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
@@ -37,21 +29,20 @@ if TYPE_CHECKING:
     from manip_il.sim.config import CameraConfig
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
-FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ when a run is resumed
-
-_OWN_STEPS = ", ".join(f"{numbers.steps:,} for {kind}" for kind, numbers in DEFAULTS.items())
-_STEPS_HELP = f"gradient steps per round; by default {_OWN_STEPS}, else 20,000"
+_OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
 
 
 @dataclass
 class GivenGroup:
     """`--dataset.*` of what a run begins with."""
 
-    root: list[Path] = option(list, "recorded demonstrations to begin with, in place of recording round 0's")
+    root: list[Path] = option(
+        list, "recorded demonstrations to begin with, in place of recording round 0's", check=require_dataset
+    )
 
 
 @dataclass
-class DaggerOptions(common.EnvOptions):
+class DaggerOptions:
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
     Round 0 is behaviour cloning on the expert's own demonstrations, or on those in --dataset.root. With --policy.path
@@ -61,69 +52,44 @@ class DaggerOptions(common.EnvOptions):
     """
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
+    first: ClassVar[tuple[str, ...]] = (
+        *("robot.type", "task.type", "demonstrations", "rounds", "episodes_per_round", "policy", "output_dir"),
+        "resume",
+    )
+    env: Given = common.env_given()
     method: Method = option(
         "dagger", f"who drives after round 0: {', '.join(one.driver for one in ALGORITHMS.values())}"
     )
     dataset: GivenGroup = field(default_factory=GivenGroup)
-    demonstrations: int = option_of(RunConfig, "demonstrations")
-    rounds: int = option_of(RunConfig, "rounds", help_text="DAgger rounds after round 0; a resumed run may have more")
-    episodes_per_round: int = option_of(RunConfig, "episodes_per_round")
-    label_budget: int | None = option_of(RunConfig, "label_budget")
-    disturbed_share: float = option_of(RunConfig, "disturbed_share")
-    beta: str = option("constant:0", "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B")
-    label: Literal["per_state", "takeover", "branch"] = option_of(RunConfig, "label")
+    settings: Given = given(RunConfig, prefix="")
     query: str | None = option(
         None,
         "when it is queried: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; "
         "by default every, for takeover one, for branch probability:1/STEPS",
     )
-    branch_steps: int | None = option_of(RunConfig, "branch_steps")
-    ensemble: int = option_of(RunConfig, "ensemble")
     sampling: Sampling = field(default_factory=Sampling)
-    policy: Open = option_of(FitConfig, "policy")
-    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
-    observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
-    cameras: list[str] = option(list, "any of front, side, wrist, for a policy on images; by default all for cnn")
-    image: common.SmallImageGroup = field(default_factory=common.SmallImageGroup)
-    redraw: int = option_of(RunConfig, "redraw")
-    vary: list[str] = option(list, common.VARY_HELP)
-    refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
-    steps: int | None = option(None, _STEPS_HELP)
-    refit_steps: int | None = option_of(RunConfig, "refit_steps")
-    batch_size: int | None = option_of(FitConfig, "batch_size")
-    lr: float | None = option_of(FitConfig, "lr")
-    optimizer: Open = option_of(FitConfig, "optimizer")
-    scheduler: Open = option_of(FitConfig, "scheduler")
-    validation_episodes: int = option_of(RunConfig, "validation_episodes")
-    hold: int = option_of(RunConfig, "hold")
-    patience: int = option_of(RunConfig, "patience")
-    seed: int = common.seed_option()
-    engine: Literal["local", "ray"] = common.engine_option()
-    workers: int | None = common.workers_option()
+    fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
+    cameras: list[str] = option(list, f"{common.CAMERAS_HELP}, for a policy on images; by default all for cnn")
+    image: Given = common.image_given(small=True)
+    vary: list[str] = common.vary_option()
+    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
     trust: bool = common.trust_option()
-    output_dir: Path = option(Path("runs/dagger"), "folder of the run")
-    resume: bool = option(False, "continue an interrupted run")
-    overwrite: bool = option(False, "replace an existing run")
+    output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        common.require_workers(self.workers)
-        common.require_pictures(self.robot.type, self.cameras)
-        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+        common.require_pictures(self.env, self.cameras)
+        self.output.check()
         if self.dataset.root:
             check_weights(self.dataset.root, ())
-        for root in self.dataset.root:
-            require_dataset(root)
         self._config()
 
     def run(self) -> None:
         """Run, or go on with, all rounds."""
         config = self.config()
-        with open_output(self, FREE, may_grow="rounds") as folder:
-            from manip_il.collect.workers import Engine
-
+        with self.output.open(self) as folder:
             kept = f"every finished episode and round, in {folder}"
-            with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+            with Stages(kept) as stages, self.engine.open() as engine:
                 engine.warm_up(learned=True)
                 results = run_rounds(config, folder, engine, stages)
             _report(self, config, results).write(folder / REPORT_FILE)
@@ -150,34 +116,34 @@ class DaggerOptions(common.EnvOptions):
         from manip_il.collect.query import parse_query  # which imports numpy
         from manip_il.evaluation.suites import varied
 
-        policy, start = round_policy(self.policy)
+        policy, start = round_policy(self.fit.get("policy", {}))
         observation, cameras = self._pictures(start)
-        same = ("action_space", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
-        env = self.env_config()
-        made = {
-            "env": env,
-            "conditions": varied(self.vary, env, sees=cameras is not None),
-            "fit": FitConfig(policy=policy, observation=observation, **{name: getattr(self, name) for name in same}),
-            "cameras": cameras,
-            "datasets": tuple(self.dataset.root),
-            "start": start,
-            "beta": BetaSchedule.parse(self.beta),
-            "query_rule": None if self.query is None else parse_query(self.query),
-        }
-        own = {one.name: getattr(self, one.name) for one in fields(RunConfig) if one.name not in made}
-        return RunConfig(**made, **own)
+        env = common.env_config(self.env)
+        of_fit: Given = {"policy": policy, "observation": observation, "trust": self.trust}
+        return RunConfig(
+            env=env,
+            method=self.method,
+            conditions=varied(self.vary, env, sees=cameras is not None),
+            fit=FitConfig(**self.fit | of_fit),
+            sampling=self.sampling,
+            cameras=cameras,
+            datasets=tuple(self.dataset.root),
+            start=start,
+            query_rule=None if self.query is None else parse_query(self.query),
+            **self.settings,
+        )
 
     def _pictures(self, start: Path | None) -> tuple[str | None, CameraConfig | None]:
         """Return observation and cameras: those given, else those of the policy to begin with."""
-        sees = self.policy.get("type") == "cnn" and self.observation != "state"
-        cameras = self.image.config(self.cameras or CAMERAS if sees else self.cameras)
+        observation = self.fit.get("observation")
+        sees = self.fit.get("policy", {}).get("type") == "cnn" and observation != "state"
+        cameras = common.camera_config(self.cameras or CAMERAS if sees else self.cameras, self.image, small=True)
         if start is None:
-            return self.observation, cameras
+            return observation, cameras
         from manip_il.learn.checkpoint import Checkpoint
         from manip_il.learn.policy_files import policy_cameras
 
-        observation = self.observation or Checkpoint.open(start).observation
-        return observation, cameras or policy_cameras(start)
+        return observation or Checkpoint.open(start).observation, cameras or policy_cameras(start)
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
@@ -225,14 +191,14 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
     return run_report(
         rows,
-        curves=[learning_curve(options.output_dir, kind)],
+        curves=[learning_curve(options.output.output_dir, kind)],
         title=f"{kind} on {config.env.robot} {config.env.task}",
         verdict=best_verdict(names, results),
         command=command_line("dagger", options),
         facts=tuple(facts),
         config=to_plain(options),
         fingerprint=best.validation.fingerprint,
-        timings=round_timings(options.output_dir),
+        timings=round_timings(options.output.output_dir),
     )
 
 

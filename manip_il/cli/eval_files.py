@@ -1,111 +1,85 @@
-"""`manip-il replay`: one episode of an evaluation again; `manip-il merge`: evaluations of several files as one."""
+"""What `manip-il eval` does with evaluations that are there: run one episode again, or merge several."""
 
 from __future__ import annotations
 
-from dataclasses import MISSING, dataclass, field, replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any
 
-from manip_il.cli import common_options as common
-from manip_il.cli.inputs import check_policy, find_policy, require_eval
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_new
+from manip_il.cli.inputs import open_driver
+from manip_il.cli.outputs import atomic_write
 from manip_il.cli.progress import say, warn
+from manip_il.collect.environments import env_fingerprint
+from manip_il.collect.job import RolloutJob
+from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UsageError
-from manip_il.option import option
-
-if TYPE_CHECKING:
-    from manip_il.collect.job import RolloutJob
-    from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.evaluation.film import Shot, run_states
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.results import EpisodeResult, EvalResult, merge_results
+from manip_il.evaluation.runner import episode_result, replay_differences
+from manip_il.learn.policy_files import policy_sha256
 
 NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing is loaded
 
 
-@dataclass
-class PolicyPathGroup:
-    """`--policy.*` of what is replayed."""
+def replay(file: Path, seed: int, policy: Path | None, video: Path | None, *, trust: bool) -> None:
+    """Run one episode of an evaluation again: the same policy, seed and conditions. Prints what was drawn.
 
-    path: Path | None = option(None, "its current path; by default the one in eval.json")
-
-
-@dataclass
-class ReplayOptions:
-    """Run one episode of an evaluation again, alone: the same policy, seed and conditions.
-
-    Prints the drawn conditions and the outcome, films the episode, and exits with 1 if the outcome is not that of
-    eval.json.
+    policy: its current path, by default the one in the evaluation. video: an MP4 to write. Raises `ManipError` if the
+    outcome is not that of the evaluation, `UsageError` for a seed or a policy that is not there.
     """
+    result = EvalResult.read(file)
+    by_seed = {episode.seed: episode for episode in result.episodes}
+    if seed not in by_seed:
+        raise UsageError(f"--replay is {seed}; {file} has the seeds {min(by_seed)} to {max(by_seed)}")
+    before, job = by_seed[seed], _job(result, file, policy, trust)
+    episode = run_states(job, seed)
+    say(_text(before))
+    if video is not None:
+        atomic_write(video, Shot.of(job, episode).film().mp4)
+        say(f"video: {video}")
+    if differences := replay_differences(before, episode_result(job, episode)):
+        raise ManipError(
+            f"the episode of seed {seed} differs from {file}: {'; '.join(differences)}; across "
+            "machines and versions success rates can be compared, single episodes cannot"
+        )
+    say(f"the same as in {file}")
 
-    example: ClassVar[str] = "manip-il replay runs/eval/eval.json --episode 17 --video out.mp4"
-    file: Path = option(MISSING, "an eval.json, or its folder", positional=True)
-    episode: int = option(MISSING, "which of its episodes, the first one is 0")
-    video: Path | None = option(None, "an MP4 to write")
-    policy: PolicyPathGroup = field(default_factory=PolicyPathGroup)
-    trust: bool = common.trust_option()
 
-    def check(self) -> None:
-        """Refuse what the paths show to be wrong."""
-        require_eval(self.file)
-        if self.policy.path is not None:
-            find_policy(self.policy.path)
+def merge(files: Sequence[Path]) -> EvalResult:
+    """Return the parts of an evaluation as one; warns if they were made with different versions or models."""
+    parts = {str(path): EvalResult.read(path) for path in files}
+    merged = merge_results(parts)
+    (first, one), *others = parts.items()
+    for name, other in others:
+        warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
+    return merged
 
-    def run(self) -> None:
-        """Run the episode, print what was drawn, film it, compare the outcome."""
-        from manip_il.evaluation.film import Shot, run_states
-        from manip_il.evaluation.results import EvalResult
-        from manip_il.evaluation.runner import episode_result, replay_differences
 
-        result = EvalResult.read(self.file)
-        if not 0 <= self.episode < len(result.episodes):
-            raise UsageError(f"--episode is {self.episode}; {self.file} has episodes 0 to {len(result.episodes) - 1}")
-        before = result.episodes[self.episode]
-        job = self._job(result)
-        episode = run_states(job, before.seed)
-        say(_text(before))
-        if self.video is not None:
-            atomic_write(self.video, Shot.of(job, episode).film().mp4)
-            say(f"video: {self.video}")
-        if differences := replay_differences(before, episode_result(job, episode)):
-            raise ManipError(
-                f"episode {self.episode} differs from {self.file}: {'; '.join(differences)}; across "
-                "machines and versions success rates can be compared, single episodes cannot"
-            )
-        say(f"the same as in {self.file}")
+def _job(result: EvalResult, file: Path, policy: Path | None, trust: bool) -> RolloutJob:
+    """Return the rollouts of the evaluation; warn if policy or program have changed since."""
+    settings = result.settings
+    env = settings.env(result.robot, result.task)
+    is_policy = result.policy not in NO_FILES or bool(result.policy_sha256) or policy is not None
+    path = _find(result, file, policy) if is_policy else None
+    _, driver, cameras = open_driver(path, result.policy, env, trust=trust, quiet=True)
+    if path is not None and result.policy_sha256 not in ("", policy_sha256(path)):
+        warn(f"{path} is not the policy of {file}: its files differ")
+    here = env_fingerprint(env, cameras)
+    warn(*compare_fingerprints(str(file), dict(result.fingerprint), "this machine", here))
+    return RolloutJob(env, driver, settings.hold, label="last", conditions=settings.conditions)
 
-    def _job(self, result: EvalResult) -> RolloutJob:
-        """Return the rollouts of the evaluation; warn if policy or program have changed since."""
-        from manip_il.collect.drivers import PolicyDriver, driver_of
-        from manip_il.collect.environments import env_fingerprint
-        from manip_il.collect.job import RolloutJob
-        from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.learn.checkpoint import Checkpoint
-        from manip_il.learn.policy_files import policy_sha256
 
-        env = result.settings.env(result.robot, result.task)
-        conditions, hold = result.settings.conditions, result.settings.hold
-        job = RolloutJob(env, hold=hold, label="last", conditions=conditions)
-        if result.policy in NO_FILES and not result.policy_sha256 and self.policy.path is None:
-            cameras, job = None, replace(job, driver=driver_of(result.policy))
-        else:
-            path = self._find(result)
-            cameras = check_policy(Checkpoint.open(path), env, trust=self.trust)
-            if result.policy_sha256 not in ("", policy_sha256(path)):
-                warn(f"{path} is not the policy of {self.file}: its files differ")
-            job = replace(job, driver=PolicyDriver((path,), trust=self.trust))
-        here = env_fingerprint(env, cameras)
-        warn(*compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))
-        return job
-
-    def _find(self, result: EvalResult) -> Path:
-        if self.policy.path is not None:
-            return find_policy(self.policy.path)
-        try:
-            return find_policy(Path(result.policy))
-        except UsageError:
-            raise UsageError(
-                f"{self.file} is of {result.policy}, which is not here (paths are relative to where eval ran); "
-                "give --policy.path=DIR"
-            ) from None
+def _find(result: EvalResult, file: Path, policy: Path | None) -> Path:
+    try:
+        return find_policy(policy or Path(result.policy))
+    except UsageError:
+        if policy is not None:
+            raise
+        raise UsageError(
+            f"{file} is of {result.policy}, which is not here (paths are relative to where eval ran); "
+            "give --policy.path=DIR"
+        ) from None
 
 
 def _text(result: EpisodeResult) -> str:
@@ -123,55 +97,3 @@ def _short(value: Any) -> str:
     if isinstance(value, dict):
         return "; ".join(f"{name} {_short(one)}" for name, one in value.items())
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-@dataclass
-class MergeOptions:
-    """Merge evaluations of one policy on different seeds, for example from several containers, into one eval.json.
-
-    Refused if policy, robot, task or settings differ, or if a seed was run twice.
-    """
-
-    example: ClassVar[str] = "manip-il merge out/0 out/1 out/2 --output_dir=out/all"
-    files: list[Path] = option(MISSING, "two or more eval.json, or their folders", positional=True)
-    output_dir: Path = option(Path("runs/merged"), "folder of the merged eval.json")
-    overwrite: bool = option(False, "replace an existing merged evaluation")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        if len(self.files) < 2:
-            raise UsageError(f"{self.files[0]} is the only one; expected two or more evaluations to merge")
-        for path in self.files:
-            if self.files.count(path) > 1:
-                raise UsageError(f"{path} is given twice; expected every evaluation once")
-            require_eval(path)
-        require_new(self.output_dir, overwrite=self.overwrite)
-
-    def run(self) -> None:
-        """Read all, merge, write, print the table."""
-        from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.evaluation.eval_report import eval_report
-        from manip_il.evaluation.results import FILE_NAME, EvalResult, merge_results
-
-        parts = {str(path): EvalResult.read(path) for path in self.files}
-        merged = merge_results(parts)
-        (first, one), *others = parts.items()
-        for name, other in others:
-            warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
-        with open_output(self):
-            merged.write(self.output_dir / FILE_NAME)
-            report = eval_report(merged, command_line("merge", self), to_plain(self))
-            report.write(self.output_dir / REPORT_FILE)
-        say_result(merged)
-        say(f"result: {self.output_dir / FILE_NAME}")
-        say(f"report: {self.output_dir / REPORT_FILE}")
-
-
-def say_result(result: EvalResult) -> None:
-    """Print an evaluation's table, and the phases that failures ended in."""
-    from manip_il.evaluation.tables import evaluation_table, print_table
-
-    print_table(evaluation_table(result))
-    if result.failures:
-        phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
-        say(f"failures by the phase that they ended in: {phases}")

@@ -7,10 +7,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from manip_il.cli.inputs import find_policy
 from manip_il.cli.outputs import atomic_write, require_short_path
 from manip_il.cli.progress import say, warn
 from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
 EXPORTABLE = ("mlp", "cnn")
@@ -27,7 +27,12 @@ class ExportOptions:
     """
 
     example: ClassVar[str] = "manip-il export runs/dagger --format=onnx --output=policy.onnx"
-    policy: Path = option(MISSING, "a run, a checkpoint or a pretrained_model folder", positional=True)
+    policy: Path = option(
+        MISSING,
+        "a run, a checkpoint or a pretrained_model folder",
+        positional=True,
+        check=lambda path: find_policy(path),
+    )
     format: Literal["onnx", "torchscript"] = option("onnx", "for onnxruntime and others, or for torch alone")
     output: Path | None = option(None, "the file; by default policy.onnx or policy.pt")
     overwrite: bool = option(False, "replace an existing file")

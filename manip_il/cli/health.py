@@ -1,4 +1,4 @@
-"""`manip-il health`: whether this machine or container can evaluate, in one line."""
+"""`manip-il eval --check`: whether this machine or container can evaluate, in one line."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ import multiprocessing
 import os
 import tempfile
 import time
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
-from manip_il.cli.progress import say
 from manip_il.errors import ManipError, RenderError
 from manip_il.sim.gl import PACKAGES
 
@@ -26,24 +24,18 @@ _BACKENDS = ("egl", "osmesa", "glfw")  # the last one needs a display
 _FEWEST_COLOURS = 16  # in a picture of a scene; the emptiest ones hold hundreds
 
 
-@dataclass
-class HealthOptions:
-    """Draw one frame of the default scene, and check what else an evaluation needs.
+def healthy() -> str:
+    """Return renderer, PyTorch and cores in one line. Raises `ManipError` for what an evaluation would miss here.
 
-    Prints renderer, PyTorch and cores. If something is missing, says what and exits with 1.
+    Draws a frame of the default scene, and checks the most frequent fault first.
     """
+    check_backend(os.environ.get("MUJOCO_GL"))
+    check_temporary_folder()
+    check_shared_memory()
+    drawing = _draw()
+    from manip_il.collect.workers import default_workers
 
-    example: ClassVar[str] = "manip-il health"
-
-    def run(self) -> None:
-        """Check everything, the most frequent fault first."""
-        check_backend(os.environ.get("MUJOCO_GL"))
-        check_temporary_folder()
-        check_shared_memory()
-        drawing = _draw()
-        from manip_il.collect.workers import default_workers
-
-        say(f"healthy: {drawing}; {describe_torch()}; cores {default_workers()}")
+    return f"{drawing}; {describe_torch()}; cores {default_workers()}"
 
 
 def check_backend(backend: str | None) -> None:

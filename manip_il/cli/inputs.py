@@ -7,17 +7,22 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from manip_il.cli.options import Open
-from manip_il.cli.progress import warn
+from manip_il.cli.common_options import env_config
+from manip_il.cli.options import Given, Open
+from manip_il.cli.progress import say, warn
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.policy_folder import find_policy, hub_hint
 
 if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.algorithms.config import RunConfig
+    from manip_il.collect.drivers import Driver
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.checkpoint import Checkpoint
+    from manip_il.learn.reward import LearnedReward
     from manip_il.mdp import Observation
     from manip_il.sim.config import CameraConfig, EnvConfig
+
+_NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
 
 def require_dataset(root: Path) -> None:
@@ -31,16 +36,23 @@ def require_dataset(root: Path) -> None:
 
 def require_eval(path: Path) -> None:
     """Raise `UsageError` unless `path` is a file, an `eval.json`, or a folder that holds one."""
+    meant = f" of manip-il eval; a policy to measure is given as --policy.path={path}"
     if not path.exists():
-        raise UsageError(f"{path} does not exist; expected an eval.json of manip-il eval, or its folder")
+        raise UsageError(f"{path} does not exist; expected an eval.json{meant}")
     if path.is_dir() and not (path / "eval.json").is_file():
-        raise UsageError(f"{path} holds no eval.json; expected the folder of a finished manip-il eval")
+        raise UsageError(f"{path} holds no eval.json{meant}")
 
 
 def require_folder(path: Path, what: str) -> None:
     """Raise `UsageError` unless there is such a folder. what: its expected content."""
     if not path.is_dir():
         raise UsageError(f"{path} {'is not a folder' if path.exists() else 'does not exist'}; expected {what}")
+
+
+def require_file(path: Path, what: str) -> None:
+    """Raise `UsageError` unless there is such a file. what: its expected content."""
+    if not path.is_file():
+        raise UsageError(f"{path} {'is no file' if path.exists() else 'does not exist'}; expected {what}")
 
 
 def _inside(root: Path) -> str:
@@ -98,7 +110,7 @@ def check_given(config: RunConfig) -> None:
                 f"a policy to it by manip-il train --dataset.root={root}, and begin with that: --policy.path=RUN"
             )
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
-        check_dataset(root, given.spec, given.fingerprint)
+        warn(*dataset_differences(str(root), given.spec, given.fingerprint))
     if config.start is None:
         return
     checkpoint = Checkpoint.open(config.start)
@@ -110,11 +122,11 @@ def check_given(config: RunConfig) -> None:
             raise MismatchError(f"cameras' {what}", str(config.start), theirs, "this run", ours)
 
 
-def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:
-    """Warn where a dataset was made by other versions or another model than this machine has.
+def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> list[str]:
+    """Return in what a dataset was made by other versions or another model than this machine has, a line each.
 
-    Raises `MismatchError` where its numbers mean something else. A dataset of a user's own arm or task, whose name
-    alone it holds, is not compared.
+    name: of the dataset. Raises `MismatchError` if its numbers mean something else. A dataset of a user's own arm or
+    task, whose name alone it holds, is not compared.
     """
     from manip_il.collect.environments import env_fingerprint, env_spec, is_known
     from manip_il.data.fingerprint import compare_fingerprints
@@ -122,13 +134,51 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     from manip_il.sim.env import EnvConfig
 
     if not is_known(spec.robot, spec.task):
-        return
+        return []
     env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
-    check_same_spec(str(root), spec, "this program", env_spec(env))
+    check_same_spec(name, spec, "this program", env_spec(env))
     # Tolerance and horizon change nothing that is learnt, and a dataset does not hold them; nor are pictures compared.
-    here = {key: value for key, value in env_fingerprint(env).items() if key != "config_sha256"}
-    theirs = {key: value for key, value in fingerprint.items() if key not in ("config_sha256", "cameras_sha256")}
-    warn(*compare_fingerprints(str(root), theirs, "this machine", here))
+    here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}
+    theirs = {key: value for key, value in fingerprint.items() if key not in _NOT_COMPARED}
+    return compare_fingerprints(name, theirs, "this machine", here)
+
+
+def open_driver(
+    policy: Path | None,
+    kind: str,
+    env: Given | EnvConfig,
+    *,
+    draw: bool = True,
+    trust: bool = False,
+    quiet: bool = False,
+) -> tuple[EnvConfig, Driver, CameraConfig | None]:
+    """Return what drives, checked, the environment that it drives, and the cameras whose pictures it takes.
+
+    policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or what was given of it:
+    the rest is as the policy has it. draw, trust: see `check_policy`. quiet: do not say which pictures it takes.
+    """
+    from manip_il.collect.drivers import PolicyDriver, driver_of
+    from manip_il.learn.checkpoint import Checkpoint
+
+    if policy is None:
+        return env_config(env) if isinstance(env, dict) else env, driver_of(kind), None
+    checkpoint = Checkpoint.open(path := find_policy(policy))
+    config = env_config(env, checkpoint.origin) if isinstance(env, dict) else env
+    cameras = check_policy(checkpoint, config, draw=draw, trust=trust)
+    if cameras is not None and not quiet:
+        say(_observation_text(cameras, checkpoint))
+    return config, PolicyDriver((path,), trust=trust), cameras
+
+
+def check_space(policy: Path, space: str | None) -> None:
+    """Raise `MismatchError` for a checkpoint of another action space than the one asked for."""
+    if space is None:
+        return
+    from manip_il.learn.checkpoint import Checkpoint
+
+    path = find_policy(policy)
+    if (theirs := Checkpoint.open(path).space) != space:
+        raise MismatchError("action space", str(path), theirs, "--action_space", space)
 
 
 def check_policy(
@@ -185,11 +235,21 @@ def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool)
     return replace(observation, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
 
 
-def observation_text(cameras: CameraConfig, path: Path) -> str:
-    """Return in words which pictures a policy takes."""
-    from manip_il.learn.checkpoint import Checkpoint
-
-    observation = Checkpoint.open(path).observation
+def _observation_text(cameras: CameraConfig, checkpoint: Checkpoint) -> str:
     lights = ", ".join(f"{name} {value}" for name, value in asdict(cameras.look).items())
     size = f"{cameras.height} x {cameras.width} pixels"
-    return f"observation {observation!r}: the policy uses {', '.join(cameras.names)}, {size}, {lights}"
+    return f"observation {checkpoint.observation!r}: the policy uses {', '.join(cameras.names)}, {size}, {lights}"
+
+
+def load_reward(path: Path) -> LearnedReward:
+    """Return the reward in a folder of `fit`, or in its `pretrained_model`. Raises what `LearnedReward.load` raises."""
+    from manip_il.learn.reward import LearnedReward
+
+    require_folder(path, "a reward of manip-il reward fit")
+    return LearnedReward.load(reward_folder(path))
+
+
+def reward_folder(path: Path) -> Path:
+    """Return the `pretrained_model` folder that a path means."""
+    inner = path / "pretrained_model"
+    return inner if (inner / "config.json").is_file() else path

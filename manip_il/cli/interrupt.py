@@ -7,66 +7,44 @@ import shlex
 import signal
 import threading
 from collections.abc import Sequence
-from types import FrameType, TracebackType
-from typing import Any, ClassVar
+from types import FrameType
+from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _MESSAGE = b"\nstopping after the step in hand (Ctrl-C again to stop at once)\n"
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised where the user has stopped a command between two steps (exit code 130).
+    """Raised if the user has stopped a command between two steps (exit code 130).
 
-    kept: what is safe on disk, as in `12 of 50 episodes in datasets/x`. resume_command: the whole command to go on
-    with; by default the one that was given, with `--resume=true`. No `ManipError`, so that code which outlives
+    kept: what is safe on disk, as in `12 of 50 episodes in datasets/x`. No `ManipError`, so that code which outlives
     errors (one failed episode, one failed round) does not outlive this.
     """
 
-    def __init__(self, kept: str, resume_command: str | None = None):
+    def __init__(self, kept: str):
         super().__init__(kept)
         self.kept = kept
-        self.resume_command = resume_command
 
 
 class StopRequest:
     """The first signal inside the `with` sets `requested`; the second raises `KeyboardInterrupt` at once.
 
-        with StopRequest() as stop:
-            for step in work:
-                step()
-                if stop.requested:
-                    raise Interrupted(kept="3 of 10 rounds in runs/x")
-
-    Nests: a request seen by an inner one is passed to the outer. Outside the main thread, where Python gives no
-    signals, it only ever reports False.
+    Outside the main thread, where Python gives no signals, it only ever reports False.
     """
-
-    _innermost: ClassVar[StopRequest | None] = None
 
     def __init__(self) -> None:
         self.requested = False
-        self._outer: StopRequest | None = None
         self._previous: dict[signal.Signals, Any] = {}
         self._pid = os.getpid()
 
     def __enter__(self) -> StopRequest:
-        if threading.current_thread() is not threading.main_thread():
-            return self
-        self._pid = os.getpid()
-        self._outer, StopRequest._innermost = StopRequest._innermost, self
-        self.requested = self._outer is not None and self._outer.requested
-        self._previous = {number: signal.signal(number, self._on_signal) for number in _SIGNALS}
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {number: signal.signal(number, self._on_signal) for number in _SIGNALS}
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None):
-        if not self._previous:
-            return
+    def __exit__(self, *error: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
-        self._previous = {}
-        StopRequest._innermost = self._outer
-        if self._outer is not None:
-            self._outer.requested |= self.requested
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() != self._pid:  # a forked worker inherits the handlers: it ignores Ctrl-C, and dies of SIGTERM

@@ -1,65 +1,63 @@
-"""Options of a run of reinforcement learning, its progress and its page: for `manip-il gail`, `airl` and `ppo`."""
+"""`manip-il rl gail`, `airl`, `ppo`: a policy by reinforcement learning, from demonstrations or a learnt reward."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import find_policy
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE, append_jsonl, open_output, read_jsonl, require_output
-from manip_il.cli.progress import Stages, say, say_policy
-from manip_il.learn.adversarial_config import PPOConfig
-from manip_il.option import option, option_of
+from manip_il.cli.inputs import dataset_differences, load_reward, require_dataset, require_folder, reward_folder
+from manip_il.cli.options import Given, command_line, given, group, to_plain
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, append_jsonl, read_jsonl
+from manip_il.cli.progress import Stages, say, say_policy, warn
+from manip_il.errors import UsageError
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
+from manip_il.learn.fit_config import check_weights
+from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.algorithms.learning_run import Iteration, LearningRun
     from manip_il.algorithms.run import Watch
     from manip_il.collect.workers import Engine
+    from manip_il.data.schema import RobotTaskSpec
+    from manip_il.learn.checkpoint import Origin
     from manip_il.sim.config import EnvConfig
 
 METRICS_FILE = "metrics.jsonl"
-FREE = ("workers", "output_dir")  # options that may differ when a run is resumed
+_INIT = "a cloned mlp, or its run, to begin with"
+_OF_ALL = (
+    *("steps", "episodes", "episode_steps", "action_space", "log_std", "warmup", "validation_every"),
+    *("validation_episodes", "seed"),
+)
+_FIRST = ("dataset.root", "init", "steps", "reward", "validation_episodes", "output_dir", "resume")
+
+
+def _require_policy(path: Path) -> None:
+    find_policy(path)
 
 
 @dataclass
-class LearningOptions:
-    """Options of every one of these commands, and what they do in the same way."""
+class GivenGroup:
+    """`--dataset.*`."""
+
+    root: list[Path] = option(MISSING, "demonstrations; several are joined", check=require_dataset)
+
+
+class Learning:
+    """What these commands do in the same way: a run of a method, its progress and its page."""
 
     title: ClassVar[str]
     name: ClassVar[str]
-    init: Path | None = option(None, "a cloned mlp, or its run, to begin with; by default a new policy")
-    steps: int = option_of(LearningConfig, "steps")
-    episodes: int = option_of(LearningConfig, "episodes")
-    episode_steps: int = option_of(LearningConfig, "episode_steps")
-    action_space: Literal["ee_delta", "joint_delta", "joint_target"] | None = option_of(LearningConfig, "action_space")
-    log_std: float | None = option_of(LearningConfig, "log_std")
-    warmup: int | None = option_of(LearningConfig, "warmup")
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    validation_every: int = option_of(LearningConfig, "validation_every")
-    validation_episodes: int = option_of(LearningConfig, "validation_episodes")
-    seed: int = common.seed_option()
-    workers: int | None = option(1, "processes that validate")
-    output_dir: Path = option(Path("runs/adversarial"), "folder of the run")
-    resume: bool = option(False, "continue an interrupted run")
-    overwrite: bool = option(False, "replace an existing run")
-
-    @property
-    def roots(self) -> tuple[Path, ...]:
-        """Datasets of demonstrations."""
-        return ()
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        common.require_workers(self.workers)
-        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-        if self.init is not None:
-            find_policy(self.init.expanduser())
+    first: ClassVar[tuple[str, ...]] = _FIRST
+    settings: Given
+    ppo: PPOConfig
+    workers: int | None
+    output: ResumableOutput
 
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
@@ -67,7 +65,7 @@ class LearningOptions:
         from manip_il.collect.workers import Engine
 
         config = self.learning_config()
-        with open_output(self, FREE) as folder:
+        with self.output.open(self) as folder:
             kept = f"every finished iteration, in {folder}"
             with Stages(kept) as stages, Engine(self.workers) as engine:
                 self._learn(config, folder, engine, stages)
@@ -75,20 +73,12 @@ class LearningOptions:
         say(f"report: {folder / REPORT_FILE}")
         robot = common.own_robot(config.env.robot)
         test = f"manip-il eval --policy.path={folder}{robot} --output_dir={folder}/test"
-        remedies = f"more --steps ({config.steps:,} now){'' if self.init else ', a clone to begin with (--init)'}"
+        remedies = f"more --steps ({config.steps:,} now){'' if config.start else ', a clone to begin with (--init)'}"
         found = validations(folder)
         say_policy(folder / "best" / "pretrained_model", found[best_validation(found)], test, remedies)
 
     def learning_config(self) -> LearningConfig:
         """Return what the run takes; raises for what is wrong with datasets and policy together."""
-        env = self.environment()
-        start = None if self.init is None else find_policy(self.init.expanduser())
-        made: dict[str, Any] = {"env": env, "datasets": self.roots, "start": start}
-        own = {one.name: getattr(self, one.name) for one in fields(LearningConfig) if hasattr(self, one.name)}
-        return LearningConfig(**{**own, **made})
-
-    def environment(self) -> EnvConfig:
-        """Return where it learns; raises where that is not one and the same for all that is given."""
         raise NotImplementedError
 
     def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
@@ -100,7 +90,7 @@ class LearningOptions:
 
         watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
         iterations = self.iterations(config, folder, engine, watch)
-        stages.start(f"{self.name}, steps", config.steps)
+        stages.start(f"{self.title}, steps", config.steps)
         written = {record["iteration"] for record in read_jsonl(folder / METRICS_FILE)}
         for result in iterations:
             if result.number not in written:
@@ -120,7 +110,136 @@ class LearningOptions:
         report.write(folder / REPORT_FILE)
 
 
-def resumed(run: LearningRun, iterations: Iterator[Iteration]) -> Iterator[Iteration]:
+@dataclass
+class GailOptions(Learning):
+    """Imitate demonstrations by generative adversarial imitation learning (GAIL).
+
+    A discriminator learns to tell the learner's steps from the demonstrations'; PPO is rewarded for being mistaken for
+    the expert. OUTPUT_DIR/best holds the policy with the highest validation success: an mlp like that of `manip-il
+    train`.
+    """
+
+    title: ClassVar[str] = "GAIL"
+    name: ClassVar[str] = "rl gail"
+    example: ClassVar[str] = "manip-il rl gail --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/gail"
+    dataset: GivenGroup
+    init: Path | None = option(None, f"{_INIT}; by default a new policy", check=_require_policy)
+    settings: Given = given(LearningConfig, prefix="", only=(*_OF_ALL, "reward_form"))
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
+    workers: int | None = option(1, "processes that validate", at_least=1, free=True)
+    output: ResumableOutput = group(ResumableOutput(Path("runs/gail")), prefix="")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self.output.check()
+        check_weights(self.dataset.root, ())
+
+    def learning_config(self) -> LearningConfig:
+        """Return what the run takes; raises if the demonstrations are not all for one environment that is known."""
+        from manip_il.data.dataset import Dataset
+        from manip_il.learn.sources import check_same_sources
+
+        opened = [Dataset.open(root) for root in self.dataset.root]
+        check_same_sources(self.dataset.root, [one.spec for one in opened], pictures=False, language=False)
+        env = _known_env(str(opened[0].root), opened[0].spec)
+        for one in opened:
+            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
+        return LearningConfig(
+            env=env,
+            datasets=tuple(self.dataset.root),
+            start=None if self.init is None else find_policy(self.init),
+            ppo=self.ppo,
+            discriminator=self.discriminator,
+            **self.settings,
+        )
+
+    def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
+        """Return the run's iterations, the last finished one of a resumed run first."""
+        from manip_il.algorithms.gail import gail
+        from manip_il.algorithms.learning_run import LearningRun
+
+        run = LearningRun(config, folder, engine, watch)
+        return _resumed(run, gail(run, config))
+
+
+@dataclass
+class AirlOptions(GailOptions):
+    """Imitate demonstrations by adversarial inverse reinforcement learning (AIRL).
+
+    Like `manip-il rl gail`, with a discriminator in the form of a reward: exp f / (exp f + pi).
+    """
+
+    title: ClassVar[str] = "AIRL"
+    name: ClassVar[str] = "rl airl"
+    example: ClassVar[str] = "manip-il rl airl --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/airl"
+    settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
+    output: ResumableOutput = group(ResumableOutput(Path("runs/airl")), prefix="")
+
+    def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
+        """Return the run's iterations, the last finished one of a resumed run first."""
+        from manip_il.algorithms.airl import airl
+        from manip_il.algorithms.learning_run import LearningRun
+
+        run = LearningRun(config, folder, engine, watch)
+        return _resumed(run, airl(run, config))
+
+
+@dataclass
+class PpoOptions(Learning):
+    """Improve a cloned policy by PPO on a reward that was learnt from preferences.
+
+    Episodes go on after success, as the reward says how good every state is. OUTPUT_DIR/best holds the policy with the
+    highest validation success, which may be the one that it began with.
+    """
+
+    title: ClassVar[str] = "PPO"
+    name: ClassVar[str] = "rl ppo"
+    example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
+    init: Path = option(MISSING, _INIT, check=_require_policy)
+    reward: Path = option(
+        MISSING, "the reward: a folder of manip-il reward fit", check=lambda path: require_folder(path, "a reward")
+    )
+    settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    workers: int | None = option(1, "processes that validate", at_least=1, free=True)
+    output: ResumableOutput = group(ResumableOutput(Path("runs/ppo")), prefix="")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self.output.check()
+
+    def learning_config(self) -> LearningConfig:
+        """Return what the run takes; raises `MismatchError` if reward and environment do not fit."""
+        from manip_il.collect.environments import env_spec
+
+        reward = load_reward(self.reward)
+        origin = reward.origin
+        env = _known_env(str(self.reward), origin)
+        reward.check_fits("the environment", env_spec(env))
+        return LearningConfig(env=env, start=find_policy(self.init), ppo=self.ppo, **self.settings)
+
+    def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
+        """Return the run's iterations, the last finished one of a resumed run first."""
+        from manip_il.algorithms.learning_run import LearningRun
+        from manip_il.algorithms.ppo import ppo
+
+        reward = reward_folder(self.reward)
+        run = LearningRun(config, folder, engine, watch, absorbing=False, reward=reward)
+        return _resumed(run, ppo(run, load_reward(self.reward)))
+
+
+def _known_env(name: str, spec: RobotTaskSpec | Origin) -> EnvConfig:
+    """Return the environment that a dataset or reward is for; `UsageError` if it cannot be simulated here."""
+    from manip_il.collect.environments import is_known
+    from manip_il.sim.config import EnvConfig
+
+    if not is_known(spec.robot, spec.task):
+        raise UsageError(f"{name} is for {spec.robot} {spec.task}, which cannot be simulated here")
+    return EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
+
+
+def _resumed(run: LearningRun, iterations: Iterator[Iteration]) -> Iterator[Iteration]:
     """Return a run's iterations after that which it goes on from, which may have ended before its line was written."""
     first = run.begin()
     return itertools.chain([first] if first else [], iterations)

@@ -13,16 +13,17 @@ import select
 import sys
 import threading
 import traceback
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from manip_il import __version__
 from manip_il.cli import progress
+from manip_il.cli.common_options import table
 from manip_il.cli.interrupt import Interrupted, resume_command
 from manip_il.cli.options import Option, metavar, options_of, word
-from manip_il.cli.parsing import parse
+from manip_il.cli.parsing import check_values, parse
 from manip_il.errors import ManipError, UnknownName, UsageError, printable
 
 PROGRAM = "manip-il"
@@ -32,68 +33,63 @@ LONGEST_LINE = 2_000  # of an error [characters]
 
 
 class Command(NamedTuple):
-    """target: `module:OptionsClass`, loaded when the command is called."""
+    """target: `module:OptionsClass` in `manip_il.cli`, loaded when the command is called."""
 
     target: str
     summary: str
 
 
 COMMANDS = {
-    "view": Command("manip_il.cli.view:ViewOptions", "watch a robot at its task, in a window or a browser"),
-    "record": Command("manip_il.cli.record:RecordOptions", "record demonstrations of the expert as a dataset"),
-    "train": Command("manip_il.cli.train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
-    "dagger": Command("manip_il.cli.dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
-    "eval": Command("manip_il.cli.evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
-    "replay": Command("manip_il.cli.eval_files:ReplayOptions", "run one episode of an evaluation again, and film it"),
-    "merge": Command("manip_il.cli.eval_files:MergeOptions", "merge parts of an evaluation from several machines"),
-    "compare": Command("manip_il.cli.compare:CompareOptions", "compare two policies or runs on the same seeds"),
-    "study": Command("manip_il.cli.study:StudyOptions", "run, test and compare several methods and training seeds"),
-    "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from which states the expert recovers"),
-    "theory": Command("manip_il.cli.theory:TheoryOptions", "see what is proved of cloning and DAgger, on an arm, too"),
-    "irl": Command("manip_il.cli.irl:IrlOptions", "learn a reward from demonstrations of carry"),
-    "gail": Command(
-        "manip_il.cli.adversarial:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"
-    ),
-    "airl": Command("manip_il.cli.adversarial:AirlOptions", "imitate by AIRL, which learns a reward, too"),
-    "ppo": Command("manip_il.cli.ppo:PpoOptions", "improve a cloned policy on a reward learnt from preferences"),
-    "preferences pairs": Command("manip_il.cli.preferences:PairsOptions", "choose pairs of clips to compare"),
-    "preferences ask": Command("manip_il.cli.preferences:AskOptions", "make a page that asks which clip is better"),
-    "preferences answer": Command(
-        "manip_il.cli.preferences:AnswerOptions", "answer pairs by a simulated teacher, who knows true progress"
-    ),
-    "preferences fit": Command("manip_il.cli.preferences:PreferencesFitOptions", "learn a reward from answers"),
-    "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
-    "push": Command(
-        "manip_il.cli.push_pull:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"
-    ),
-    "pull": Command("manip_il.cli.push_pull:PullOptions", "download a dataset or policy, every file verified"),
-    "export": Command("manip_il.cli.export:ExportOptions", "export a policy as ONNX or TorchScript"),
-    "data check": Command("manip_il.cli.doctor:CheckOptions", "find what is wrong with a dataset, of any origin"),
-    "data repair": Command("manip_il.cli.doctor:RepairOptions", "repair a dataset, from its journals or its own data"),
-    "data render": Command(
-        "manip_il.cli.record:RenderOptions", "render a dataset again, with other cameras, sizes or lights"
-    ),
-    "data redraw": Command("manip_il.cli.redraw:RedrawOptions", "draw visited states anew, for policies on pictures"),
-    "data relabel": Command("manip_il.cli.relabel:RelabelOptions", "relabel a dataset with the current expert"),
-    "data build": Command("manip_il.cli.record:BuildOptions", "rebuild a dataset from its journals"),
-    "data merge": Command("manip_il.cli.data_merge:DataMergeOptions", "merge datasets of one robot and task"),
-    "data score": Command(
-        "manip_il.cli.score:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"
-    ),
-    "data to-mcap": Command(
-        "manip_il.cli.mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."
-    ),
-    "data from-mcap": Command(
-        "manip_il.cli.mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"
-    ),
-    "robot new": Command("manip_il.cli.robot:RobotNewOptions", "write a first YAML for an arm's MJCF"),
-    "robot check": Command("manip_il.cli.robot:RobotCheckOptions", "measure what an arm can do, before recording"),
-    "quickstart": Command(
-        "manip_il.cli.quickstart:QuickstartOptions", "run a small example: record, clone, DAgger, report"
-    ),
+    "demo": Command("demo:DemoOptions", "the whole story, small: record, clone, DAgger, report"),
+    "record": Command("record:RecordOptions", "record demonstrations of the expert as a dataset"),
+    "train": Command("train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
+    "dagger": Command("dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
+    "eval": Command("evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
+    "compare": Command("compare:CompareOptions", "compare policies, runs or whole studies on the same seeds"),
+    "view": Command("view:ViewOptions", "watch a robot at its task, in a window or a browser"),
+    "push": Command("push_pull:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
+    "pull": Command("push_pull:PullOptions", "download a dataset or policy, every file verified"),
+    "export": Command("export:ExportOptions", "export a policy as ONNX or TorchScript"),
+    "theory": Command("theory:TheoryOptions", "compare the proven bounds with your own run"),
+    "data check": Command("data_check:CheckOptions", "find what is wrong with a dataset, of any origin"),
+    "data repair": Command("data_check:RepairOptions", "repair a dataset, from its journals or its own data"),
+    "data render": Command("data_edits:RenderOptions", "render a dataset again, with other cameras, sizes or lights"),
+    "data redraw": Command("data_edits:RedrawOptions", "draw visited states anew, for policies on pictures"),
+    "data relabel": Command("data_edits:RelabelOptions", "relabel a dataset with the current expert"),
+    "data build": Command("data_edits:BuildOptions", "rebuild a dataset from its journals"),
+    "data merge": Command("data_edits:MergeOptions", "merge datasets of one robot and task"),
+    "data score": Command("reward:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
+    "data to-mcap": Command("mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
+    "data from-mcap": Command("mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
+    "robot new": Command("robot:RobotNewOptions", "write a first YAML for an arm's MJCF"),
+    "robot check": Command("robot:RobotCheckOptions", "measure what an arm can do, before recording"),
+    "robot certify": Command("robot:CertifyOptions", "measure from which states the expert recovers"),
+    "rl gail": Command("learning:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"),
+    "rl airl": Command("learning:AirlOptions", "imitate by AIRL, which learns a reward, too"),
+    "rl ppo": Command("learning:PpoOptions", "improve a cloned policy on a reward learnt from preferences"),
+    "reward irl": Command("reward:IrlOptions", "learn a reward from demonstrations of carry"),
+    "reward pairs": Command("reward:PairsOptions", "choose pairs of clips to compare"),
+    "reward ask": Command("reward:AskOptions", "make a page that asks which clip is better"),
+    "reward answer": Command("reward:AnswerOptions", "answer pairs by a simulated teacher, who knows true progress"),
+    "reward fit": Command("reward:FitOptions", "learn a reward from answers"),
 }
-
+GROUPS = {
+    "data": "check, repair, edit, score and convert datasets",
+    "robot": "add an arm of your own; measure what an arm can do",
+    "rl": "reinforcement learning: GAIL, AIRL, PPO",
+    "reward": "learn rewards from demonstrations or preferences",
+}
 RENAMED = {
+    "quickstart": "demo",
+    "replay": "eval EVALUATION --replay=SEED",
+    "merge": "eval EVALUATION EVALUATION ...",
+    "health": "eval --check",
+    "study": "compare STUDY.yaml",
+    "certify": "robot certify",
+    "irl": "reward irl",
+    **{name: f"rl {name}" for name in ("gail", "airl", "ppo")},
+    **{f"preferences {name}": f"reward {name}" for name in ("pairs", "ask", "answer", "fit")},
+    "preferences": "reward",
     "doctor": "data check, and manip-il data repair in place of --repair",
     **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
     "mcap export": "data to-mcap",
@@ -101,7 +97,8 @@ RENAMED = {
     "mcap": "data to-mcap, and manip-il data from-mcap",
 }
 
-_HELP_WORDS = ("--help", "-h", "help")
+HELP_ALL = "--help=all"
+_HELP_WORDS = ("--help", "-h", "help", HELP_ALL)
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
   --quiet      no progress on standard error"""
@@ -132,7 +129,6 @@ def script() -> NoReturn:
 
     Nothing is lost by that: what every command writes outlives a kill.
     """
-    _reopen_streams()
     code = main()
     busy = any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
     if code == EXIT_INTERRUPTED and busy:
@@ -141,20 +137,12 @@ def script() -> NoReturn:
     sys.exit(code)
 
 
-def _reopen_streams() -> None:
-    """Make /dev/null of the streams that the shell closed (`>&-`): else the next file opened would take their place."""
-    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
-        if getattr(sys, name) is None:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free, so this one
-            setattr(sys, name, os.fdopen(number, mode, closefd=False))
-
-
 def load(name: str) -> type:
     """Return the dataclass of options of a command; `UnknownName` (exit code 2) names the known ones."""
     if name not in COMMANDS:
         raise UnknownName("command", name, COMMANDS)
     module, _, options_class = COMMANDS[name].target.partition(":")
-    return getattr(importlib.import_module(module), options_class)
+    return getattr(importlib.import_module(f"manip_il.cli.{module}"), options_class)
 
 
 def _dispatch(words: list[str]) -> None:
@@ -166,14 +154,15 @@ def _dispatch(words: list[str]) -> None:
         print(f"{PROGRAM} {__version__}")
     elif words[0].startswith("-"):
         raise UsageError(f"{words[0]!r} is given before a command; write {PROGRAM} COMMAND {words[0]} (see --help)")
-    elif len(words) == 1 and _group(words[0]):
+    elif words == [words[0]] and words[0] in GROUPS:
         print(_group_help(words[0]))
-    elif "--help" in words or "-h" in words:
-        name, _ = _split(words)
-        print(_command_help(name, load(name), words) if name in COMMANDS else _group_help(name))
+    elif {"--help", "-h", HELP_ALL} & {*words}:
+        name, rest = _split(words)
+        print(_command_help(name, load(name), rest) if name not in GROUPS else _group_help(name))
     else:
         name, words = _split(words)
         options = parse(load(name), words, command=name)
+        check_values(options)
         if hasattr(options, "check"):
             options.check()
         from manip_il.errors import silence_ffmpeg_warning
@@ -186,23 +175,21 @@ def _dispatch(words: list[str]) -> None:
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
     """A command's name, of one word or two, and the words behind it; a group's name where only help is asked for."""
-    for name in (" ".join(words[:2]), words[0]):
-        if name in RENAMED:
-            raise UsageError(f"{name!r} has a new name: {PROGRAM} {RENAMED[name]}")
-    group = _group(words[0])
-    if not group:
-        return words[0], words[1:]
-    name = " ".join(words[:2])
-    if name in COMMANDS:
-        return name, words[2:]
-    if words[1] in ("--help", "-h"):
-        return words[0], []
-    raise UnknownName("command", name, group)
+    name, of_two = words[0], " ".join(words[:2])
+    if found := next((RENAMED[old] for old in (of_two, name) if old in RENAMED), ""):
+        raise UsageError(f"{of_two if of_two in RENAMED else name!r} has a new name: {PROGRAM} {found}")
+    if name not in GROUPS:
+        return name, words[1:]
+    if of_two in COMMANDS:
+        return of_two, words[2:]
+    if words[1].startswith("-"):
+        return name, []
+    raise UnknownName("command", of_two, _inside(name))
 
 
-def _group(word: str) -> list[str]:
+def _inside(group: str) -> list[str]:
     """The commands of two words that begin with this one."""
-    return [name for name in COMMANDS if name.startswith(f"{word} ")]
+    return [name for name in COMMANDS if name.startswith(f"{group} ")]
 
 
 def _report(error: BaseException, words: list[str]) -> int:
@@ -225,13 +212,14 @@ def _report(error: BaseException, words: list[str]) -> int:
 
 def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
     if isinstance(error, Interrupted):
-        return f"; kept: {error.kept}; continue with: {error.resume_command or resume_command(words)}"
+        return f"; kept: {error.kept}; continue with: {resume_command(words)}"
     try:
         name, rest = _split(words)
         options: Any = parse(load(name), rest)
     except (Exception, KeyboardInterrupt):  # stopped while it was loading, or stopped once more
         return ""
-    if not hasattr(options, "resume") or not getattr(options, "output_dir", Path()).exists():  # nothing to resume
+    values = {one.name: one.value(options) for one in options_of(type(options))}
+    if "resume" not in values or not values.get("output_dir", Path()).exists():  # nothing to resume
         return ""
     return f"; finished work is kept; continue with: {resume_command(words)}"
 
@@ -247,38 +235,40 @@ def _clean(text: str, words: list[str]) -> str:
 
 
 def _help() -> str:
+    single = {name: command.summary for name, command in COMMANDS.items() if " " not in name}
+    groups = {f"{name} ...": summary for name, summary in GROUPS.items()}
     return (
         f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
         "Robot-arm imitation learning without teleoperation.\n\n"
-        f"commands:\n{_commands(COMMANDS)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
+        f"commands:\n{table(single | groups)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
-        f"example: {PROGRAM} quickstart --output_dir=runs/quickstart"
+        f"example: {PROGRAM} demo --output_dir=runs/demo"
     )
 
 
 def _group_help(group: str) -> str:
-    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_commands(_group(group))}"
-
-
-def _commands(names: Collection[str]) -> str:
-    width = max(map(len, names)) + 2
-    return "\n".join(f"  {name:{width}}{COMMANDS[name].summary}" for name in names)
+    rows = {name: COMMANDS[name].summary for name in _inside(group)}
+    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{table(rows)}"
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
-    """Help of one command. words: all that was given, as some have help for a choice, too (`more_help`)."""
+    """Help of one command: the options that people use first (`first`), or with `--help=all` every option.
+
+    words: all that was given, as some have help for a choice, too (`more_help`).
+    """
     options = options_of(cls)
+    first = () if HELP_ALL in words else getattr(cls, "first", ())
     positional = [option for option in options if option.positional]
     places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
-    rows = [_row(option) for option in options]
-    rows.append(("--config_path=FILE.yaml", "read options from YAML; those on the command line win"))
-    width = max(len(left) for left, _ in rows) + 2
-    lines = "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows)
-    example = getattr(cls, "example", "")
+    rows = dict(_row(option) for option in options if not first or option.positional or option.name in first)
+    rest = len(options) - len(rows)
+    rows["--config_path=FILE.yaml"] = "read options from YAML; those on the command line win"
+    if rest:
+        rows[HELP_ALL] = f"list the other {rest} options, too"
     more = cls.more_help(words) if hasattr(cls, "more_help") else ""
     return (
         f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{inspect.getdoc(cls)}\n\n"
-        f"options:\n{lines}{more}\n\n{_GLOBAL_HELP}" + (f"\n\nexample: {example}" if example else "")
+        f"options:\n{table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {cls.example}"
     )
 
 

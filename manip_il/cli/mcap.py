@@ -6,8 +6,8 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from manip_il.cli.inputs import require_dataset
-from manip_il.cli.outputs import prepare_output, require_new, save_options
+from manip_il.cli.inputs import require_dataset, require_file
+from manip_il.cli.outputs import prepare_output, require_output, save_options
 from manip_il.cli.progress import progress, say
 from manip_il.data.atomic import new_folder
 from manip_il.errors import UsageError
@@ -22,16 +22,15 @@ class McapExportOptions:
     """
 
     example: ClassVar[str] = "manip-il data to-mcap datasets/demos demos_mcap"
-    dataset: Path = option(MISSING, "the dataset's folder", positional=True)
+    dataset: Path = option(MISSING, "the dataset's folder", positional=True, check=require_dataset)
     out: Path = option(MISSING, "folder for the files", positional=True)
     overwrite: bool = option(False, "replace an existing export")
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
-        require_dataset(self.dataset)
         if self.dataset.resolve().is_relative_to(self.out.resolve()):
             raise UsageError(f"{self.out} holds the dataset itself; expected another folder for the files")
-        require_new(self.out, overwrite=self.overwrite)
+        require_output(self.out, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
@@ -50,6 +49,10 @@ class McapExportOptions:
         say(f"back to a dataset: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
 
 
+def _require_mapping(path: Path) -> None:
+    require_file(path, "a mapping file, such as configs/mcap/panda.yaml")
+
+
 @dataclass
 class McapImportOptions:
     """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in the order of their names.
@@ -61,14 +64,14 @@ class McapImportOptions:
     example: ClassVar[str] = "manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
     source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True)
     dataset: Path = option(MISSING, "folder for the dataset", positional=True)
-    mapping: Path = option(MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)")
+    mapping: Path = option(
+        MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)", check=_require_mapping
+    )
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
         if not self.source.exists():
             raise UsageError(f"{self.source} does not exist; expected an MCAP file, or a folder of them")
-        if not self.mapping.is_file():
-            raise UsageError(f"{self.mapping} does not exist; expected a mapping file, such as configs/mcap/panda.yaml")
         if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
             raise UsageError(f"{self.dataset} exists already; choose another folder, or delete it first")
 

@@ -1,8 +1,9 @@
 """Options of commands: what a dataclass of options holds, which values a type accepts, and what help calls them.
 
-A field's type is int, float, bool, str, Path, a `Literal` of names, a list of those, one of those or None, another
-dataclass (a group, `--dataset.root`), or `Open`: a group of which only another program knows the options
-(`--policy.*`), as a dict of whatever was given.
+A field's type is int, float, bool, str, Path, a `Literal` of names, a list of those, one of those or None, a class with
+`parse` and `str` (`linear:5`), another dataclass (a group, `--dataset.root`), or `Open`: a group of which only another
+program knows the options (`--policy.*`), as a dict of whatever was given. `given(Config)` is a group of a class's own
+options, as a dict of those that were given: what makes the class, with what else it takes.
 """
 
 from __future__ import annotations
@@ -11,27 +12,62 @@ import dataclasses
 import functools
 import json
 import shlex
+import sys
 import types
 import typing
-from collections.abc import Iterator
-from dataclasses import MISSING, dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Union
 
 Open = dict[str, Any]  # option -> value as YAML reads it
+Given = dict[str, Any]  # field -> value
 _EXPECTED = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
 _METAVARS = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH"}
 
 
+def group(default: Any, prefix: str | None = None) -> Any:
+    """Return a field of nested options. prefix: before their names, in place of the field's own name and a dot."""
+    metadata = {} if prefix is None else {"prefix": prefix}
+    return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
+
+
+def given(
+    cls: type, prefix: str | None = None, only: Collection[str] = (), defaults: Mapping[str, Any] | None = None
+) -> Any:
+    """Return a `Given` field: every option of `cls`, declared there.
+
+    only: fields, if not all. defaults: field -> what stands in help in place of the default of `cls`; None for one that
+    depends on what else is given.
+    """
+    metadata = {"given": cls, "only": only, "defaults": defaults or {}}
+    return field(default_factory=dict, metadata=metadata if prefix is None else metadata | {"prefix": prefix})
+
+
 @dataclass(frozen=True)
 class Option:
-    """One option of a command. `default` is `MISSING` where the user must give a value."""
+    """One option of a command. `default` is `MISSING` if the user must give a value.
+
+    path: the attributes and keys that lead from the command's options to its value. metadata: of its field: `help`, one
+    line; `positional` for a value without a name; `command_line_only` for one that no file may set; `flag`, its whole
+    name; `at_least` and `at_most`.
+    """
 
     name: str  # dotted: `dataset.root`
+    path: tuple[str, ...]
     type: Any
     default: Any
-    help: str
-    positional: bool
+    metadata: Mapping[str, Any]
+
+    @property
+    def help(self) -> str:
+        """One line of help."""
+        return self.metadata.get("help", "")
+
+    @property
+    def positional(self) -> bool:
+        """Whether its value stands without a name."""
+        return self.metadata.get("positional", False)
 
     @property
     def label(self) -> str:
@@ -50,72 +86,98 @@ class Option:
     @property
     def is_open(self) -> bool:
         """Whether it stands for any number of options, of which only another program knows the names."""
-        return self.type == Open
+        return typing.get_origin(self.type) in (dict, Mapping)
+
+    def value(self, options: Any) -> Any:
+        """Return its value in a command's options."""
+        for key in self.path:
+            options = options.get(key, self.default) if isinstance(options, dict) else getattr(options, key)
+        return {} if self.is_open and options in (None, MISSING) else options
 
 
-def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
-    """Return every option of a dataclass, groups resolved, in the order of definition.
-
-    field metadata: `help`, one line; `positional=True` for a value without a name (`manip-il data check DATASET`);
-    `command_line_only=True` for an option that no file may set, and that no file of options holds.
-    """
+def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()) -> list[Option]:
+    """Return every option of a dataclass, groups resolved, in the order of definition. base: has the defaults."""
     found: list[Option] = []
-    for field, field_type, default in fields_of(cls, base):
-        name = prefix + field.name
-        if dataclasses.is_dataclass(field_type):
-            found += options_of(typing.cast(type, field_type), None if default is MISSING else default, f"{name}.")
+    for one, kind, default in fields_of(cls, base):
+        inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
+        if "given" in one.metadata:
+            defaults = one.metadata["defaults"]
+            for option in given_options(one):
+                changes = {"default": defaults[option.name]} if option.name in defaults else {}
+                name = option.metadata.get("flag", inner + option.name)
+                found.append(dataclasses.replace(option, name=name, path=(*here, option.name), **changes))
+        elif dataclasses.is_dataclass(kind):
+            found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
         else:
-            help_text, positional = field.metadata.get("help", ""), field.metadata.get("positional", False)
-            found.append(Option(name, field_type, default, help_text, positional))
+            found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata))
     return found
+
+
+def given_options(one: dataclasses.Field[Any]) -> Iterator[Option]:
+    """Yield the options of a `Given` field, by the names of the fields."""
+    cls, only = one.metadata["given"], one.metadata["only"]
+    for inner in dataclasses.fields(cls):
+        if "help" in inner.metadata and (not only or inner.name in only):
+            yield Option(inner.name, (inner.name,), _type_of(cls, inner), _default(inner), inner.metadata)
 
 
 def fields_of(cls: type, base: Any) -> Iterator[tuple[dataclasses.Field[Any], Any, Any]]:
     """Yield every field that a dataclass's constructor takes, its type, and its value in `base`, else its default."""
-    hints = typing.get_type_hints(cls)
-    for field in dataclasses.fields(cls):
-        own = field.default if field.default_factory is MISSING else field.default_factory()
-        if field.init:
-            yield field, hints[field.name], own if base is None else getattr(base, field.name)
+    for one in dataclasses.fields(cls):
+        if one.init:
+            yield one, _type_of(cls, one), _default(one) if base is None else getattr(base, one.name)
 
 
-def value_of(options: Any, name: str) -> Any:
-    """Return the value of an option by its dotted name."""
-    return functools.reduce(getattr, name.split("."), options)
+def _default(one: dataclasses.Field[Any]) -> Any:
+    return one.default if one.default_factory is MISSING else one.default_factory()
 
 
-def to_plain(value: Any) -> Any:
-    """Return options as dicts, lists, text, numbers, booleans and None."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = [f for f in dataclasses.fields(value) if f.init and not f.metadata.get("command_line_only")]
-        return {f.name: to_plain(getattr(value, f.name)) for f in fields}
-    if isinstance(value, dict):
-        return {key: to_plain(item) for key, item in value.items()}
-    if isinstance(value, Path):
-        return str(value)
+def _type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
+    """Return a field's type; other fields' types may be known to type checkers alone."""
+    if not isinstance(one.type, str):
+        return one.type
+    home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
+    return eval(one.type, vars(sys.modules[home.__module__]))
+
+
+def to_plain(options: Any) -> dict[str, Any]:
+    """Return a command's options as a tree of dicts, lists, text, numbers, booleans and None, by their names."""
+    tree: dict[str, Any] = {}
+    for one in options_of(type(options)):
+        if one.metadata.get("command_line_only"):
+            continue
+        *groups, last = one.name.split(".")
+        place = functools.reduce(lambda inner, name: inner.setdefault(name, {}), groups, tree)
+        place[last] = _plain(one.value(options))
+    return tree
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in typing.cast(Mapping[str, Any], value).items()}
     if isinstance(value, list | tuple):
-        return [to_plain(item) for item in value]
-    return value
+        return [_plain(item) for item in typing.cast(list[Any], value)]
+    return str(value) if isinstance(value, Path) or hasattr(value, "parse") else value
 
 
 def command_line(name: str, options: Any) -> str:
     """Return the command with every option that is not its default, to copy."""
     words = ["manip-il", *name.split()]
-    for known in options_of(type(options)):
-        value = value_of(options, known.name)
-        if known.positional:
-            words += map(str, value if isinstance(value, list) else [value])
-        elif known.is_open:
-            given = {key: one if isinstance(one, str) else json.dumps(one) for key, one in value.items()}
-            words += [f"--{known.name}.{key}={one}" for key, one in given.items()]
-        elif (known.default is MISSING or value != known.default) and known.name not in ("resume", "overwrite"):
-            words.append(f"--{known.name}={word(value)}")
+    for one in options_of(type(options)):
+        value = one.value(options)
+        if one.positional:
+            words += map(str, value if isinstance(value, list) else [] if value is None else [value])
+        elif one.is_open:
+            texts = {key: text if isinstance(text, str) else json.dumps(text) for key, text in value.items()}
+            words += [f"--{one.name}.{key}={text}" for key, text in texts.items()]
+        elif (one.default is MISSING or value != one.default) and one.name not in ("resume", "overwrite"):
+            words.append(f"--{one.name}={word(value)}")
     return shlex.join(words)
 
 
 def word(value: Any) -> str:
     """Return a value as it stands on the command line."""
-    plain = to_plain(value)
+    plain = _plain(value)
     if isinstance(plain, list):
         return ",".join(map(str, plain))
     return json.dumps(plain) if plain is None or isinstance(plain, bool) else str(plain)
@@ -136,31 +198,36 @@ def expected(option_type: Any) -> str:
     if typing.get_origin(option_type) is list:
         return f"a comma-separated list, each {expected(typing.get_args(option_type)[0])}"
     named = choices(option_type)
-    return f"one of {', '.join(named)}" if named else _EXPECTED[option_type]
+    return f"one of {', '.join(named)}" if named else _EXPECTED.get(option_type, "text")
 
 
 def decode(option_type: Any, value: Any, *, is_word: bool = False) -> Any:
-    """Return `value` as the declared type; `ValueError` where it is none. is_word: `null` and commas have a meaning."""
+    """Return `value` as the declared type; `ValueError` if it is none. is_word: `null` and commas have a meaning."""
     if (some := without_none(option_type)) is not option_type:
         is_none = value is None or (is_word and value.lower() in ("null", "none"))
         return None if is_none else decode(some, value, is_word=is_word)
     if typing.get_origin(option_type) is list:
-        if is_word:
-            inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
-            value = [item.strip().strip("'\"") for item in inner.split(",")] if inner.strip() else []
-            if "" in value:
-                raise ValueError
-        item_type = typing.get_args(option_type)[0]
-        if item_type is Path and isinstance(value, str):
-            value = [value]  # in YAML one path stands for a list of one
-        if not isinstance(value, list):
-            raise ValueError
-        return [decode(item_type, item) for item in value]
+        return _decode_list(typing.get_args(option_type)[0], value, is_word)
     if named := choices(option_type):
         if value not in named:
             raise ValueError
         return value
+    if hasattr(option_type, "parse") and isinstance(value, str):
+        return option_type.parse(value)
     return _decode_scalar(option_type, value)
+
+
+def _decode_list(item_type: Any, value: Any, is_word: bool) -> list[Any]:
+    if is_word:
+        inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
+        value = [item.strip().strip("'\"") for item in inner.split(",")] if inner.strip() else []
+        if "" in value:
+            raise ValueError
+    if item_type is Path and isinstance(value, str):
+        value = [value]  # in YAML one path stands for a list of one
+    if not isinstance(value, list):
+        raise ValueError
+    return [decode(item_type, item) for item in typing.cast(list[Any], value)]
 
 
 def _decode_scalar(option_type: Any, value: Any) -> Any:

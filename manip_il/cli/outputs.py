@@ -5,33 +5,75 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Generator, Iterable, Mapping
-from contextlib import contextmanager
+from collections.abc import Generator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from manip_il import checks
-from manip_il.cli.options import options_of, value_of
+from manip_il.cli.options import options_of
 from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
 from manip_il.cli.progress import say
 from manip_il.data.atomic import PARTIAL, exclusive, write_file, writing
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.option import option
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
 _LONGEST_NAME, _LONGEST_PATH = 220, 3_500  # of a folder that is written [bytes]; file systems take 255 and 4,096
 _MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a folder
 
 
-@contextmanager
-def open_output(options: Any, free: Iterable[str] = (), may_grow: str | None = None) -> Generator[Path]:
-    """Hold and prepare `options.output_dir`, with `config.yaml` in it; a resumed run must have the same options."""
-    folder, resume = options.output_dir, getattr(options, "resume", False)
-    with exclusive(folder):
-        prepare_output(folder, resume=resume, overwrite=options.overwrite)
-        if resume:
-            check_same_options(folder, options, free, may_grow)
-        save_options(folder, options)
-        yield folder
+@dataclass
+class Output:
+    """Where a command writes."""
+
+    output_dir: Path = option(MISSING, "folder of what is written", free=True)
+    overwrite: bool = option(False, "replace what is there", free=True)
+    _resumes: ClassVar[bool] = False
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether what is there is continued."""
+        return False
+
+    def check(self) -> None:
+        """Raise `UsageError` if a command cannot begin to write; say so if there is nothing to resume."""
+        require_output(self.output_dir, resume=self.goes_on, overwrite=self.overwrite, resumable=self._resumes)
+
+    @contextmanager
+    def open(self, options: Any) -> Generator[Path]:
+        """Hold and prepare the folder, with the command's options in `config.yaml`; a resumed run must have the same.
+
+        Raises `ManipError` if the folder cannot be written to.
+        """
+        folder = self.output_dir
+        with ExitStack() as held:
+            try:
+                held.enter_context(exclusive(folder))
+                prepare_output(folder, resume=self.goes_on, overwrite=self.overwrite)
+            except OSError as error:
+                raise ManipError(
+                    f"{folder} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
+                    'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
+                ) from error
+            if self.goes_on:
+                check_same_options(folder, options)
+            save_options(folder, options)
+            yield folder
+
+
+@dataclass
+class ResumableOutput(Output):
+    """Where a command writes that can be continued."""
+
+    resume: bool = option(False, "continue what was interrupted", free=True)
+    _resumes: ClassVar[bool] = True
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether what is there is continued."""
+        return self.resume
 
 
 def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
@@ -76,19 +118,19 @@ def require_short_path(path: Path) -> None:
             raise UsageError(f"{what} {checks.shorten(str(path))} has {size:,} bytes; expected at most {most:,}")
 
 
-def require_output(folder: Path, *, resume: bool = False, overwrite: bool = False) -> None:
-    """Raise `UsageError` if a command cannot begin to write to `folder`; say so if there is nothing to resume in it."""
-    check_output(folder, resume=resume, overwrite=overwrite)
+def require_output(folder: Path, *, resume: bool = False, overwrite: bool = False, resumable: bool = False) -> None:
+    """Raise `UsageError` if a command cannot begin to write to `folder`; say so if there is nothing to resume in it.
+
+    resumable: whether the command could go on with what is there.
+    """
+    try:
+        check_output(folder, resume=resume, overwrite=overwrite)
+    except FolderExistsError:
+        if resumable:
+            raise
+        raise UsageError(f"{folder} exists already; replace it with --overwrite=true") from None
     if resume and not (folder.is_dir() and any(folder.iterdir())):
         say(f"nothing to resume in {folder}: starting from the beginning")
-
-
-def require_new(folder: Path, *, overwrite: bool = False) -> None:
-    """Raise `UsageError` where a command that cannot be resumed may not write to `folder`."""
-    try:
-        check_output(folder, resume=False, overwrite=overwrite)
-    except FolderExistsError:
-        raise UsageError(f"{folder} exists already; replace it with --overwrite=true") from None
 
 
 def save_options(folder: Path, options: Any) -> None:
@@ -96,11 +138,11 @@ def save_options(folder: Path, options: Any) -> None:
     atomic_write(folder / CONFIG_FILE, dump_yaml(options))
 
 
-def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow: str | None = None) -> None:
+def check_same_options(folder: Path, options: Any) -> None:
     """Raise `MismatchError` naming the option unless the run in `folder` was started with the same options.
 
-    free: options that may differ. may_grow: one that may be larger than it was. A folder that is not there or
-    empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
+    Options with `free` in their metadata may differ, with `grows` be larger than they were. A folder that is not there
+    or empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
     """
     path = folder / CONFIG_FILE
     # A run that was killed at once leaves at most half a file, under a hidden name.
@@ -110,9 +152,9 @@ def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow
         raise UsageError(f"{folder} holds no {CONFIG_FILE}, so there is no run to continue; choose another folder")
     before = from_yaml(path, type(options))
     for known in options_of(type(options)):
-        was, now = value_of(before, known.name), value_of(options, known.name)
-        grown = known.name == may_grow and now >= was
-        if was != now and known.name not in (*free, "resume", "overwrite") and not grown:
+        was, now = known.value(before), known.value(options)
+        has_grown = known.metadata.get("grows") and now >= was
+        if was != now and not known.metadata.get("free") and not has_grown:
             raise MismatchError(f"--{known.name}", str(path), was, "the command line", now)
 
 

@@ -1,36 +1,33 @@
 """Options from the command line (`--a.b=c`) and from YAML, in LeRobot's style; words beat YAML beats defaults.
 
-The parser is our own, as draccus cannot be taught to answer with one line: it exits through argparse, turns a range
-error of a nested dataclass into a decoding error, takes `true` for a number, and loads YAML with tags that read other
-files.
+The parser is our own, as LeRobot's cannot be taught to answer with one line: it exits through argparse, turns a range
+error of a nested dataclass into a decoding error, takes `true` for a number, and knows no open groups.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
-from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
 
 from manip_il import __version__
 from manip_il.checks import shorten
-from manip_il.cli.options import Open, Option, choices, decode, expected, fields_of, options_of, to_plain, without_none
-from manip_il.errors import UsageError, did_you_mean, nearest
+from manip_il.cli.options import Option, choices, decode, expected, fields_of, options_of, to_plain, without_none
+from manip_il.errors import UsageError, did_you_mean, nearest, nearest_names
+from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
 _FEW = 3
-_NEAR = 0.65  # ratio of difflib from which on a name is offered
-_AS_NEAR = 0.1  # of the best one: others that are offered beside it
 _PATHS = (Path, list[Path])
-_LONGEST = 100  # [characters] of a name that is compared
+type Known = Mapping[str, Option]
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Said:
     """A value as the user gave it, and its origin, for the error message."""
 
     value: Any
@@ -43,10 +40,10 @@ def parse[T](cls: type[T], words: Sequence[str], command: str = "") -> T:
 
     command: whose options they are, for the message.
     """
-    known = {option.name: option for option in options_of(cls)}
+    known = _known(cls)
     from_words, config_paths = _read_words(words, known, command)
     from_files = _read_layers(((path, _read_yaml(Path(path))) for path in config_paths), known)
-    return _build(cls, from_files | from_words)
+    return _make(cls, from_files | from_words, known)
 
 
 def from_yaml[T](path: Path, cls: type[T]) -> T:
@@ -59,7 +56,20 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Mapping[str, Any]]]
 
     layers: the origin of a tree, for error messages, and the tree. `UsageError` as from a YAML file.
     """
-    return _build(cls, _read_layers(layers, {option.name: option for option in options_of(cls)}))
+    return _make(cls, _read_layers(layers, _known(cls)), _known(cls))
+
+
+def check_values(options: Any, prefix: str | None = None) -> None:
+    """Refuse values out of bounds, and what the options' own `check` refuses: paths that are not there, most of all.
+
+    prefix: of the names in messages, in place of two dashes.
+    """
+    for one in options_of(type(options)):
+        value = one.value(options)
+        check_bound(one.label if prefix is None else prefix + one.name, value, one.metadata)
+        for item in value if one.is_list else [value]:
+            if item is not None and "check" in one.metadata:
+                one.metadata["check"](item)
 
 
 def dump_yaml(options: Any) -> str:
@@ -70,8 +80,12 @@ def dump_yaml(options: Any) -> str:
     return header + yaml.safe_dump(to_plain(options), sort_keys=False)
 
 
-def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str) -> tuple[dict[str, _Given], list[str]]:
-    given: dict[str, _Given] = {}
+def _known(cls: type) -> Known:
+    return {option.name: option for option in options_of(cls)}
+
+
+def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[str, _Said], list[str]]:
+    said: dict[str, _Said] = {}
     config_paths: list[str] = []
     places = [option for option in known.values() if option.positional]
     rest = list(words)
@@ -79,13 +93,13 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str)
         word = rest.pop(0)
         if not word.startswith("--"):
             if not places:
-                raise unexpected_word(word, known, command)
+                raise _unexpected_word(word, known, command)
             option = places[0] if places[0].is_list else places.pop(0)
             if option.is_list:  # takes every word that is left
-                before = given[option.name].value if option.name in given else []
-                given[option.name] = _Given([*before, word], option.label, False)
+                before = said[option.name].value if option.name in said else []
+                said[option.name] = _Said([*before, word], option.label, False)
             else:
-                given[option.name] = _Given(word, option.label, True)
+                said[option.name] = _Said(word, option.label, True)
             continue
         name, equals, value = word[2:].partition("=")
         if name not in known and name.replace("-", "_") in known:  # as other programs write it
@@ -93,7 +107,7 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str)
         if group := _open_group(name, known):
             if not equals and (not rest or rest[0].startswith("--")):
                 raise UsageError(f"--{name} has no value; expected --{name}=VALUE")
-            given[name] = _Given(_as_yaml(value if equals else rest.pop(0), group), f"--{name}", False)
+            said[name] = _Said(_as_yaml(value if equals else rest.pop(0), group), f"--{name}", False)
             continue
         if name != CONFIG_PATH and (name not in known or known[name].positional or known[name].is_open):
             raise unknown_option("option", name, known, "--", command)
@@ -102,11 +116,11 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str)
         if name == CONFIG_PATH:
             config_paths.append(value)
         else:
-            given[name] = _Given(value, f"--{name}", True)
-    return given, config_paths
+            said[name] = _Said(value, f"--{name}", True)
+    return said, config_paths
 
 
-def _open_group(name: str, known: Mapping[str, Option]) -> str:
+def _open_group(name: str, known: Known) -> str:
     """Return the open group that `name` is an option of, or nothing."""
     if name in known:
         return ""
@@ -122,7 +136,7 @@ def _as_yaml(word: str, group: str) -> Any:
         raise UsageError(f"--{group}: {shorten(word)} is not a YAML value: {error}") from error
 
 
-def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:
+def _next_value(name: str, known: Known, rest: list[str]) -> str:
     """Take the value of `--name value` from `rest`; a flag without one is true."""
     if name in known and known[name].type is bool and not (rest and rest[0] in ("true", "false")):
         return "true"
@@ -141,66 +155,75 @@ def _read_yaml(path: Path) -> dict[Any, Any]:
     return tree or {}
 
 
-def _read_layers(layers: Iterable[tuple[str, Mapping[Any, Any]]], known: Mapping[str, Option]) -> dict[str, _Given]:
-    given: dict[str, _Given] = {}
+def _read_layers(layers: Iterable[tuple[str, Mapping[Any, Any]]], known: Known) -> dict[str, _Said]:
+    said: dict[str, _Said] = {}
     for origin, tree in layers:
-        given |= _read_tree(tree, known, origin)
-    return given
+        said |= _read_tree(tree, known, origin)
+    return said
 
 
-def _read_tree(
-    tree: Mapping[Any, Any], known: Mapping[str, Option], origin: str, prefix: str = ""
-) -> dict[str, _Given]:
-    given: dict[str, _Given] = {}
+def _read_tree(tree: Mapping[Any, Any], known: Known, origin: str, prefix: str = "") -> dict[str, _Said]:
+    said: dict[str, _Said] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
         is_open = name in known and known[name].is_open
         if not is_open and (name in known or _open_group(name, known)):
-            given[name] = _Given(value, f"{origin}: {name}", False)
+            said[name] = _Said(value, f"{origin}: {name}", False)
         elif not is_open and not any(option.startswith(f"{name}.") for option in known):
             raise unknown_option(f"key in {origin}:", name, known, "", "")
         elif not isinstance(value, dict | None):
             raise UsageError(f"{origin}: {name}: expected a mapping of options, got {shorten(value)}")
         else:
-            given |= _read_tree(value or {}, known, origin, f"{name}.")
-    return given
+            said |= _read_tree(value or {}, known, origin, f"{name}.")
+    return said
 
 
-def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefix: str = "") -> T:
-    """Return an instance of `cls` of the given values, else `base`'s, else the defaults."""
+def _make[T](cls: type[T], said: Mapping[str, _Said], known: Known) -> T:
+    values: dict[tuple[str, ...], Any] = {}
+    for option in known.values():
+        if option.is_open:
+            inside = {name: one.value for name, one in said.items() if name.startswith(f"{option.name}.")}
+            if inside:
+                before = {} if option.default is MISSING else option.default
+                named = {name.removeprefix(f"{option.name}."): value for name, value in inside.items()}
+                values[option.path] = before | named
+        elif option.name in said:
+            one = said[option.name]
+            if option.metadata.get("command_line_only") and not one.is_word:
+                raise UsageError(f"{one.origin}: this can only be set on the command line; give --{option.name}=...")
+            if one.value is not None or option.default is not None:  # as such a file has it that was not given
+                values[option.path] = _decode_said(option.type, one)
+        elif option.default is MISSING:
+            raise UsageError(f"{option.label} is missing; expected {expected(option.type)}")
+    return _build(cls, values)
+
+
+def _build[T](cls: type[T], values: Mapping[tuple[str, ...], Any], base: Any = None, path: tuple[str, ...] = ()) -> T:
+    """Return an instance of `cls` of the values by their paths, else of `base`'s, else of the defaults."""
     arguments: dict[str, Any] = {}
-    for field, field_type, default in fields_of(cls, base):
-        name = prefix + field.name
-        if dataclasses.is_dataclass(field_type):
-            nested = None if default is MISSING else default
-            arguments[field.name] = _build(typing.cast(type, field_type), given, nested, f"{name}.")
-        elif field_type == Open:
-            inside = {key: one.value for key, one in given.items() if key.startswith(f"{name}.")}
-            before = {} if default is MISSING else default
-            arguments[field.name] = before | {key.removeprefix(f"{name}."): value for key, value in inside.items()}
-        elif name in given:
-            if field.metadata.get("command_line_only") and not given[name].is_word:
-                raise UsageError(f"{given[name].origin}: this can only be set on the command line; give --{name}=...")
-            arguments[field.name] = _decode_given(field_type, given[name])
-        elif default is MISSING:
-            label = name.upper() if field.metadata.get("positional") else f"--{name}"
-            raise UsageError(f"{label} is missing; expected {expected(field_type)}")
+    for field, kind, default in fields_of(cls, base):
+        here = (*path, field.name)
+        if "given" in field.metadata:
+            arguments[field.name] = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
+        elif dataclasses.is_dataclass(kind):
+            inner_base = None if default is MISSING else default
+            arguments[field.name] = _build(typing.cast(type, kind), values, inner_base, here)
         else:
-            arguments[field.name] = default
+            arguments[field.name] = values.get(here, {} if default is MISSING else default)
     return cls(**arguments)
 
 
-def _decode_given(field_type: Any, given: _Given) -> Any:
+def _decode_said(option_type: Any, said: _Said) -> Any:
     try:
-        return decode(field_type, given.value, is_word=given.is_word)
+        return decode(option_type, said.value, is_word=said.is_word)
     except (ValueError, OverflowError):
-        hint = nearest(given.value, choices(field_type)) if isinstance(given.value, str) else ""
-        quotes = "; YAML needs quotes around text like this" if field_type is str and not given.is_word else ""
-        text = f"{given.origin}: expected {expected(field_type)}, got {shorten(given.value)}{hint}{quotes}"
+        hint = nearest(said.value, choices(option_type)) if isinstance(said.value, str) else ""
+        quotes = "; YAML needs quotes around text like this" if option_type is str and not said.is_word else ""
+        text = f"{said.origin}: expected {expected(option_type)}, got {shorten(said.value)}{hint}{quotes}"
         raise UsageError(text) from None
 
 
-def unknown_option(kind: str, name: str, known: Mapping[str, Option], dashes: str, command: str) -> UsageError:
+def unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
     """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
 
     kind: `option`, or which file's key. dashes: before the names. command: empty where none is known.
@@ -215,7 +238,7 @@ def unknown_option(kind: str, name: str, known: Mapping[str, Option], dashes: st
     return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; {_help(command)} lists all")
 
 
-def unexpected_word(word: str, known: Mapping[str, Option], command: str) -> UsageError:
+def _unexpected_word(word: str, known: Known, command: str) -> UsageError:
     """Return the error for a word that is neither an option nor a value: how it may have been meant."""
     text = f"unexpected {shorten(word)}"
     name = word.lstrip("-").partition("=")[0]
@@ -232,24 +255,17 @@ def unexpected_word(word: str, known: Mapping[str, Option], command: str) -> Usa
     return UsageError(f"{text}; options are written --name=value, and {_help(command)} lists them")
 
 
-def nearest_options(name: str, known: Iterable[str]) -> list[str]:
+def nearest_options(name: str, known: Collection[str]) -> list[str]:
     """Return the options that a name may have meant, nearest first: `num_episodes` finds `dataset.num_episodes`."""
-    scores = {option: _likeness(name[:_LONGEST].replace("-", "_"), option) for option in known}
-    best = max(scores.values(), default=0.0)
-    near = [option for option, score in scores.items() if score >= max(_NEAR, best - _AS_NEAR)]
-    return sorted(near, key=lambda option: -scores[option])[:_FEW]
-
-
-def _likeness(name: str, option: str) -> float:
-    """Return the likeness of two dotted names, 0 to 2; 1 and more where their last words are equal."""
-    leaf, other = name.rpartition(".")[2], option.rpartition(".")[2]
-    whole = SequenceMatcher(None, name, option).ratio()
-    if leaf == other:
-        return 1 + whole
-    if len(leaf) >= 3 and (other.startswith(leaf) or leaf.startswith(f"{other}_")):
-        return max(0.8, whole)
-    return max(whole, 0.95 * SequenceMatcher(None, leaf, other).ratio())
+    by_leaf: dict[str, list[str]] = {}
+    for option in known:
+        by_leaf.setdefault(option.rpartition(".")[2], []).append(option)
+    name = name.replace("-", "_")
+    leaf = name.rpartition(".")[2]
+    leaves = [leaf] if leaf in by_leaf else nearest_names(leaf, by_leaf)
+    of_leaf = [option for one in leaves for option in by_leaf[one]]
+    return list(dict.fromkeys([*of_leaf, *nearest_names(name, known)]))[:_FEW]
 
 
 def _help(command: str) -> str:
-    return f"manip-il {command or 'COMMAND'} --help"
+    return f"manip-il {command or 'COMMAND'} --help=all"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from manip_il.mdp import Episode
 
 INTERVAL = 5.0  # [s] between plain lines
-_UNITS = ("B", "kB", "MB", "GB", "TB")
 
 _quiet = False
 
@@ -70,15 +69,15 @@ def warn(*lines: str) -> None:
 
 
 @contextmanager
-def progress(total: int | None, description: str, *, of_bytes: bool = False) -> Generator[Progress]:
-    """Show the progress of `total` steps (None where the number is unknown), or bytes, while the `with` lasts."""
+def progress(total: int | None, description: str) -> Generator[Progress]:
+    """Show the progress of `total` steps (None if the number is unknown) while the `with` lasts."""
     if _quiet:
         yield Progress()
     elif sys.stderr.isatty():
-        with _bar(total, description, of_bytes) as bar:
+        with _bar(total, description) as bar:
             yield bar
     else:
-        lines = _Lines(total, description, bytes_text if of_bytes else _count_text)
+        lines = _Lines(total, description)
         try:
             yield lines
         finally:
@@ -88,8 +87,8 @@ def progress(total: int | None, description: str, *, of_bytes: bool = False) -> 
 class _Lines(Progress):
     """Lines at most every `INTERVAL`, and one at the end: `record: 12/50 (3.4/s, success 0.92)`."""
 
-    def __init__(self, total: int | None, description: str, text: Callable[[float], str]):
-        self._total, self._description, self._text = total, description, text
+    def __init__(self, total: int | None, description: str):
+        self._total, self._description = total, description
         self._done = 0
         self._fields: dict[str, object] = {}
         self._start = self._printed = time.monotonic()
@@ -109,9 +108,9 @@ class _Lines(Progress):
 
     def _print(self, now: float) -> None:
         self._printed, self._fresh = now, False
-        count = "/".join(self._text(number) for number in (self._done, self._total) if number is not None)
+        count = "/".join(str(number) for number in (self._done, self._total) if number is not None)
         rate = self._done / max(now - self._start, 1e-9)
-        details = ", ".join(filter(None, [f"{self._text(rate)}/s", _fields_text(self._fields)]))
+        details = ", ".join(filter(None, [f"{rate:.3g}/s", _fields_text(self._fields)]))
         print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
 
 
@@ -126,33 +125,20 @@ class _Bar(Progress):
 
 
 @contextmanager
-def _bar(total: int | None, description: str, of_bytes: bool) -> Generator[_Bar]:
+def _bar(total: int | None, description: str) -> Generator[_Bar]:
     from rich import progress as rich_progress
     from rich.console import Console
 
-    steps = (rich_progress.MofNCompleteColumn(),)
     columns = (
         rich_progress.TextColumn("{task.description}", markup=False),
         rich_progress.BarColumn(),
-        *((rich_progress.DownloadColumn(), rich_progress.TransferSpeedColumn()) if of_bytes else steps),
+        rich_progress.MofNCompleteColumn(),
         rich_progress.TimeRemainingColumn(),
         rich_progress.TextColumn("{task.fields[details]}", markup=False),
     )
     # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
     with rich_progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as bar:
         yield _Bar(bar, bar.add_task(description, total=total, details=""))
-
-
-def bytes_text(count: float) -> str:
-    """Return a number of bytes as people read it: `1.2 GB`."""
-    unit = 0
-    while count >= 999.5 and unit < len(_UNITS) - 1:
-        count, unit = count / 1000, unit + 1
-    return f"{count:{'.3g' if unit else '.0f'}} {_UNITS[unit]}"
-
-
-def _count_text(count: float) -> str:
-    return f"{count}" if isinstance(count, int) else f"{count:.3g}"
 
 
 def _fields_text(fields: dict[str, object]) -> str:

@@ -9,11 +9,15 @@ from typing import ClassVar
 
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.outputs import require_ours, require_short_path
-from manip_il.cli.progress import bytes_text, is_quiet, say
+from manip_il.cli.progress import is_quiet, say
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.option import option
 
 REMOTES = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
+
+
+def _require_source(path: Path) -> None:
+    require_folder(path, "the folder of a dataset, a run or a policy")
 
 
 @dataclass
@@ -26,28 +30,28 @@ class PushOptions:
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
-    source: Path = option(MISSING, "folder of a dataset, a run or a policy", positional=True)
+    source: Path = option(MISSING, "folder of a dataset, a run or a policy", positional=True, check=_require_source)
     remote: str = option(MISSING, REMOTES, positional=True)
     dry_run: bool = option(False, "only list what would be uploaded and removed")
     journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
     private: bool = option(False, "make a new repository on the Hub private")
 
-    def check(self) -> None:
-        """Refuse a missing folder."""
-        require_folder(self.source, "the folder of a dataset, a run or a policy")
-
     def run(self) -> None:
         """Examine, list, upload, switch over; print what was done."""
+        from rich import filesize
+
         from manip_il.store.transfer import open_remote, push
 
         remote = open_remote(self.remote, private=self.private, quiet=is_quiet() or not sys.stderr.isatty())
         plan = push(self.source, remote, journals=self.journals, dry_run=self.dry_run)
         sizes = {path: plan.manifest.files[path].size for path in plan.upload}
         for path, size in sizes.items() if self.dry_run else ():
-            say(f"upload   {path} ({bytes_text(size)})")
+            say(f"upload   {path} ({filesize.decimal(size)})")
         for path in plan.remove if self.dry_run else ():
             say(f"remove   {path}")
-        counts = f"{len(sizes)} files, {bytes_text(sum(sizes.values()))}, {'to upload' * self.dry_run or 'uploaded'}"
+        counts = (
+            f"{len(sizes)} files, {filesize.decimal(sum(sizes.values()))}, {'to upload' * self.dry_run or 'uploaded'}"
+        )
         rest = f"{len(plan.remove)} {'to remove' * self.dry_run or 'removed'}; {len(plan.local) - len(sizes)} unchanged"
         say(f"{remote.name}: {counts}; {rest}{'; nothing was done' * self.dry_run}")
         if not self.dry_run:
@@ -77,6 +81,8 @@ class PullOptions:
 
     def run(self) -> None:
         """Fetch, verify, rename; print what was pulled."""
+        from rich import filesize
+
         from manip_il.store.transfer import open_remote, pull
 
         remote = open_remote(self.remote, revision=self.revision, quiet=is_quiet() or not sys.stderr.isatty())
@@ -86,8 +92,8 @@ class PullOptions:
             remedy = "replace them with --overwrite=true, or name a new folder"
             raise UsageError(f"{self.target} or its journals exist already; {remedy}") from None
         for path, file in manifest.files.items() if self.dry_run else ():
-            say(f"pull     {path} ({bytes_text(file.size)})")
-        size = bytes_text(sum(file.size for file in manifest.files.values()))
+            say(f"pull     {path} ({filesize.decimal(file.size)})")
+        size = filesize.decimal(sum(file.size for file in manifest.files.values()))
         what = f"a {manifest.kind} of {len(manifest.files)} files, {size}"
         say(f"{remote.name}: {what}; nothing was done" if self.dry_run else f"{self.target}: {what}, all verified")
         if not self.dry_run and manifest.kind == "dataset":

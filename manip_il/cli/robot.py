@@ -1,17 +1,18 @@
-"""`manip-il robot new`: a first YAML for an arm of one's own; `manip-il robot check`: what that arm can do."""
+"""`manip-il robot new`, `check`, `certify`: a YAML for an arm of one's own, and what that arm and its expert can do."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il import checks
-from manip_il.cli.inputs import require_folder
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import open_output, require_new
+from manip_il.cli import common_options as common
+from manip_il.cli.inputs import open_driver, require_file, require_folder
+from manip_il.cli.options import Given, command_line, group, to_plain
+from manip_il.cli.outputs import REPORT_FILE, Output
 from manip_il.cli.progress import progress, say, warn
 from manip_il.errors import ManipError, RenderError, UnknownName, UsageError
 from manip_il.option import option
@@ -24,6 +25,10 @@ SUFFIXES = (".yaml", ".yml")
 PAGE = "check.html"
 
 
+def _require_model(path: Path) -> None:
+    require_file(path, "an MJCF")
+
+
 @dataclass
 class RobotNewOptions:
     """Write a first YAML for an arm's MJCF: hand, fingers and workspace as they look on the model.
@@ -34,16 +39,13 @@ class RobotNewOptions:
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"
-    model: Path = option(MISSING, "the arm's MJCF", positional=True)
-    gripper: Path | None = option(None, "the gripper's MJCF, where that is another file")
+    model: Path = option(MISSING, "the arm's MJCF", positional=True, check=_require_model)
+    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", check=_require_model)
     output: Path | None = option(None, "the YAML; by default beside the model, with its name")
     overwrite: bool = option(False, "replace an existing file")
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
-        for path in filter(None, (self.model, self.gripper)):
-            if not path.is_file():
-                raise UsageError(f"{path} is not there; expected an MJCF")
         target = self._target()
         if target.suffix not in SUFFIXES:
             raise UsageError(f"--output is {target}; expected a file, NAME.yaml")
@@ -95,6 +97,11 @@ def _measure(
         return check_robot(robot, tasks, episodes, engine, on_result)
 
 
+def _require_task(task: str) -> None:
+    if task not in NAMES:
+        raise UnknownName("task in --tasks:", task, NAMES)
+
+
 @dataclass
 class RobotCheckOptions:
     """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
@@ -106,21 +113,15 @@ class RobotCheckOptions:
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
     robot: str = option(MISSING, "its YAML, or the name of one that ships", positional=True)
-    tasks: list[str] = option(list, f"of {', '.join(NAMES)}; by default all")
-    episodes: int = option(50, "of the expert at each task, and as many with random actions; 0 for none")
-    output_dir: Path = option(Path("runs/robot_check"), f"folder of {PAGE}")
-    overwrite: bool = option(False, "replace an existing check")
+    tasks: list[str] = option(list, f"of {', '.join(NAMES)}; by default all", check=_require_task)
+    episodes: int = option(
+        50, "of the expert at each task, and as many with random actions; 0 for none", at_least=0, at_most=1_000_000
+    )
+    output: Output = group(Output(Path("runs/robot_check")), prefix="")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong, and a robot that cannot be used."""
-        from manip_il.seeding import stream_seeds
-
-        if self.episodes < 0:
-            raise UsageError(f"--episodes is {self.episodes}; expected 0 or more")
-        stream_seeds("validation", self.episodes)
-        if odd := next((task for task in self.tasks if task not in NAMES), None):
-            raise UnknownName("task in --tasks:", odd, NAMES)
-        require_new(self.output_dir, overwrite=self.overwrite)
+        self.output.check()
         from manip_il.robots.gripper import sweep
         from manip_il.robots.table import get_robot
 
@@ -132,7 +133,7 @@ class RobotCheckOptions:
         from manip_il.evaluation.robot_page import check_report, looks
 
         tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
-        with open_output(self) as folder:
+        with self.output.open(self) as folder:
             with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
                 found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
             found.write(folder / FILE_NAME)
@@ -160,3 +161,58 @@ class RobotCheckOptions:
         say(verdict(found))
         for line in advice(found):
             say(f"change: {line}")
+
+
+@dataclass
+class VisitorGroup:
+    """`--policy.*` of the policy whose visited states the expert takes over in."""
+
+    path: Path | None = common.policy_option()
+
+
+@dataclass
+class CertifyOptions:
+    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json and a report.
+
+    With --policy.path it also takes over from that policy.
+    """
+
+    example: ClassVar[str] = "manip-il robot certify --policy.path=runs/dagger --output_dir=runs/certificate"
+    first: ClassVar[tuple[str, ...]] = ("policy.path", "robot.type", "task.type", "cases", "output_dir")
+    policy: VisitorGroup = field(default_factory=VisitorGroup)
+    env: Given = common.env_given(of_policy=True)
+    cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)
+    seed: int = common.seed_option()
+    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
+    trust: bool = common.trust_option()
+    output: Output = group(Output(Path("runs/certificate")), prefix="")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self.output.check()
+        common.env_config(self.env)
+
+    def run(self) -> None:
+        """Run the episodes, write `certificate.json`, print the tables."""
+        from manip_il.evaluation.certificate import FILE_NAME, certificate_report
+        from manip_il.evaluation.certify import certify, count_episodes
+        from manip_il.evaluation.policy_folder import find_policy
+        from manip_il.evaluation.tables import print_table
+
+        local = self.engine.engine == "local"
+        env, *_ = open_driver(self.policy.path, "expert", self.env, draw=local, trust=self.trust, quiet=True)
+        policy = find_policy(self.policy.path) if self.policy.path else None
+        engine, count = self.engine.open(), count_episodes(env, self.cases, policy)
+        with self.output.open(self) as folder:
+            with progress(count, f"certify {env.robot} {env.task}") as bar, engine:
+                advance = bar.advance
+                certificate = certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)
+            certificate.write(folder / FILE_NAME)
+            report = certificate_report(certificate, command_line("robot certify", self), to_plain(self))
+            report.write(folder / REPORT_FILE)
+        for table in certificate.tables():
+            print_table(table, empty="-")
+        for line in certificate.facts():
+            say(line)
+        say(f"result: {folder / FILE_NAME}")
+        say(f"report: {folder / REPORT_FILE}")

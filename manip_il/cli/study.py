@@ -1,29 +1,20 @@
-"""`manip-il study`: the same runs for several arms and training seeds, tested and compared.
-
-Arms that differ only after round 0 share it: the same options and seed would give the same bytes.
-"""
+"""A study of `manip-il compare`: the same runs for several arms and training seeds, tested and compared."""
 
 from __future__ import annotations
 
-import json
-import shlex
-import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING
 
-from manip_il.cli import common_options as common
-from manip_il.cli.arms import ROUND_0, ArmOptions, with_start_cost, with_start_policy
-from manip_il.cli.compare import check_policies
-from manip_il.cli.dagger import FREE, METRICS_FILE, DaggerOptions
-from manip_il.cli.options import to_plain
-from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, read_jsonl, require_output, save_options
+from manip_il.cli.arms import ArmOptions, with_start_cost, with_start_policy
+from manip_il.cli.compare import CompareOptions, check_policies
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, atomic_write
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.study_file import ExpertTest, Plan, check_same_file, keep_file, read_plan
-from manip_il.data.atomic import new_folder
-from manip_il.errors import NoEffect, UsageError
-from manip_il.option import option
+from manip_il.errors import NoEffect
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
@@ -34,38 +25,17 @@ if TYPE_CHECKING:
     from manip_il.evaluation.trial import Trial
     from manip_il.sim.config import EnvConfig
 
-# Options on which round 0 (demonstrations and the first fit) does not depend
-_AFTER_ROUND_0 = (
-    *("method", "rounds", "episodes_per_round", "disturbed_share", "beta", "label", "query", "branch_steps"),
-    *("refit", "refit_steps", "output_dir", "resume", "overwrite", "workers", "engine"),
-)
+
+def run_study(options: CompareOptions, file: Path) -> None:
+    """Run what is not there yet of a study, test it, print and write the answer. Raises `UsageError` for its file."""
+    _Study(options, file).run()
 
 
-@dataclass
-class StudyOptions:
-    """Run every arm of FILE with several training seeds, test all on the same unseen seeds, and compare.
+class _Study:
+    """One study: its runs, their tests, and what comes of them."""
 
-    FILE holds `common` and `arms` (options of manip-il dagger), training_seeds, eval, checkpoint, at, baseline and
-    target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json, table.md and report.html the results.
-    """
-
-    example: ClassVar[str] = "manip-il study configs/studies/chunk_labels.yaml --output_dir=runs/labels"
-    file: Path = option(MISSING, "YAML of the study", positional=True)
-    training_seeds: int | None = option(None, "in place of the file's; a resumed study may have more")
-    engine: Literal["local", "ray"] = common.engine_option()
-    workers: int | None = common.workers_option()
-    trust: bool = common.trust_option()
-    output_dir: Path = option(Path("runs/study"), "folder of the study")
-    resume: bool = option(False, "continue an interrupted study")
-    overwrite: bool = option(False, "replace an existing study")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        if not self.file.is_file():
-            wanted = "the YAML of a study, such as configs/studies/*.yaml"
-            raise UsageError(f"{self.file} does not exist; expected {wanted}")
-        common.require_workers(self.workers)
-        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+    def __init__(self, options: CompareOptions, file: Path) -> None:
+        self._asked, self._file, self._root = options, file, options.output.output_dir
 
     def run(self) -> None:
         """Run what is not there yet, test it, print and write the answer."""
@@ -73,11 +43,11 @@ class StudyOptions:
         from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, table_markdown
         from manip_il.evaluation.tables import print_table
 
-        plan = read_plan(self.file, self.training_seeds, self.trust)
+        plan = read_plan(self._file, self._asked.training_seeds, self._asked.trust)
         experts = expert_trials(plan)
-        if self.resume:
-            check_same_file(self.output_dir, plan.file)
-        with open_output(self, (*FREE, "file", "training_seeds")) as folder:  # what the file says is compared above
+        if self._asked.output.resume:
+            check_same_file(self._root, plan.file)
+        with self._asked.output.open(self._asked) as folder:
             keep_file(folder, plan.file)
             self._learn(plan)
             study = self._test(plan, experts)
@@ -106,25 +76,20 @@ class StudyOptions:
             # the report is what a run writes last
             if not ((folder / REPORT_FILE).is_file() and run_finished(folder)):
                 say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
-                self._run(plan, name, seed)
+                self._options(plan, name, seed).run()
             member = self._member(plan, name, seed)
             member.select(plan.rule, plan.rule.limit({member.name: member.history}))
 
-    def _run(self, plan: Plan, name: str, seed: int) -> None:
-        options = self._options(plan, name, seed)
-        if isinstance(options, DaggerOptions):
-            others = [self._options(plan, other, seed) for other in plan.arms if other != name]
-            share_start(options, [one for one in others if isinstance(one, DaggerOptions)])
-        options.run()
-
     def _options(self, plan: Plan, name: str, seed: int) -> ArmOptions:
         own = with_start_policy(plan.arms[name], lambda arm: self._folder(arm, seed))
-        own = replace(own, seed=seed, output_dir=self._folder(name, seed), resume=True, overwrite=False)
-        own = replace(own, workers=self.workers)
-        return replace(own, engine=self.engine) if isinstance(own, DaggerOptions) else own
+        output = ResumableOutput(self._folder(name, seed), resume=True)
+        own = replace(own, settings=own.settings | {"seed": seed}, output=output)
+        engine = self._asked.engine
+        if isinstance(own, DaggerOptions):
+            return replace(own, engine=engine)
+        return replace(own, workers=engine.workers)
 
     def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Study:
-        from manip_il.collect.workers import Engine
         from manip_il.evaluation.arm import Arm
         from manip_il.evaluation.study import Study
 
@@ -133,9 +98,9 @@ class StudyOptions:
         limit = plan.rule.limit({member.name: member.history for arm in runs.values() for member in arm})
         chosen = {name: [member.select(plan.rule, limit) for member in arm] for name, arm in runs.items()}
         trials = {name: self._trial(plan, name, arm) for name, arm in chosen.items()}
-        kept = f"every finished run and evaluation, in {self.output_dir}"
-        with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            last = (self.output_dir, engine, stages)
+        kept = f"every finished run and evaluation, in {self._root}"
+        with Stages(kept) as stages, self._asked.engine.open() as engine:
+            last = (self._root, engine, stages)
             arms = [Arm(name, tuple(one.measure(trials[name], *last) for one in arm)) for name, arm in chosen.items()]
             solved = {name: self._test_expert(name, tests, engine, stages) for name, tests in experts.items()}
         return Study(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved, plan.within)
@@ -145,7 +110,7 @@ class StudyOptions:
     ) -> dict[str, EvalResult]:
         """Return what the expert solves of an arm's task: name of the test -> result."""
         names = {test: f"expert, {arm}, {test}" for test in trials}
-        files = {test: trial.file(self.output_dir, None) for test, trial in trials.items()}
+        files = {test: trial.file(self._root, None) for test, trial in trials.items()}
         return {test: trial.measure(None, names[test], files[test], engine, stages) for test, trial in trials.items()}
 
     def _trial(self, plan: Plan, name: str, members: Iterable[Member]) -> Trial:
@@ -154,8 +119,8 @@ class StudyOptions:
 
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
-        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self.trust)
-        check_policies(policies, trial, self.output_dir, self.engine)
+        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self._asked.trust)
+        check_policies(policies, trial, self._root, self._asked.engine.engine)
         return trial
 
     def _member(self, plan: Plan, name: str, seed: int) -> Member:
@@ -165,28 +130,24 @@ class StudyOptions:
         return replace(run, history=with_start_cost(plan.arms[name], run.history, start))
 
     def _folder(self, name: str, seed: int) -> Path:
-        return self.output_dir / name / f"seed_{seed}"
+        return self._root / name / f"seed_{seed}"
 
     def _report(self, plan: Plan, study: Study) -> None:
         from manip_il.evaluation.compare_report import study_report
 
         result = study.arms[0].members[0].test
-        words = ["manip-il", "study", str(self.file), f"--output_dir={self.output_dir}"]
-        if self.training_seeds is not None:
-            words.append(f"--training_seeds={self.training_seeds}")
-        if self.trust:
-            words.append("--trust=true")
         what = f"{result.robot} {result.task}" if plan.baseline else result.robot
-        title = f"Study: {what}, {self.file.stem}"
-        study_report(study, title, shlex.join(words), to_plain(plan.file)).write(self.output_dir / REPORT_FILE)
+        command = command_line("compare", self._asked)
+        page = study_report(study, f"Study: {what}, {self._file.stem}", command, to_plain(plan.file))
+        page.write(self._root / REPORT_FILE)
 
     def _next(self, study: Study) -> str:
         best = max(study.arms, key=lambda arm: arm.test_rate)
         other = study.baseline if best.name != study.baseline else study.arms[-1].name
         if other in (None, best.name):
             return f"manip-il eval --policy.path={best.members[0].policy} --eval.films=3"
-        left, right = self.output_dir / other, self.output_dir / best.name
-        return f"manip-il compare {left} {right} --at=seconds --output_dir={self.output_dir}_seconds"
+        left, right = self._root / other, self._root / best.name
+        return f"manip-il compare {left} {right} --at=seconds --output_dir={self._root}_seconds"
 
 
 def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
@@ -215,27 +176,3 @@ def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
         return Trial.of(env, seeds, test.suite)
     except NoEffect:
         return None
-
-
-def same_start(left: DaggerOptions, right: DaggerOptions) -> bool:
-    """Return whether two runs have the same round 0."""
-    names = [one.name for one in fields(DaggerOptions) if one.name not in _AFTER_ROUND_0]
-    return all(getattr(left, name) == getattr(right, name) for name in names)
-
-
-def share_start(options: DaggerOptions, others: Iterable[DaggerOptions]) -> bool:
-    """Begin a run that is not there yet with round 0 of another that has the same; return whether there was one.
-
-    Its line of metrics comes along, so that the run is charged for what its round 0 took.
-    """
-    if options.output_dir.exists():
-        return False
-    for other in others:
-        records = read_jsonl(other.output_dir / METRICS_FILE)
-        if same_start(options, other) and records and (other.output_dir / ROUND_0).is_dir():
-            with new_folder(options.output_dir) as folder:
-                shutil.copytree(other.output_dir / ROUND_0, folder / ROUND_0, symlinks=True)
-                atomic_write(folder / METRICS_FILE, json.dumps(records[0]) + "\n")
-                save_options(folder, options)
-            return True
-    return False

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il import checks
 from manip_il.cli.arms import ArmOptions, first_arm, learning_env, read_arm
-from manip_il.cli.common_options import TrialGroup
+from manip_il.cli.compare import TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.options import Open, to_plain
 from manip_il.cli.outputs import atomic_write
-from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml
+from manip_il.cli.parsing import check_values, dump_yaml, from_layers, from_yaml
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.option import option
 from manip_il.seeding import MAX_SEED
@@ -39,7 +39,7 @@ class ExpertTest:
     robot: str | None = None
     suite: str = "nominal"
     vary: list[str] = field(default_factory=list[str])
-    n_episodes: int = 500
+    n_episodes: int = option(500, "test episodes", at_least=1)
 
 
 @dataclass
@@ -55,13 +55,13 @@ class StudyFile:
     common: Open = field(default_factory=dict[str, Any])
     arms: Open = field(default_factory=dict[str, Any])
     expert: Open = field(default_factory=dict[str, Any])
-    training_seeds: int = 3
+    training_seeds: int = option(3, "runs of every arm", at_least=1, at_most=MAX_SEED)
     eval: TrialGroup = field(default_factory=TrialGroup)
     suite: str = "nominal"
     checkpoint: Literal["best", "last"] = "best"
     at: str = "end"
     baseline: str | None = option(None, "the arm that others are compared with; by default the first")
-    target: float = option(0.95, "validation success whose cost is reported")
+    target: float = option(0.95, "validation success whose cost is reported", at_least=0.0, at_most=1.0)
     within: list[str] = option(list, "costs up to which the best validation success is reported")
 
 
@@ -161,12 +161,7 @@ def _check_numbers(path: Path, file: StudyFile) -> None:
 
     if not file.arms:
         raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
-    if not 1 <= file.training_seeds <= MAX_SEED:
-        raise UsageError(f"training_seeds is {file.training_seeds}; expected 1 to {MAX_SEED}")
-    if file.eval.n_episodes < 1:
-        raise UsageError(f"{path}: eval.n_episodes is {file.eval.n_episodes}; expected at least 1")
-    if not 0 < file.target <= 1:
-        raise UsageError(f"{path}: target is {file.target}; expected a share above 0 and up to 1, such as 0.95")
+    check_values(file, "")
     for name in file.arms:
         is_name = isinstance(name, str) and ARM_NAME.fullmatch(name) and len(name) <= checks.LONGEST_NAME
         if not is_name or ".." in name or name == FOLDER:
@@ -195,8 +190,7 @@ def _expert_test(path: Path, name: str, tree: Any) -> ExpertTest:
     if not isinstance(tree, dict | None):
         raise UsageError(f"{origin}: expected robot, suite, vary and n_episodes, got {checks.shorten(tree)}")
     test = from_layers(ExpertTest, [(origin, tree or {})])
-    if test.n_episodes < 1:
-        raise UsageError(f"{origin}: n_episodes is {test.n_episodes}; expected at least 1")
+    check_values(test, f"{origin}: ")
     if test.vary and test.suite != "nominal":
         raise UsageError(f"{origin}: has suite and vary; expected one of them")
     return test

@@ -1,4 +1,4 @@
-"""`manip-il theory`: the theorems on cloning and DAgger, seen on small processes, and on the rounds of a run."""
+"""`manip-il theory`: the proven bounds of cloning and DAgger, on small processes and on the rounds of a run."""
 
 from __future__ import annotations
 
@@ -9,41 +9,39 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_folder
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import open_output, require_new
+from manip_il.cli.options import command_line, group, to_plain
+from manip_il.cli.outputs import Output
 from manip_il.cli.progress import progress, say
-from manip_il.errors import UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.theory.shift import Shift
 
 
+def _require_run(path: Path) -> None:
+    require_folder(path, "a run of manip-il dagger")
+
+
 @dataclass
 class TheoryOptions:
-    """Show what is proved of cloning and DAgger: on processes solved exactly, on linear systems, on the arm.
+    """Compare the proven bounds of cloning and DAgger with processes solved exactly, linear systems and the arm.
 
     Writes report.html and theory.json. SOURCE is the folder of a run of `manip-il dagger`: its distribution shift,
     round by round, beside the theorem's bound.
     """
 
     example: ClassVar[str] = "manip-il theory runs/dagger --output_dir=runs/theory"
-    source: Path | None = option(None, "a run of manip-il dagger, to look at its rounds", positional=True)
-    episodes: int = option(50, "of the expert and of every round's policy")
-    cases: int = option(30, "wrong actions of each kind, to find what one costs the expert")
-    workers: int | None = common.workers_option()
-    output_dir: Path = option(Path("runs/theory"), "folder of report.html")
-    overwrite: bool = option(False, "replace an existing one")
+    source: Path | None = option(
+        None, "a run of manip-il dagger, to look at its rounds", positional=True, check=_require_run
+    )
+    episodes: int = option(50, "of the expert and of every round's policy", at_least=2)
+    cases: int = option(30, "wrong actions of each kind, to find what one costs the expert", at_least=1)
+    workers: int | None = common.processes_option()
+    output: Output = group(Output(Path("runs/theory")), prefix="")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        for name, least in (("episodes", 2), ("cases", 1)):
-            if getattr(self, name) < least:
-                raise UsageError(f"--{name} is {getattr(self, name)}; expected at least {least}")
-        common.require_workers(self.workers)
-        if self.source is not None:
-            require_folder(self.source, "a run of manip-il dagger")
-        require_new(self.output_dir, overwrite=self.overwrite)
+        self.output.check()
 
     def run(self) -> None:
         """Compute, measure, write the page and the file, print the slopes."""
@@ -54,7 +52,7 @@ class TheoryOptions:
         from manip_il.theory.report import FILE_NAME, PAGE, Theory, summary_lines, theory_report
 
         timings, begin = dict[str, float](), time.monotonic()
-        with open_output(self) as folder:
+        with self.output.open(self) as folder:
             shift = None
             if self.source is not None:
                 shift = self._shift(self.source)
@@ -80,7 +78,7 @@ class TheoryOptions:
         from manip_il.theory.shift import find_rounds, measure_shift
 
         rounds = find_rounds(run)
-        env = common_env(read_arm(run).members, lambda _: common.EnvOptions().env_config())
+        env = common_env(read_arm(run).members, lambda _: common.env_config({}))
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
         with progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.advance())

@@ -5,20 +5,20 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import check_dataset, require_dataset, start_policy
-from manip_il.cli.options import Open
-from manip_il.cli.outputs import check_same_options, prepare_output, require_output, save_options
+from manip_il.cli.data_edits import RedrawOptions
+from manip_il.cli.inputs import dataset_differences, require_dataset, require_file, start_policy
+from manip_il.cli.options import Given, given, group
+from manip_il.cli.outputs import ResumableOutput, check_same_options, prepare_output, save_options
 from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
-from manip_il.cli.redraw import RedrawOptions
 from manip_il.data.atomic import exclusive
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig, check_weights
-from manip_il.option import option, option_of
+from manip_il.option import option
 
 if TYPE_CHECKING:  # the learner takes a second to import
     import numpy as np
@@ -29,17 +29,16 @@ if TYPE_CHECKING:  # the learner takes a second to import
     from manip_il.learn.sources import Sources
 
 RANK = "RANK"  # the variable by which processes that were started together know their place
-# What may differ when a fit is resumed: nothing of it changes the weights.
-_FREE = ("threads", "log_freq", "save_freq", "dataset.root", "output_dir", "tensorboard", "wandb", "trust")
 
 
 @dataclass
 class SourceGroup:
     """`--dataset.*` of what is learnt from."""
 
-    root: list[Path] = option(MISSING, "folder of a LeRobot v3.0 dataset; several to learn from all")
+    root: list[Path] = option(
+        MISSING, "folder of a LeRobot v3.0 dataset; several to learn from all", check=require_dataset, free=True
+    )
     weights: list[float] = option(list, "share of the samples drawn from each of several; by default by its frames")
-    eval_split: float = option_of(FitConfig, "eval_split")
 
 
 @dataclass
@@ -54,45 +53,36 @@ class TrainOptions:
     example: ClassVar[str] = (
         "manip-il train --dataset.root=datasets/demos --policy.type=act --policy.chunk_size=16 --output_dir=runs/act"
     )
+    first: ClassVar[tuple[str, ...]] = (
+        *("dataset.root", "policy", "observation", "action_space", "steps", "batch_size", "output_dir", "resume"),
+    )
     dataset: SourceGroup
     redraw: int = option(
-        0, "learn from so many scenes drawn anew from the dataset's states (manip-il data redraw), for pictures"
+        0,
+        "learn from so many scenes drawn anew from the dataset's states (manip-il data redraw), for pictures",
+        at_least=0,
     )
     weights: Path | None = option(
-        None, "draw frames by the progress in this file of manip-il data score, as LeRobot's RA-BC weighs them"
+        None,
+        "draw frames by the progress in this file of manip-il data score, as LeRobot's RA-BC weighs them",
+        check=lambda path: require_file(path, "rabc.parquet of manip-il data score"),
     )
-    policy: Open = option_of(FitConfig, "policy")
-    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
-    observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
-    steps: int | None = option_of(FitConfig, "steps")
-    batch_size: int | None = option_of(FitConfig, "batch_size")
-    lr: float | None = option_of(FitConfig, "lr")
-    optimizer: Open = option_of(FitConfig, "optimizer")
-    scheduler: Open = option_of(FitConfig, "scheduler")
-    image_augment: bool | None = option_of(FitConfig, "image_augment")
-    output_dir: Path = option(Path("runs/train"), "folder of the run")
-    seed: int = option(0, "seed of weights and batches, 0 to 1000")
-    threads: int = option_of(FitConfig, "threads")
-    save_freq: int | None = option_of(FitConfig, "save_freq")
-    log_freq: int = option_of(FitConfig, "log_freq")
-    tensorboard: bool = option_of(FitConfig, "tensorboard")
-    wandb: Open = option_of(FitConfig, "wandb")
+    fit: Given = given(FitConfig, prefix="")
+    seed: int = option(0, "seed of weights and batches, 0 to 1000", at_least=0, at_most=1000)
     trust: bool = common.trust_option()
-    resume: bool = option(False, "continue from the last checkpoint")
-    overwrite: bool = option(False, "replace an existing run")
+    output: ResumableOutput = group(ResumableOutput(Path("runs/train")), prefix="")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         config = self._fit_config()
         check_weights(self.dataset.root, self.dataset.weights)
-        for root in self.dataset.root:
-            require_dataset(root)
-        self._check_redraw()
-        self._check_weights()
+        self._check_redraw(config)
+        if self.weights is not None and (len(self.dataset.root) > 1 or self.redraw):
+            raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
         if not self.redraw:
             self._check_columns(config)
         if _is_first_process():
-            require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+            self.output.check()
 
     def run(self) -> None:
         """Read the datasets, fit, and say where the checkpoint is."""
@@ -112,15 +102,16 @@ class TrainOptions:
         if _is_first_process():
             say(f"checkpoint: {path}")
             robot = common.own_robot(sources.spec.robot, suffix=".yaml")
-            say(f"next: manip-il eval --policy.path={path}{robot} --output_dir={self.output_dir}/eval")
+            say(f"next: manip-il eval --policy.path={path}{robot} --output_dir={self.output.output_dir}/eval")
 
     def _prepare(self, held: contextlib.ExitStack) -> None:
         """Hold the run's folder, emptied or with the run to resume."""
         if _is_first_process():
-            held.enter_context(exclusive(self.output_dir))
-            prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-            if self.resume:
-                check_same_options(self.output_dir, self, _FREE)
+            folder, resume = self.output.output_dir, self.output.resume
+            held.enter_context(exclusive(folder))
+            prepare_output(folder, resume=resume, overwrite=self.output.overwrite)
+            if resume:
+                check_same_options(folder, self)
 
     def _check_columns(self, config: FitConfig) -> None:
         """Refuse datasets that lack what the policy looks at."""
@@ -130,23 +121,13 @@ class TrainOptions:
         for root in self.dataset.root:
             input_columns(config, root, read_info(root))
 
-    def _check_redraw(self) -> None:
-        if self.redraw < 0:
-            raise UsageError(f"--redraw is {self.redraw}; expected the number of scenes")
+    def _check_redraw(self, config: FitConfig) -> None:
         if self.redraw and len(self.dataset.root) > 1:
             raise UsageError("--redraw is for one dataset; redraw each by manip-il data redraw, and give those")
-        if self.redraw and not self._fit_config().takes_images:
+        if self.redraw and not config.takes_images:
             raise UsageError("--redraw is for policies on pictures; use --policy.type=cnn, or --observation=images")
         if self.redraw and RANK in os.environ:
             raise UsageError("--redraw is not for processes that were started together; redraw by manip-il data redraw")
-
-    def _check_weights(self) -> None:
-        if self.weights is None:
-            return
-        if not self.weights.is_file():
-            raise UsageError(f"--weights is {self.weights}, which is no file; expected rabc.parquet of data score")
-        if len(self.dataset.root) > 1 or self.redraw:
-            raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
 
     def _frame_weights(self, lerobot: LeRobotFit, dataset: Dataset) -> NDArray[np.float64] | None:
         """Return how often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
@@ -164,10 +145,10 @@ class TrainOptions:
         """The dataset of redrawn scenes in the run's folder, which is held from here on; made where it is not there."""
         from manip_il.collect.edits import open_source
 
-        source, target = self.dataset.root[0], self.output_dir / "redrawn"
+        source, target = self.dataset.root[0], self.output.output_dir / "redrawn"
         open_source(source)  # refuses one without states before anything is removed
         self._prepare(held)
-        save_options(self.output_dir, self)
+        save_options(self.output.output_dir, self)
         if not target.is_dir():
             RedrawOptions(source, target, self.redraw, seed=self.seed).make()
         return target
@@ -175,10 +156,9 @@ class TrainOptions:
     def _fit_config(self) -> FitConfig:
         from manip_il.seeding import stream_base
 
-        made = ("policy", "eval_split", "seed", "init_from")
-        same = {one.name: getattr(self, one.name) for one in fields(FitConfig) if one.name not in made}
-        policy, seed = start_policy(self.policy), stream_base("training", self.seed)
-        return FitConfig(policy=policy, eval_split=self.dataset.eval_split, seed=seed, **same)
+        policy, seed = start_policy(self.fit.get("policy", {})), stream_base("training", self.seed)
+        own: Given = {"policy": policy, "seed": seed, "trust": self.trust}
+        return FitConfig(**self.fit | own)
 
     def _sources(self, config: FitConfig, roots: tuple[Path, ...]) -> Sources:
         """Return the datasets, which must agree with the first."""
@@ -189,7 +169,7 @@ class TrainOptions:
         sources = Sources(tuple(map(Dataset.open, roots)), tuple(self.dataset.weights))
         sources.check_alike(pictures=config.takes_images, language=config.kind not in PLAIN)
         for one in sources.datasets:
-            check_dataset(one.root, one.spec, one.fingerprint)
+            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
             odd = [key for key in one.cameras if config.takes_images and not one.features[key].is_rgb]
             warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
         looks = sources.looks if config.takes_images else []
@@ -201,15 +181,13 @@ class TrainOptions:
     def _fit(self, config: FitConfig, sources: Sources, weights: NDArray[np.float64] | None) -> Path:
         from manip_il.learn.train import Trainer
 
+        folder = self.output.output_dir
         with self._decoding(sources) as on_frames:
-            trainer = Trainer(
-                sources, config, self.output_dir, resume=self.resume, on_frames=on_frames, weights=weights
-            )
+            trainer = Trainer(sources, config, folder, resume=self.output.resume, on_frames=on_frames, weights=weights)
         if _is_first_process():
-            save_options(self.output_dir, self)  # now that what can be wrong has been found
+            save_options(folder, self)  # now that what can be wrong has been found
         steps = config.steps_per_checkpoint
-        kept = f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)"
-        with Stages(kept) as stages:
+        with Stages(f"every finished checkpoint in {folder} (one every {steps:,} steps)") as stages:
             stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
             return trainer.fit(stages.log)
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import check_policy, find_policy, observation_text, require_folder
+from manip_il.cli.inputs import open_driver, require_folder
+from manip_il.cli.options import Given
 from manip_il.cli.outputs import require_short_path
 from manip_il.cli.progress import say, warn
 from manip_il.errors import RenderError, UsageError
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from manip_il.sim.env import ManipEnv
 
 HOLD = 10  # control steps that an episode goes on for after success
-IN_A_FILE = 3  # episodes, where nobody says how many
+IN_A_FILE = 3  # episodes, if nobody says how many
 SIZE = (240, 320)  # of pictures that no policy looks at [pixels]
 SUFFIX = ".rrd"
 
@@ -33,7 +34,7 @@ SUFFIX = ".rrd"
 class WatchedPolicyGroup:
     """`--policy.*` of what drives."""
 
-    path: Path | None = option(None, "a checkpoint or a run")
+    path: Path | None = common.policy_option()
     type: Literal["expert", "random", "sliders"] | None = option(
         None, "instead of a checkpoint; sliders: those of the window; by default expert"
     )
@@ -49,12 +50,13 @@ class ViewOptions:
     """
 
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
+    first: ClassVar[tuple[str, ...]] = (
+        *("policy.path", "policy.type", "robot.type", "task.type", "n_episodes", "output"),
+    )
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
-    robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
-    task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
-    env: common.EnvGroup = field(default_factory=common.EnvGroup)
-    suite: str = option("nominal", common.SUITE_HELP)
-    n_episodes: int | None = option(None, f"episodes; by default without end, {IN_A_FILE} in a file")
+    env: Given = common.env_given(of_policy=True)
+    suite: str = common.suite_option()
+    n_episodes: int | None = option(None, f"episodes; by default without end, {IN_A_FILE} in a file", at_least=1)
     seed: int = common.seed_option()
     trust: bool = common.trust_option()
     output: Path | None = option(None, "write a file of Rerun's, FILE.rrd, in place of showing anything")
@@ -63,22 +65,15 @@ class ViewOptions:
         """Refuse what paths and values show to be wrong."""
         if self.policy.path is not None and self.policy.type is not None:
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random|sliders")
-        if self.n_episodes is not None and self.n_episodes < 1:
-            raise UsageError(f"--n_episodes is {self.n_episodes}; expected at least 1")
         self._seeds()
         if self.output is not None:
             require_short_path(self.output)
             if self.output.suffix != SUFFIX or self.output.is_dir():
                 raise UsageError(f"--output is {self.output}; expected a file, NAME{SUFFIX}")
             require_folder(self.output.parent, f"the folder of --output={self.output}")
-        if self.policy.path is not None:
-            find_policy(self.policy.path)
-        from manip_il.evaluation.suites import require_suite
-
-        require_suite(self.suite)
-        if self.robot.type == STOCK:
+        if self.env.get("robot") == STOCK:
             raise UsageError(f'--robot.type={STOCK} cannot be viewed; gymnasium shows it: render_mode="human"')
-        self.env.config(self.robot.type, self.task.type, shape=self.task.object, reward=self.task.reward)
+        common.env_config(self.env)
         if self.policy.type == "sliders":
             self._check_sliders()
 
@@ -118,24 +113,15 @@ class ViewOptions:
 
     def _job(self) -> RolloutJob:
         """Return the episodes to show; without pictures where no policy looks at any and a window is open."""
-        from manip_il.collect.drivers import PolicyDriver, driver_of
         from manip_il.collect.job import RolloutJob
         from manip_il.evaluation.suites import suite_conditions
-        from manip_il.learn.checkpoint import Checkpoint
         from manip_il.mdp import LONGEST_EPISODE
 
-        path = None if self.policy.path is None else find_policy(self.policy.path)
-        checkpoint = None if path is None else Checkpoint.open(path)
-        meta = checkpoint.origin if checkpoint else None
-        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
-        cameras = None if checkpoint is None else check_policy(checkpoint, env, trust=self.trust)
-        if cameras is not None and path is not None:
-            say(observation_text(cameras, path))
+        env, driver, cameras = open_driver(self.policy.path, self.policy.type or "expert", self.env, trust=self.trust)
         if cameras is None and not self._in_a_window:
             cameras = self._cameras(env)
         conditions = suite_conditions(self.suite, env, sees=cameras is not None)
-        driver = PolicyDriver((path,), trust=self.trust) if path else driver_of(self.policy.type)
-        if self.policy.type == "sliders" and not self.env.horizon:
+        if self.policy.type == "sliders" and not self.env.get("horizon"):
             env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
         return RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
 

@@ -79,7 +79,7 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
     """Return a run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` if they are not a run's.
 
-    Of `manip-il gail`, `airl` and `ppo` those iterations are rounds that were validated.
+    Of `manip-il rl gail`, `airl` and `ppo` those iterations are rounds that were validated.
     """
     unit: Literal["round", "iteration"] = "iteration" if records and "iteration" in records[0] else "round"
     rounds: list[Round] = []

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from manip_il.collect.drivers import ExpertDriver, PolicyDriver
 from manip_il.collect.environments import env_fingerprint
@@ -19,6 +19,7 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.policy_files import policy_cameras, policy_sha256
+from manip_il.mdp import Episode
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import EnvConfig
 from manip_il.stock.table import ROBOT as STOCK
@@ -33,12 +34,16 @@ class Progress(Protocol):
         """Begin a stage of so many episodes or steps."""
         ...
 
-    def episode(self, episode: EpisodeResult) -> None:
+    def episode(self, episode: Episode | EpisodeResult) -> None:
         """Count an episode."""
         ...
 
     def step(self) -> None:
         """Count a step."""
+        ...
+
+    def log(self, record: dict[str, Any]) -> None:
+        """Take a fit's metrics at a step."""
         ...
 
     def close(self) -> None:

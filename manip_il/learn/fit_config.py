@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.names import ACTION_SPACES, CNN, CONVERTED, JOINT_TARGET, MLP, OBSERVATIONS
@@ -27,6 +27,7 @@ class Defaults(NamedTuple):
     save_freq: int
 
 
+ActionSpace = Literal["joint_target", "joint_delta", "ee_delta"]
 LEROBOT = Defaults(100_000, 8, 20_000)
 DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}  # if they are not LeRobot's
 
@@ -64,10 +65,10 @@ class FitConfig:
         "an option of the policy by its name: type (mlp, cnn or one of LeRobot's), path of a policy to start from, or "
         "one that --policy.type=TYPE --help lists",
     )
-    action_space: str | None = option(
+    action_space: ActionSpace | None = option(
         None, "what is learnt, out of the same dataset; by default joint_delta by mlp and cnn, else joint_target"
     )
-    observation: str | None = option(
+    observation: Literal["state", "images", "both"] | None = option(
         None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
     )
     steps: int | None = option(None, f"gradient steps; {_by_default('steps')}")
@@ -79,15 +80,15 @@ class FitConfig:
     scheduler: Mapping[str, Any] = option(
         dict, "an option of a schedule of the learning rate in place of the policy's own: type, ..."
     )
-    eval_split: float = option(0.05, "share of the episodes held out for val_loss")
+    eval_split: float = option(0.05, "share of the episodes held out for val_loss", flag="dataset.eval_split")
     image_augment: bool | None = option(
         None, "random crops and colour jitter of pictures while training; by default for all but cnn"
     )
-    threads: int = option(1, "PyTorch threads; more help only on free cores")
-    save_freq: int | None = option(None, f"steps between checkpoints; {_by_default('save_freq')}")
-    log_freq: int = option(200, "steps between metrics")
-    tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
-    wandb: Mapping[str, Any] = option(dict, "an option of Weights & Biases: enable, project, mode, ...")
+    threads: int = option(1, "PyTorch threads; more help only on free cores", free=True)
+    save_freq: int | None = option(None, f"steps between checkpoints; {_by_default('save_freq')}", free=True)
+    log_freq: int = option(200, "steps between metrics", free=True)
+    tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard", free=True)
+    wandb: Mapping[str, Any] = option(dict, "an option of Weights & Biases: enable, project, mode, ...", free=True)
     trust: bool = False
     seed: int = 0
     init_from: Path | None = None

@@ -145,7 +145,7 @@ class LearnedReward:
 
     @classmethod
     def load(cls, path: Path) -> LearnedReward:
-        """Load a folder of `manip-il preferences fit`, from JSON and safetensors alone.
+        """Load a folder of `manip-il reward fit`, from JSON and safetensors alone.
 
         Raises `ManipError` for a folder that is not whole or is no such reward.
         """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
@@ -13,7 +14,7 @@ from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for
 from manip_il.learn.action_steps import add_steps, is_in_processors
 from manip_il.learn.checkpoint import Checkpoint
-from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.fit_config import ActionSpace, FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit
 from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
@@ -53,7 +54,8 @@ def start_policy(
     A clone keeps its own units, and acts as it did.
     """
     options = None if start is None else Checkpoint.open(start).mlp_options
-    fit = FitConfig(policy={**(options or {"type": MLP}), "loss": _GAUSSIAN}, action_space=space, seed=seed)
+    settings = {**(options or {"type": MLP}), "loss": _GAUSSIAN}
+    fit = FitConfig(policy=settings, action_space=cast(ActionSpace, space), seed=seed)
     policy = _new_policy(LeRobotFit(fit, spec.action_meaning), spec)
     if start is not None:
         policy.model.load_state_dict({**policy.model.state_dict(), **read_weights(start)})

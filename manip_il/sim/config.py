@@ -31,16 +31,16 @@ class EnvConfig:
     as `Reward.parse` reads it, kept as its numbers wherever it came from; empty for the task's own.
     """
 
-    robot: str = option("panda", ROBOT_HELP)
-    task: str = option("pick_place", TASK_HELP)
+    robot: str = option("panda", ROBOT_HELP, flag="robot.type")
+    task: str = option("pick_place", TASK_HELP, flag="task.type")
     control_hz: int = option(0, "control steps a second; 0: the robot's own, 30 of so101, 20 of others")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
     success_steps: int = option(
         0, "consecutive control steps within the tolerance that count as success; 0: the task's own"
     )
     horizon: int = option(0, "control steps in an episode; 0: the task's own")
-    object: str = option("", f"{SHAPE_HELP}; by default the task's own")
-    reward: str = option("", f"{REWARD_HELP}; by default {DEFAULT}")
+    object: str = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
+    reward: str = option("", f"{REWARD_HELP}; by default {DEFAULT}", flag="task.reward")
 
     def __post_init__(self) -> None:
         from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from manip_il.cli.common_options import EnvGroup, TaskGroup
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.outputs import append_jsonl, save_options
+from manip_il.cli.outputs import ResumableOutput, append_jsonl, save_options
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import schema
 from manip_il.data.schema import RobotTaskSpec
@@ -24,7 +23,7 @@ from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
 
 ENV = EnvConfig("panda", "reach", horizon=8)
-OPTIONS = DaggerOptions(task=TaskGroup("reach"), env=EnvGroup(horizon=8))
+OPTIONS = DaggerOptions(env={"task": "reach", "horizon": 8})
 SUCCESSES = (0.2, 0.6, 0.4)
 
 
@@ -63,7 +62,8 @@ def make_run(
 ) -> Path:
     """A finished run of as many rounds as successes, each with a policy of its own."""
     folder.mkdir(parents=True, exist_ok=True)
-    save_options(folder, replace(OPTIONS, seed=seed, rounds=len(successes) - 1, output_dir=folder))
+    settings = {"seed": seed, "rounds": len(successes) - 1}
+    save_options(folder, replace(OPTIONS, settings=settings, output=ResumableOutput(folder)))
     for number, success in enumerate(successes):
         made = folder / f"round_{number:03d}" / "policy" / "checkpoints" / "last" / "pretrained_model"
         shutil.copytree(policy, made)

@@ -1,4 +1,4 @@
-"""`manip-il gail` and `airl`: bad input is one line, a run ends with a policy, metrics and a page."""
+"""`manip-il rl gail` and `airl`: bad input is one line, a run ends with a policy, metrics and a page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 @pytest.mark.parametrize(
     ("words", "says", "code"),
     [
-        ("", "--dataset.root names no dataset", 2),
+        ("", "--dataset.root is missing", 2),
         ("--dataset.root=nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
         (f"--dataset.root={SAMPLE} --init=nowhere", "no policy in nowhere", 2),
         (f"--dataset.root={SAMPLE} --steps=0", "steps is 0; expected at least 1", 2),
@@ -32,7 +32,7 @@ SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
     ],
 )
 def test_bad_input_is_one_line(name, words, says, code, here, error):
-    assert main([name, *words.split(), "--quiet"]) == code
+    assert main(["rl", name, *words.split(), "--quiet"]) == code
     assert says in error()
     assert not any(here.glob("runs/*/checkpoints"))
 
@@ -51,14 +51,14 @@ def test_a_policy_that_cannot_be_gone_on_from_is_refused(kind, robot, says, here
     env = EnvConfig("fetch" if (robot == "same") == (own.robot == "fetch") else "panda", own.task)
     spec = env_spec(env)
     write_checkpoint(here / "policy", kind, spec, origin=Origin.of(spec, {}))
-    assert main(["gail", f"--dataset.root={SAMPLE}", "--init=policy", "--quiet"]) != 0
+    assert main(["rl", "gail", f"--dataset.root={SAMPLE}", "--init=policy", "--quiet"]) != 0
     assert says in error()
 
 
 @pytest.mark.slow
 def test_a_run_ends_with_a_policy_metrics_and_a_page_and_goes_on(here, capsys):
     small = "--steps=1 --episodes=2 --ppo.minibatches=1 --ppo.epochs=1 --discriminator.steps=1 --validation_episodes=1"
-    words = ["gail", f"--dataset.root={SAMPLE}", *small.split(), "--output_dir=run", "--quiet"]
+    words = ["rl", "gail", f"--dataset.root={SAMPLE}", *small.split(), "--output_dir=run", "--quiet"]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "validation success" in out

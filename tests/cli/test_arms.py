@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from manip_il.cli.adversarial import AirlOptions, GailOptions
 from manip_il.cli.arms import with_start_cost, with_start_policy
+from manip_il.cli.learning import AirlOptions, GailOptions, PpoOptions
 from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
-from manip_il.cli.ppo import PpoOptions
 from manip_il.cli.study_file import read_plan
 from manip_il.evaluation.rounds import history
 
@@ -56,9 +55,9 @@ def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
     )
     start = Path("s/seed_3/cloning/round_000")
     assert isinstance(gail, GailOptions)
-    assert (gail.dataset.root, gail.init, gail.steps) == ([start / "dataset"], start / "policy", 300)
+    assert (gail.dataset.root, gail.init, gail.settings["steps"]) == ([start / "dataset"], start / "policy", 300)
     assert isinstance(scratch, AirlOptions)
-    assert (list(scratch.roots), scratch.init) == ([start / "dataset"], None)
+    assert (scratch.dataset.root, scratch.init) == ([start / "dataset"], None)
     assert isinstance(ppo, PpoOptions)
     assert (ppo.init, ppo.reward) == (start / "policy", Path("somewhere"))
     assert len({*plan.envs.values()}) == 1
@@ -83,7 +82,7 @@ def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
             "dataset.root: gail}",
             "arm 'scratch': dataset.root and init are gail; expected the",
         ),
-        (", dataset.root: cloning}", "}", "arm 'scratch': dataset.root and init are not given; expected the name"),
+        (", dataset.root: cloning}", "}", "arm 'scratch': --dataset.root is missing"),
         ("steps: 300", "rounds: 3", "arms.gail: 'rounds'"),
         ("horizon: 100", "horizon: 99", "arm 'gail': environment differs: arm 'cloning' has"),
         ("steps:20000", "steps", "within has 'steps'; expected a cost with an amount"),
@@ -93,7 +92,7 @@ def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
 def test_an_arm_that_cannot_begin_is_one_line(before, after, words, file, error):
     assert before in FILE
     file.write_text(FILE.replace(before, after, 1))
-    assert main(["study", str(file.name), "--output_dir=s"]) in (1, 2)
+    assert main(["compare", str(file.name), "--output_dir=s"]) in (1, 2)
     assert words in error()
     assert not Path("s").exists()
 
@@ -132,7 +131,7 @@ def test_a_run_is_charged_for_the_demonstrations_it_begins_with_and_for_the_fit_
 @pytest.mark.slow
 def test_a_study_of_cloning_and_gail_tests_both_and_goes_on(file, tmp_path, capsys):
     file.write_text(TINY)
-    words = ["study", file.name, "--output_dir=s", "--workers=1"]
+    words = ["compare", file.name, "--output_dir=s", "--workers=1"]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "within 200 steps" in out

@@ -1,4 +1,4 @@
-"""`manip-il certify` writes what it measured and prints it; what cannot be is one line before the first step."""
+"""`manip-il robot certify` writes what it measured and prints it; what cannot be is one line before the first step."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from manip_il.sim.env import EnvConfig, ManipEnv
 from .made_runs import make_policy
 
 ENV = EnvConfig("fetch", "reach", horizon=60)
-WORDS = ["certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--cases=2", "--workers=1"]
+WORDS = ["robot", "certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--cases=2", "--workers=1"]
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_the_same_seed_gives_the_same_certificate(tmp_path):
 
 
 def test_a_policy_brings_its_robot_and_task(policy, tmp_path, capsys):
-    words = ["certify", f"--policy.path={policy}", "--env.horizon=60", "--cases=2", "--workers=1"]
+    words = ["robot", "certify", f"--policy.path={policy}", "--env.horizon=60", "--cases=2", "--workers=1"]
     assert main([*words, f"--output_dir={tmp_path / 'c'}"]) == 0
     out = capsys.readouterr().out
     assert "states that the policy visited" in out
@@ -67,7 +67,7 @@ def test_a_policy_brings_its_robot_and_task(policy, tmp_path, capsys):
 
 def test_another_robots_policy_is_refused_before_the_first_step(policy, tmp_path, error, monkeypatch):
     monkeypatch.setattr(ManipEnv, "advance", None)
-    words = [*WORDS[:1], "--robot.type=panda", f"--policy.path={policy}", f"--output_dir={tmp_path / 'c'}"]
+    words = [*WORDS[:2], "--robot.type=panda", f"--policy.path={policy}", f"--output_dir={tmp_path / 'c'}"]
     assert main(words) == 1
     assert "robot differs: the policy has fetch" in error()
     assert not (tmp_path / "c").exists()

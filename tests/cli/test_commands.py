@@ -1,4 +1,4 @@
-"""Recording, training, DAgger and the quickstart from the command line."""
+"""Recording, training, DAgger and the demo from the command line."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 from manip_il.cli.dagger import DaggerOptions, best_verdict
+from manip_il.cli.demo import demo_verdict
 from manip_il.cli.main import load, main
 from manip_il.cli.options import command_line, options_of
-from manip_il.cli.outputs import read_jsonl
+from manip_il.cli.outputs import ResumableOutput, read_jsonl
 from manip_il.cli.parsing import from_yaml, parse
-from manip_il.cli.quickstart import quickstart_verdict
 from manip_il.data.dataset import Dataset
 from manip_il.evaluation import film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
@@ -131,7 +131,7 @@ def test_train_to_eval(policy, tmp_path, capsys, error):
     assert main(words) == 0
     out, err = capsys.readouterr()
     assert "differs" not in err
-    assert "next: manip-il replay" in out
+    assert "--replay=4000000" in out
     result = EvalResult.read(tmp_path / "e" / "eval.json")
     assert [episode.seed for episode in result.episodes] == [4_000_000, 4_000_001]
     assert (result.robot, result.task, result.settings.disturbance) == ("panda", "pick_place", "none")
@@ -165,10 +165,10 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
 
 
 @pytest.mark.slow
-def test_the_quickstart_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
+def test_the_demo_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
     sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
-    words = ["quickstart", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
+    words = ["demo", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "report: " in out
@@ -180,7 +180,7 @@ def test_the_quickstart_shows_every_policy_and_resumes(tmp_path, capsys, monkeyp
 
 
 def test_a_command_line_can_be_copied_from_a_report():
-    options = DaggerOptions(rounds=2, output_dir=Path("runs/a b"))
+    options = DaggerOptions(settings={"rounds": 2}, output=ResumableOutput(Path("runs/a b")))
     assert command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"
 
 
@@ -212,9 +212,9 @@ def test_the_best_round_of_few_episodes_is_not_said_to_be_better(successes, n, v
     assert re.fullmatch(verdict, best_verdict(NAMES, rounds(*successes, n=n)))
 
 
-def test_the_quickstart_says_where_nothing_is_shown():
+def test_the_demo_says_where_nothing_is_shown():
     rows = [PolicyRow(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
-    assert quickstart_verdict(rows, significant=False).endswith(
+    assert demo_verdict(rows, significant=False).endswith(
         "no difference between DAgger and cloning with as many labels."
     )
-    assert quickstart_verdict(rows, significant=True).endswith("with the first demonstrations alone.")
+    assert demo_verdict(rows, significant=True).endswith("with the first demonstrations alone.")

@@ -116,11 +116,11 @@ def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys, error):
     assert evaluate("whole", *REACH, "--eval.n_episodes=5") == 0
     assert evaluate("a", *REACH, "--eval.n_episodes=3") == 0
     assert evaluate("b", *REACH, "--eval.n_episodes=2", "--eval.first=3") == 0
-    assert main(["merge", "b/eval.json", "a", "--output_dir=ab"]) == 0
+    assert main(["eval", "b/eval.json", "a", "--output_dir=ab"]) == 0
     assert EvalResult.read(Path("ab")) == EvalResult.read(Path("whole"))
     assert Path("ab/report.html").is_file()
     capsys.readouterr()
-    assert main(["merge", "a", "whole", "--output_dir=c"]) == 1
+    assert main(["eval", "a", "whole", "--output_dir=c"]) == 1
     assert "seed 4000000 is in a and in whole" in error()
     assert not Path("c").exists()
 
@@ -175,9 +175,9 @@ def test_a_mounted_folder_is_emptied_where_another_would_be_replaced(here, monke
 def test_every_line_of_eval_json_can_be_replayed_alone(suite, act, here, capsys):
     assert evaluate("e", f"--policy.path={act}", f"--suite={suite}", "--eval.n_episodes=4", *SMALL) == 0
     result = EvalResult.read(Path("e"))
-    for index, episode in enumerate(result.episodes):
+    for episode in result.episodes:
         capsys.readouterr()
-        assert main(["replay", "e/eval.json", "--episode", str(index)]) == 0
+        assert main(["eval", "e/eval.json", f"--replay={episode.seed}"]) == 0
         out, err = capsys.readouterr()
         assert f"seed {episode.seed}, {episode.detail['condition']}: failure" in out
         assert "the same as in e/eval.json" in out
@@ -189,15 +189,14 @@ def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     edit_json(Path("e/eval.json"), lambda data: data["episodes"][0].update({"success": True, "return": 3.0}))
     edit_json(Path("e/eval.json"), lambda data: data["episodes"][1]["drawn"].update(delay=77))
     capsys.readouterr()
-    assert main(["replay", "e", "--episode=0"]) == 1
+    assert main(["eval", "e", "--replay=4000000"]) == 1
     line = error()
     assert "success was True, is False" in line
     assert "return was 3.0, is 0.0" in line
-    assert main(["replay", "e", "--episode=1"]) == 1
+    assert main(["eval", "e", "--replay=4000001"]) == 1
     assert "what is drawn for the episode differs" in error()
-    for index in (-1, 2):
-        assert main(["replay", "e", f"--episode={index}"]) == 2
-        assert "has episodes 0 to 1" in error()
+    assert main(["eval", "e", "--replay=2"]) == 2
+    assert "has the seeds 4000000 to 4000001" in error()
 
 
 def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, capsys, error):
@@ -205,12 +204,12 @@ def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, caps
     assert evaluate("e", "--policy.path=act", "--eval.n_episodes=1", "--task.type=pick_place", *SMALL) == 0
     act.rename(here / "moved")
     capsys.readouterr()
-    assert main(["replay", "e", "--episode=0"]) == 2
+    assert main(["eval", "e", "--replay=4000000"]) == 2
     assert "e is of act, which is not here" in error()
-    assert main(["replay", "e", "--episode=0", "--policy.path=moved"]) == 0
+    assert main(["eval", "e", "--replay=4000000", "--policy.path=moved"]) == 0
     assert "files differ" not in capsys.readouterr().err
     other = write_checkpoint(here / "other", "act", env_spec(ENV), chunk_size=4)
-    assert main(["replay", "e", "--episode=0", f"--policy.path={other}"]) in (0, 1)
+    assert main(["eval", "e", "--replay=4000000", f"--policy.path={other}"]) in (0, 1)
     assert "is not the policy of e: its files differ" in capsys.readouterr().err
 
 
@@ -224,7 +223,7 @@ def test_failures_and_successes_are_filmed_and_a_replay_films_one(act, here):
     names = sorted(path.name for path in Path("bad/films").iterdir())
     assert names == ["seed_4000000_failure.mp4", "seed_4000001_failure.mp4"]
     assert Path("bad/report.html").read_text().count("<video") == 2
-    assert main(["replay", "bad", "--episode=1", "--video", "deep/one.mp4"]) == 0
+    assert main(["eval", "bad", "--replay=4000001", "--video=deep/one.mp4"]) == 0
     assert Path("deep/one.mp4").read_bytes() == (Path("bad/films") / names[1]).read_bytes()
 
 

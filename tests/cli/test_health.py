@@ -1,4 +1,4 @@
-"""`manip-il health` says in one line what there is, or what is missing."""
+"""`manip-il eval --check` says in one line what there is, or what is missing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def undrawn(monkeypatch):
 
 @pytest.mark.gl
 def test_a_healthy_machine_says_what_it_has(capsys):
-    assert main(["health"]) == 0
+    assert main(["eval", "--check"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
     [line] = out.splitlines()
@@ -44,7 +44,7 @@ def test_torch_is_not_imported_to_say_its_version():
 @pytest.mark.parametrize("backend", ["nonsense", "", "disable"])
 def test_a_wrong_backend_is_named_with_the_right_ones(backend, monkeypatch, error):
     monkeypatch.setenv("MUJOCO_GL", backend)
-    assert main(["health"]) == 1
+    assert main(["eval", "--check"]) == 1
     assert f"MUJOCO_GL is {backend!r}; expected egl or osmesa" in error()
 
 
@@ -59,7 +59,7 @@ def test_opengl_that_fails_is_one_line(monkeypatch, error):
 
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setattr("manip_il.sim.render.pictures", fail)
-    assert main(["health"]) == 1
+    assert main(["eval", "--check"]) == 1
     assert "no off-screen OpenGL here" in error()
 
 
@@ -103,5 +103,5 @@ def fails(error: OSError):
 )
 def test_what_cannot_be_written_is_said(place, stand_in, says, monkeypatch, error):
     monkeypatch.setattr(place, stand_in)
-    assert main(["health"]) == 1
+    assert main(["eval", "--check"]) == 1
     assert says in error()

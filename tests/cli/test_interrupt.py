@@ -28,16 +28,6 @@ def test_the_handlers_before_are_restored():
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
-def test_an_outer_one_learns_of_an_inner_ones_request():
-    with StopRequest() as outer:
-        with StopRequest() as inner:
-            signal.raise_signal(signal.SIGINT)
-        assert inner.requested
-        assert outer.requested
-        with StopRequest() as late:
-            assert late.requested
-
-
 def test_outside_the_main_thread_it_reports_no_request():
     seen: list[bool] = []
 

@@ -1,12 +1,12 @@
-"""`manip-il irl`: bad input is one line; the reward it writes is one that the task takes."""
+"""`manip-il reward irl`: bad input is one line; the reward it writes is one that the task takes."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from manip_il.cli.irl import METHODS, IrlOptions
 from manip_il.cli.main import main
+from manip_il.cli.reward import METHODS, IrlOptions
 from manip_il.rewards import methods
 from manip_il.tasks.reward import FEATURES, Reward
 
@@ -21,10 +21,10 @@ def test_the_methods_of_the_command_are_those_there_are():
 @pytest.mark.parametrize(
     ("line", "says", "code"),
     [
-        ("irl nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
-        (f"irl {SAMPLE} --method=max_entrpy", "unknown method 'max_entrpy' (did you mean 'max_entropy'?)", 2),
-        (f"irl {SAMPLE} --seed=-1", "seed is -1", 2),
-        (f"irl {SAMPLE}", "expected a dataset of manip-il record --task.type=carry", 1),
+        ("reward irl nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        (f"reward irl {SAMPLE} --method=max_entrpy", "unknown method 'max_entrpy' (did you mean 'max_entropy'?)", 2),
+        (f"reward irl {SAMPLE} --seed=-1", "seed is -1", 2),
+        (f"reward irl {SAMPLE}", "expected a dataset of manip-il record --task.type=carry", 1),
     ],
 )
 def test_bad_input_is_one_line(line, says, code, here, error):
@@ -38,7 +38,7 @@ def test_a_reward_is_learnt_from_demonstrations_and_taken_by_the_task(tmp_path, 
     shown, folder = tmp_path / "carry", tmp_path / "irl"
     words = ["--robot.type=panda", "--task.type=carry", "--dataset.num_episodes=3", f"--dataset.root={shown}"]
     assert main(["record", *words, "--dataset.repo_id=a/carry", "--workers=1"]) == 0
-    assert main(["irl", str(shown), "--method=max_margin", f"--output_dir={folder}"]) == 0
+    assert main(["reward", "irl", str(shown), "--method=max_margin", f"--output_dir={folder}"]) == 0
     out, err = capsys.readouterr()
     found = json.loads((folder / "reward.json").read_text())
     assert (found["method"], found["demonstrations"]) == ("max_margin", 3)

@@ -12,7 +12,7 @@ import pytest
 
 import manip_il
 from manip_il import __version__
-from manip_il.cli.main import COMMANDS, main
+from manip_il.cli.main import COMMANDS, GROUPS, main
 
 SLOW = ["torch", "lerobot"]  # seconds
 HEAVY = [*SLOW, "mujoco", "mink", "scipy", "pyarrow", "av", "PIL", "mcap", "huggingface_hub"]
@@ -54,13 +54,14 @@ def mistakes(cases: dict[str, str], cwd: Path, heavy: list[str] = HEAVY) -> None
 
 
 def test_help_of_every_command_imports_nothing_heavy(tmp_path):
-    of_results = ("compare", "study")
+    of_results = ("compare",)
     light = [[*name.split(), "--help"] for name in COMMANDS if name not in of_results]
-    given = answers([[], ["--help"], ["data"], *light], tmp_path, LIGHT)
+    given = answers([[], ["--help"], *([name] for name in GROUPS), *light], tmp_path, LIGHT)
     given += answers([[name, "--help"] for name in of_results], tmp_path)
     assert all(code == 0 and out.startswith("usage: manip-il") for _, code, out, _ in given)
     assert given[0][2] == given[1][2]
-    assert all(f"  {name} " in given[0][2] for name in COMMANDS)
+    assert all(f"  {name.split()[0]} " in given[0][2] for name in COMMANDS)
+    assert given[0][2].count("\n") <= 40
     assert answers([["--version"]], tmp_path)[0][1:] == (0, f"manip-il {__version__}\n", "")
 
 
@@ -83,24 +84,23 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             "eval --policy.path=missing": "no policy in missing",
             "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://lerobot/act_aloha FOLDER",
             "eval --policy.type=expert --suite=missing.yaml": "--suite=missing.yaml: no such file",
-            "certify --policy.path=missing": "no policy in missing",
+            "robot certify --policy.path=missing": "no policy in missing",
             "view --policy.path=missing": "no policy in missing",
-            "robot new missing.xml": "missing.xml is not there; expected an MJCF",
+            "robot new missing.xml": "missing.xml does not exist; expected an MJCF",
             "view --output=missing/a.rrd": "missing does not exist; expected the folder of --output=missing/a.rrd",
-            "replay missing --episode=1": "missing does not exist; expected an eval.json",
-            "merge a b": "a does not exist; expected an eval.json",
+            "eval missing --replay=1": "missing does not exist; expected an eval.json",
+            "eval a b": "a does not exist; expected an eval.json",
             "compare a b": "a does not exist; expected an eval.json, a policy",
-            "study missing.yaml": "missing.yaml does not exist; expected the YAML of a study",
+            "compare missing.yaml": "missing.yaml does not exist; expected the YAML of a study",
             "data render missing out": no_dataset,
             "data check missing": no_dataset,
             "data to-mcap missing out": no_dataset,
-            "data from-mcap missing out --mapping=m.yaml": "missing does not exist; expected an MCAP file",
-            "data from-mcap . out --mapping=m.yaml": "m.yaml does not exist; expected a mapping file",
+            "data from-mcap missing out --mapping=m.yaml": "m.yaml does not exist; expected a mapping file",
             "data from-mcap missing out": "--mapping is missing",
             "data from-mcap missing out --maping=m.yaml": "(did you mean '--mapping'?)",
             "data to-mcap": "DATASET is missing",
             "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: data build, ",
-            "data merge a --output=x": "a is the only one; expected two or more datasets",
+            "data merge SAMPLE --output=x": "is the only one; expected two or more datasets",
             "doctor x --repair": "'doctor' has a new name: manip-il data check, and manip-il data repair",
             "mcap export a b": "'mcap export' has a new name: manip-il data to-mcap",
             "score --help": "'score' has a new name: manip-il data score",
@@ -110,9 +110,7 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             "data check": "DATASET is missing",
             "data check a b": "unexpected 'b'",
             "data check . --fix": "unknown option '--fix'",
-            "merge": "FILES",
-            "merge a": "two or more",
-            "merge a a": "given twice",
+            "eval SAMPLE": "holds no eval.json",
             "eval": "--policy.path=DIR",
             f"eval --policy.path={ROOT}": "no policy in",
             "push SAMPLE": "REMOTE is missing",
@@ -174,20 +172,20 @@ def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
             f"{expert} --eval.first=-1": "--eval.first is -1",
             f"{expert} --eval.batch_size=0": "--eval.batch_size is 0",
             "eval --policy.type=exprt": "did you mean 'expert'?",
-            "eval runs/x": "did you mean --policy.path=runs/x?",
+            "eval runs/x": "a policy to measure is given as --policy.path=runs/x",
             "view --robot.type=ur5": "unknown robot 'ur5'; known: fetch, panda",
             "view --policy.type=slider": "did you mean 'sliders'?",
-            "certify --cases=0": "--cases is 0; expected at least 1",
-            "certify --cases=2000000": "2000000 seeds asked of stream 'certificate'",
-            "certify --seed=-1": "seed is -1",
+            "robot certify --cases=0": "--cases is 0; expected",
+            "robot certify --cases=2000000": "--cases is 2000000; expected 1 to 1,000,000",
+            "robot certify --seed=-1": "seed is -1",
             "theory missing": "a run of manip-il dagger",
             "theory --episodes=1": "--episodes is 1; expected at least 2",
-            "theory --cases=0": "--cases is 0; expected at least 1",
-            "certify --env.horizon=2": "horizon is 2",
-            "certify --case=3": "did you mean '--cases'?",
-            "quickstart --rounds=-1": "rounds is -1",
-            "quickstart --test_episodes=0": "expected at least 1",
-            **{f"{command} --workers=0": "--workers is 0" for command in ("record", "dagger", expert, "certify")},
+            "theory --cases=0": "--cases is 0; expected",
+            "robot certify --env.horizon=2": "horizon is 2",
+            "robot certify --case=3": "did you mean '--cases'?",
+            "demo --rounds=-1": "rounds is -1",
+            "demo --test_episodes=0": "expected at least 1",
+            **{f"{command} --workers=0": "--workers is 0" for command in ("record", "dagger", expert, "robot certify")},
         },
         tmp_path,
         SLOW,

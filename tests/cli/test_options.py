@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.cli.main import main
-from manip_il.cli.options import Open, expected, metavar, options_of, value_of, word
+from manip_il.cli.options import Open, expected, metavar, options_of, word
 from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml, parse
 from manip_il.errors import UsageError
 
@@ -85,9 +85,9 @@ def test_words_change_what_they_name(words, change):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help lists all"]),
+        (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help=all lists all"]),
         (["--num_epsiodes=1"], ["did you mean", "num_episodes"]),
-        (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"]),
+        (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--dataset.repo_id' or '--small.repo_id'?)"]),
         (["--dataset=x"], ["--dataset is a group", "--dataset.num_episodes"]),
         (["--lr=fast"], ["--lr", "expected a number", "'fast'"]),
         (["--lr=nan"], ["expected a number"]),
@@ -188,7 +188,7 @@ def test_options_survive_yaml(tmp_path_factory, options):
 @given(any_options)
 def test_options_survive_the_command_line(options):
     options = replace(options, cameras=[], note=None)  # a comma in an item, and the text "null", need YAML
-    words = [f"--{option.name}={word(value_of(options, option.name))}" for option in options_of(Options)]
+    words = [f"--{option.name}={word(option.value(options))}" for option in options_of(Options)]
     assert parse(Options, words) == options
 
 
@@ -237,7 +237,7 @@ def test_an_open_options_dotted_name_may_stand_in_yaml(tmp_path):
         ("record", "dataset: [" + "1, " * 10_000 + "1]"),
         ("record", "seed: " + "x" * 100_000),
         ("record", "cameras: {a: " + "y" * 100_000 + "}"),
-        ("quickstart", "x" * 1_000 + ": 1"),
+        ("demo", "x" * 1_000 + ": 1"),
     ],
     ids=["list", "text", "mapping", "name"],
 )

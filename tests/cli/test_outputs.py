@@ -70,10 +70,10 @@ def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
 def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(tmp_path):
     options = RecordOptions(dataset=DatasetGroup(root=tmp_path / "demos"))
     (tmp_path / f".{CONFIG_FILE}.123.tmp").write_text("# manip-")
-    check_same_options(tmp_path, options, ())
+    check_same_options(tmp_path, options)
     (tmp_path / "episode.mcap").touch()
     with pytest.raises(UsageError, match=r"holds no config\.yaml"):
-        check_same_options(tmp_path, options, ())
+        check_same_options(tmp_path, options)
 
 
 @pytest.mark.parametrize(
@@ -172,10 +172,8 @@ COMMANDS = {
     "dagger": [],
     "train": [f"--dataset.root={SAMPLE}", "--steps=1"],
     "compare": ["left.json", "right.json"],
-    "merge": ["left.json", "right.json"],
-    "study": ["study.yaml"],
-    "certify": ["--robot.type=fetch", "--task.type=reach", "--workers=1"],
-    "quickstart": [],
+    "robot certify": ["--robot.type=fetch", "--task.type=reach", "--workers=1"],
+    "demo": [],
 }
 
 

@@ -1,4 +1,4 @@
-"""`manip-il ppo`: a clone goes on from a reward learnt from preferences, of the same robot and task."""
+"""`manip-il rl ppo`: a clone goes on from a reward learnt from preferences, of the same robot and task."""
 
 from __future__ import annotations
 
@@ -38,25 +38,25 @@ def cloned(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("", "--init is missing; expected the run of a cloned mlp"),
+        ("", "--init is missing; expected a path"),
         ("--init=nowhere --reward=nowhere", "no policy in nowhere"),
     ],
 )
 def test_bad_input_is_one_line(words, says, here, error):
-    assert main(["ppo", *words.split(), "--quiet"]) == 2
+    assert main(["rl", "ppo", *words.split(), "--quiet"]) == 2
     assert says in error()
 
 
 @pytest.mark.slow
 def test_a_reward_that_is_not_the_policys_is_refused(here, cloned, error):
-    assert main(["ppo", f"--init={cloned}", "--quiet"]) == 2
-    assert "--reward is missing; expected a folder of manip-il preferences fit" in error()
-    assert main(["ppo", f"--init={cloned}", "--reward=nowhere", "--quiet"]) == 2
-    assert "nowhere does not exist; expected a reward of manip-il preferences fit" in error()
-    assert main(["ppo", f"--init={cloned}", f"--reward={cloned}", "--quiet"]) == 1
+    assert main(["rl", "ppo", f"--init={cloned}", "--quiet"]) == 2
+    assert "--reward is missing; expected a path" in error()
+    assert main(["rl", "ppo", f"--init={cloned}", "--reward=nowhere", "--quiet"]) == 2
+    assert "nowhere does not exist; expected a reward of manip-il reward fit" in error()
+    assert main(["rl", "ppo", f"--init={cloned}", f"--reward={cloned}", "--quiet"]) == 1
     assert "is of type 'mlp'; expected a reward" in error()
     reward(here / "lift", replace(ENV, task="lift", horizon=0))
-    assert main(["ppo", f"--init={cloned}", "--reward=lift", "--quiet"]) == 1
+    assert main(["rl", "ppo", f"--init={cloned}", "--reward=lift", "--quiet"]) == 1
     assert "task differs" in error()
 
 
@@ -64,7 +64,7 @@ def test_a_reward_that_is_not_the_policys_is_refused(here, cloned, error):
 def test_a_run_ends_with_a_policy_metrics_and_a_page(here, cloned, capsys):
     reward(here / "reward")
     small = "--steps=1 --episodes=2 --episode_steps=4 --warmup=0 --ppo.minibatches=1 --ppo.epochs=1"
-    words = ["ppo", f"--init={cloned}", "--reward=reward", *small.split(), "--validation_episodes=1"]
+    words = ["rl", "ppo", f"--init={cloned}", "--reward=reward", *small.split(), "--validation_episodes=1"]
     assert main([*words, "--output_dir=run", "--quiet"]) == 0
     assert "manip-il eval --policy.path=run" in capsys.readouterr().out
     start, record = map(json.loads, (here / "run" / "metrics.jsonl").read_text().splitlines())

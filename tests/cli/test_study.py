@@ -5,21 +5,17 @@ from __future__ import annotations
 import json
 import re
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from manip_il.cli.common_options import TaskGroup
-from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
+from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import main
-from manip_il.cli.outputs import read_jsonl
-from manip_il.cli.study import ROUND_0, expert_trials, same_start, share_start
+from manip_il.cli.study import expert_trials
 from manip_il.cli.study_file import read_plan
-from manip_il.data.dataset import joined_columns
 from manip_il.errors import MismatchError
 
-from .made_runs import files, make_run
+from .made_runs import make_run
 
 FILE = """
 common:
@@ -68,24 +64,25 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
     def run(options: DaggerOptions) -> None:
         asked.append(options)
         successes = (0.2, 0.4, 0.6) if options.method == "dagger" else (0.2, 0.2, 0.4)
-        make_run(options.output_dir, policy, options.seed, successes)
+        make_run(options.output.output_dir, policy, options.settings["seed"], successes)
 
     monkeypatch.setattr(DaggerOptions, "run", run)
-    monkeypatch.setattr("manip_il.cli.study.share_start", lambda options, others: False)  # made runs begin whole
     return asked
 
 
 def study(*words: str) -> int:
-    return main(["study", "x.yaml", "--output_dir=s", "--workers=1", *words])
+    return main(["compare", "x.yaml", "--output_dir=s", "--workers=1", *words])
 
 
 def test_every_arm_runs_with_every_training_seed_and_its_own_options(here, runs):
     assert study() == 0
     expected = [(seed, method) for seed in range(2) for method in ("cloning", "dagger")]
-    assert [(options.seed, options.method) for options in runs] == expected
-    assert [str(options.output_dir) for options in runs] == [f"s/{method}/seed_{seed}" for seed, method in expected]
-    assert all(options.env.horizon == 8 and options.policy == {"width": 16} for options in runs)
-    assert all(options.resume and options.workers == 1 for options in runs)
+    assert [(options.settings["seed"], options.method) for options in runs] == expected
+    assert [str(options.output.output_dir) for options in runs] == [
+        f"s/{method}/seed_{seed}" for seed, method in expected
+    ]
+    assert all(options.env["horizon"] == 8 and options.fit["policy"] == {"width": 16} for options in runs)
+    assert all(options.output.resume and options.engine.workers == 1 for options in runs)
 
 
 def test_the_answer_is_printed_and_written(here, runs, capsys):
@@ -113,10 +110,10 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     for path in (here / "s" / "dagger" / "seed_1").iterdir():
         path.rename(here / path.name)
     assert study("--resume=true") == 0
-    assert [str(options.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
+    assert [str(options.output.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
     assert len(evaluated) == 4  # its policies came out the same
     assert study("--resume=true", "--training_seeds=3") == 0
-    assert [str(options.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
+    assert [str(options.output.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 
@@ -163,7 +160,7 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
         ("dagger:\n", "dagger: 3\n", "arms.dagger: expected a mapping"),
         ("  dagger:", "  ../dagger:", "named '../dagger', which becomes a folder"),
         ("  dagger:", "  evaluations:", "and not evaluations"),
-        ("target: 0.6", "target: 60", "target is 60.0; expected a share"),
+        ("target: 0.6", "target: 60", "target is 60.0; expected 0.0 to 1.0"),
         ("target: 0.6", "baseline: clonning", "did you mean 'cloning'?"),
         ("at: labels", "at: label", "did you mean 'labels'?"),
         ("training_seeds: 2", "training_seeds: 0", "training_seeds is 0"),
@@ -224,7 +221,7 @@ def test_the_expert_is_tested_where_a_test_changes_something(here):
 @pytest.mark.slow
 def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys, error):
     (tmp_path / "x.yaml").write_text(TINY)
-    words = ["study", str(tmp_path / "x.yaml"), "--workers=1"]
+    words = ["compare", str(tmp_path / "x.yaml"), "--workers=1"]
     process = start(*words, f"--output_dir={tmp_path / 'cut'}", log=tmp_path / "log")
     while not (tmp_path / "cut" / "dagger" / "seed_0" / "metrics.jsonl").is_file():
         assert process.is_alive(), "it ended before it was killed"
@@ -258,56 +255,6 @@ def answer(folder: Path):
     return strip(data)
 
 
-@pytest.fixture
-def options(tmp_path: Path) -> DaggerOptions:
-    return DaggerOptions(
-        task=TaskGroup("reach"),
-        demonstrations=2,
-        rounds=1,
-        episodes_per_round=2,
-        policy={"width": 16},
-        steps=20,
-        validation_episodes=2,
-        output_dir=tmp_path / "first",
-        workers=1,
-    )
-
-
-def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {name: data for name, data in files(folder).items() if name.endswith((".safetensors", ".parquet"))}
-
-
-def test_what_differs_after_the_first_round_begins_alike_and_nothing_else(options):
-    for changes in ({"method": "cloning"}, {"label": "takeover"}, {"refit": "warm"}, {"rounds": 9}):
-        assert same_start(options, replace(options, **changes)), changes
-    for changes in ({"seed": 1}, {"steps": 21}, {"policy": {}}, {"label_budget": 9}, {"ensemble": 2}):
-        assert not same_start(options, replace(options, **changes)), changes
-
-
-@pytest.mark.slow
-def test_a_shared_start_ends_with_the_same_bytes_and_is_charged_for_it(options, tmp_path):
-    options.run()
-    arm = replace(options, method="cloning", output_dir=tmp_path / "shared")
-    alone = replace(arm, output_dir=tmp_path / "alone")
-    alone.run()
-    assert share_start(arm, [replace(options, seed=3), options])
-    assert bytes_of(arm.output_dir / ROUND_0) == bytes_of(alone.output_dir / ROUND_0)
-    replace(arm, resume=True).run()
-    for part in (ROUND_0, "round_001"):
-        assert bytes_of(arm.output_dir / part) == bytes_of(alone.output_dir / part)
-    rounds = [read_jsonl(run.output_dir / METRICS_FILE) for run in (options, arm)]
-    assert rounds[0][0] == rounds[1][0]
-    assert len(rounds[1]) == 2
-    assert set(joined_columns([arm.output_dir / "dataset"], ("actor",))["actor"].ravel()) == {0}
-
-
-def test_a_run_that_is_there_is_left_alone_and_so_is_one_without_a_twin(options, tmp_path):
-    assert not share_start(options, [replace(options, output_dir=tmp_path / "nowhere")])
-    assert not options.output_dir.exists()
-    options.output_dir.mkdir()
-    assert not share_start(options, [options])
-
-
 def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_path):
     paths = sorted((Path(__file__).parents[2] / "configs/studies").glob("*.yaml"))
     assert len(paths) >= 5
@@ -318,4 +265,4 @@ def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_pa
         assert (plan.baseline is None) == (len({env.task for env in plan.envs.values()}) > 1)
         assert all(len(found) >= len(plan.experts) - 1 for found in expert_trials(plan).values())
         first = path.read_text().splitlines()[0]
-        assert first == f"# manip-il study configs/studies/{path.name} --output_dir=runs/{path.stem}"
+        assert first == f"# manip-il compare configs/studies/{path.name} --output_dir=runs/{path.stem}"

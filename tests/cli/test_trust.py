@@ -24,13 +24,12 @@ from manip_il.learn.lerobot_config import LeRobotFit
 from ..damage import edit_json
 from .made_runs import ENV, make_eval, make_policy, make_run
 
-COMMANDS = ("train", "dagger", "eval", "replay", "compare", "study", "certify")
+COMMANDS = ("train", "dagger", "eval", "compare", "robot certify")
+SAMPLE = Path(__file__).resolve().parents[2] / "datasets" / "sample"
 STEP = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}}
 REQUIRED = {
     "train": ["--dataset.root=x"],
-    "replay": ["x", "--episode=0"],
     "compare": ["x", "y"],
-    "study": ["x"],
 }
 
 
@@ -60,9 +59,9 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, pol
     words = ["--env.horizon=8", "--workers=1", out]
     for command in (
         ["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words],
-        ["certify", f"--policy.path={hostile}", "--cases=1", *words],
+        ["robot", "certify", f"--policy.path={hostile}", "--cases=1", *words],
         ["compare", str(policy), str(hostile), "--eval.n_episodes=1", *words],
-        ["replay", str(file), "--episode=0", f"--policy.path={hostile}"],
+        ["eval", str(file), "--replay=4000000", f"--policy.path={hostile}"],
         ["dagger", f"--policy.path={named}", out],
         ["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out],
     ):
@@ -137,7 +136,8 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
 @pytest.mark.parametrize("command", ["train", "dagger"])
 @pytest.mark.usefixtures("here")
 def test_a_path_without_a_policy_is_one_line(command, value, error):
-    assert main([command, *REQUIRED.get(command, []), f"--policy.path={value}"]) == 2
+    given = [f"--dataset.root={SAMPLE}"] if command == "train" else []
+    assert main([command, *given, f"--policy.path={value}"]) == 2
     assert "policy" in error()
 
 

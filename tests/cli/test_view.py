@@ -127,7 +127,7 @@ def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
         (["--output=x.mp4"], "expected a file, NAME.rrd"),
         (["--robot.type=fetch_stock"], "cannot be viewed"),
         (["--n_episodes=0"], "expected at least 1"),
-        (["--policy.type=expert", "--policy.path=x"], "give one of"),
+        (["--policy.type=expert", "--policy.path=x"], "no policy in x"),
     ],
 )
 def test_what_cannot_be_watched_is_refused(words: list[str], says: str, here, error):

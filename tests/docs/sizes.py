@@ -36,16 +36,16 @@ SMALL: Sizes = {  # put into every command that has the option
     "workers": 1,
 }
 # Only where the line gives the option.
-GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1, "redraw": 30, "processes": 1}
+GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "replay": 4_000_001, "redraw": 30, "processes": 1}
 OF_COMMAND: dict[str, Sizes] = {
     "dagger": {"image.height": 32, "image.width": 32},
     "robot check": {"episodes": 1},
     "theory": {"episodes": 2},
-    "preferences pairs": {"count": 12},
-    "preferences fit": {"members": 3},
-    "gail": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
-    "airl": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
-    "ppo": {"episodes": 2, "episode_steps": 20, "ppo.minibatches": 2, "ppo.epochs": 1},
+    "reward pairs": {"count": 12},
+    "reward fit": {"members": 3},
+    "rl gail": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
+    "rl airl": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
+    "rl ppo": {"episodes": 2, "episode_steps": 20, "ppo.minibatches": 2, "ppo.epochs": 1},
     "data redraw": {"frames": 30, "image.height": 96, "image.width": 96},  # diffusion cuts out 84 x 84 pixels
     "view": {"output": "seen.rrd"},  # a viewer that is served lives as long as its process, which runs all the lines
 }
@@ -135,9 +135,9 @@ def shrink_study(path: Path) -> None:
     of_dagger = {option.name for option in options_of(load("dagger"))}
     learning = [arm for arm in study["arms"].values() if "algorithm" in arm]
     for arm in learning:
-        of_command = {option.name for option in options_of(load(arm["algorithm"]))}
+        of_command = {option.name for option in options_of(load(f"rl {arm['algorithm']}"))}
         arm |= {name: size for name, size in SMALL.items() if name in of_command and name != "workers"}
-        arm |= OF_COMMAND[arm["algorithm"]]
+        arm |= OF_COMMAND[f"rl {arm['algorithm']}"]
     for arm in (study["common"], *(one for one in study["arms"].values() if "algorithm" not in one)):
         for option, size in (SMALL | GIVEN).items():
             if option in of_dagger and option in arm:

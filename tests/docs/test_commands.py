@@ -24,7 +24,7 @@ from .stock import Stock
 from .workplace import PROGRAM, RULES, LeRobot, Workplace
 
 BUCKET = "robots"  # the one in the docs
-_DRAWS = ("--cameras=", "redraw", "--video", "data render", "manip-il health", "datasets/seen", "preferences ask")
+_DRAWS = ("--cameras=", "redraw", "--video", "data render", "manip-il eval --check", "datasets/seen", "reward ask")
 
 
 @pytest.fixture(scope="session")
@@ -92,7 +92,7 @@ def workplace(
     for name, value in (servers | {"HF_TOKEN": TOKEN, "HF_ENDPOINT": running_hub.url}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the quickstart's time
+    monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the demo's time
     talk_to(running_hub.url, monkeypatch.setattr)
     return Workplace(tmp_path, stock, lerobot)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.main import COMMANDS, load
+from manip_il.cli.main import COMMANDS, GROUPS, load
 from manip_il.cli.options import options_of
 
 from .pages import PAGES, ROOT
@@ -43,7 +43,7 @@ def test_every_option_is_one_of_a_command(page: str):
 @pytest.mark.parametrize("page", PAGES)
 def test_every_command_is_one_that_there_is(page: str):
     text = (ROOT / page).read_text(encoding="utf-8")
-    unknown = [words for words in _INLINE_COMMAND.findall(text) if not {words, words.split()[0]} & set(COMMANDS)]
+    unknown = [words for words in _INLINE_COMMAND.findall(text) if not {words, words.split()[0]} & {*COMMANDS, *GROUPS}]
     assert unknown == []
 
 

@@ -57,7 +57,7 @@ def eval_case() -> Case:
     return Case(report, tuple(film.caption for some in films.values() for film in some))
 
 
-def quickstart_case() -> Case:
+def demo_case() -> Case:
     films, rows = [small_film(number) for number in range(3)], [PolicyRow("DAgger", RESULT, 4000)]
     rows.append(PolicyRow("cloning", RESULT, 4000, RESULT, CLONING))
     report = run_report(rows, films, curves=[CURVE], title="t", verdict="DAgger solves 95.0 %.", command="manip-il x")
@@ -67,9 +67,9 @@ def quickstart_case() -> Case:
 CASES = {
     "eval": eval_case,
     "compare": lambda: Case(compare_report(COMPARISON, "manip-il compare a b")),
-    "quickstart": quickstart_case,
-    "study": lambda: Case(study_report(STUDY, "Study", "manip-il study x.yaml")),
-    "certify": lambda: Case(certificate_report(certificate(row("action", ACTIONS)), "manip-il certify", {})),
+    "demo": demo_case,
+    "study": lambda: Case(study_report(STUDY, "Study", "manip-il compare x.yaml")),
+    "certify": lambda: Case(certificate_report(certificate(row("action", ACTIONS)), "manip-il robot certify", {})),
 }
 
 

@@ -81,7 +81,7 @@ def test_the_tables_and_the_page_show_the_numbers_and_who_was_not_solved():
     made = certificate(row("action", ACTIONS), row("learner", ACTIONS[:3], "learner", left_out=1))
     recoveries, costs = made.tables()
     assert costs.rows[0] == ("words of a", "17.5", *["50 steps (2.5 s)"] * 3, "1", "4")
-    page = page_of(certificate_report(made, "manip-il certify", {}))
+    page = page_of(certificate_report(made, "manip-il robot certify", {}))
     assert "75.0 % [30.1, 95.4]" in page.text
     assert "at least 50 steps (2.5 s), the whole horizon; with 95% confidence, at most 52.7%" in page.text
     assert "The policy had solved 1 of 4 before" in page.text

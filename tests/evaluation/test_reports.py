@@ -159,7 +159,7 @@ def test_both_fingerprints_are_there_if_they_differ():
 
 
 def test_a_study_has_a_curve_a_cost_and_its_baseline_is_grey():
-    page = page_of(study_report(STUDY, "t", "manip-il study x.yaml", {"at": "end"}))
+    page = page_of(study_report(STUDY, "t", "manip-il compare x.yaml", {"at": "end"}))
     assert sum("Validation success over" in words for words in page.figures) == 3
     assert "dagger, training seed 0, collect and fit" in page.text
     colours = arm_colours(STUDY)

@@ -26,10 +26,10 @@ def run(line: str) -> int:
 
 
 def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
-    assert run("preferences pairs good bad --clip=10 --count=40") == 0
-    assert run("preferences answer pairs.json --teacher=mistaken:0.1 --output=a.json") == 0
-    assert run("preferences answer pairs.json --teacher=perfect --output=b.json") == 0
-    assert run("preferences fit pairs.json a.json b.json --members=3 --output_dir=reward") == 0
+    assert run("reward pairs good bad --clip=10 --count=40") == 0
+    assert run("reward answer pairs.json --teacher=mistaken:0.1 --output=a.json") == 0
+    assert run("reward answer pairs.json --teacher=perfect --output=b.json") == 0
+    assert run("reward fit pairs.json a.json b.json --members=3 --output_dir=reward") == 0
     out, err = capsys.readouterr()
     assert "80 answers about 40 pairs" in out
     assert "are answered left and right: both answers count" in err
@@ -41,13 +41,13 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     assert run(f"train {words} --output_dir=weighted") == 0
     assert "of the frames weigh 0" in capsys.readouterr().out
     assert (here / "weighted/checkpoints/last/pretrained_model/model.safetensors").is_file()
-    assert run("preferences pairs good bad --clip=10 --count=5 --reward=reward --output=more.json") == 0
+    assert run("reward pairs good bad --clip=10 --count=5 --reward=reward --output=more.json") == 0
     assert Pairs.read(here / "more.json").chosen == "where rewards disagree"
-    assert run("preferences answer more.json --output=c.json") == 0
+    assert run("reward answer more.json --output=c.json") == 0
     words = "pairs.json a.json c.json --more_pairs=more.json --members=3 --output_dir=again"
-    assert run(f"preferences fit {words}") == 0
+    assert run(f"reward fit {words}") == 0
     assert "45 answers about 45 pairs" in capsys.readouterr().out
-    assert run("preferences fit pairs.json c.json --members=3 --output_dir=third") == 1
+    assert run("reward fit pairs.json c.json --members=3 --output_dir=third") == 1
     assert "pairs (sha256) differs: c.json has" in capsys.readouterr().err
 
 
@@ -62,16 +62,16 @@ def test_true_progress_scores_without_a_reward(here, capsys):
 @pytest.mark.parametrize(
     ("line", "says", "code"),
     [
-        ("preferences pairs good other", "task differs: good has lift, other has reach", 1),
-        ("preferences pairs nowhere", "nowhere does not exist; expected a LeRobot dataset or a run", 2),
-        ("preferences pairs good --count=0", "--count is 0; expected at least 1", 2),
-        ("preferences pairs good --output=x.txt", "--output is x.txt; expected a file, NAME.json", 2),
-        ("preferences pairs good --clip=99", "the longest episode has 30", 1),
-        ("preferences ask nowhere.json", "nowhere.json does not exist; expected pairs.json", 2),
-        ("preferences answer good/meta/info.json", "format is None, version None; expected 'manip_il pairs'", 1),
-        ("preferences answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
-        ("preferences fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
-        ("preferences fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),
+        ("reward pairs good other", "task differs: good has lift, other has reach", 1),
+        ("reward pairs nowhere", "nowhere does not exist; expected a LeRobot dataset or a run", 2),
+        ("reward pairs good --count=0", "--count is 0; expected at least 1", 2),
+        ("reward pairs good --output=x.txt", "--output is x.txt; expected a file, NAME.json", 2),
+        ("reward pairs good --clip=99", "the longest episode has 30", 1),
+        ("reward ask nowhere.json", "nowhere.json does not exist; expected pairs.json", 2),
+        ("reward answer good/meta/info.json", "format is None, version None; expected 'manip_il pairs'", 1),
+        ("reward answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
+        ("reward fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
+        ("reward fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),
         ("data score good --reward=nowhere", "nowhere does not exist; expected a reward", 2),
         ("data score nowhere --reward=progress", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
         ("train --dataset.root=good --weights=nowhere.parquet", "--weights is nowhere.parquet, which is no file", 2),
@@ -87,6 +87,6 @@ def test_bad_input_is_one_line(line, says, code, here, error):
 
 def test_a_file_that_is_there_is_not_replaced_unasked(here, error):
     (here / "pairs.json").write_text("mine")
-    assert run("preferences pairs good --clip=10 --count=5") == 2
+    assert run("reward pairs good --clip=10 --count=5") == 2
     assert "pairs.json exists already" in error()
-    assert run("preferences pairs good --clip=10 --count=5 --overwrite=true") == 0
+    assert run("reward pairs good --clip=10 --count=5 --overwrite=true") == 0

@@ -171,6 +171,6 @@ def test_weights_that_are_not_finite_are_refused_when_they_are_used(folder, tmp_
 
 
 def test_the_page_says_what_was_held_out_and_by_whom_it_was_answered(fitted, clips, answers):
-    page = fit_report(fitted, clips, answers, ["Ada"], "manip-il preferences fit", {}, {}).render()
+    page = fit_report(fitted, clips, answers, ["Ada"], "manip-il reward fit", {}, {}).render()
     for words in ("by Ada", f"epoch {fitted.fit.epochs}", "agrees with true progress in"):
         assert words in page

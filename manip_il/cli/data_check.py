@@ -7,15 +7,20 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from manip_il.cli.inputs import hub_hint, require_folder
+from manip_il.cli.inputs import dataset_differences, require_folder
 from manip_il.cli.progress import say
+from manip_il.errors import ManipError
+from manip_il.evaluation.policy_folder import hub_hint
 from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
 
-_NO_PART = ("processor", "config_sha256", "cameras_sha256")  # tolerance and horizon are not part of a dataset
+
+def _require_dataset_folder(root: Path) -> None:
+    """Raise `UsageError` unless there is such a folder; what it holds is for the check."""
+    require_folder(root, f"the folder of a LeRobot dataset{hub_hint(root, 'datasets/')}")
 
 
 @dataclass
@@ -26,16 +31,12 @@ class CheckOptions:
     """
 
     example: ClassVar[str] = "manip-il data check datasets/demos"
-    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True)
-
-    def check(self) -> None:
-        """Refuse what is no folder."""
-        require_dataset_folder(self.dataset)
+    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True, check=_require_dataset_folder)
 
     def run(self) -> None:
         """Examine, and say the verdict; raises `NotWhole` after errors."""
-        root = named(self.dataset)
-        say_verdict(root, examine(root))
+        root = _named(self.dataset)
+        _say_verdict(root, _examine(root))
 
 
 @dataclass
@@ -46,39 +47,30 @@ class RepairOptions:
     """
 
     example: ClassVar[str] = "manip-il data repair datasets/demos"
-    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True)
-
-    def check(self) -> None:
-        """Refuse what is no folder."""
-        require_dataset_folder(self.dataset)
+    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True, check=_require_dataset_folder)
 
     def run(self) -> None:
         """Examine, repair, examine again, and say the verdict; raises `NotWhole` if something stays wrong."""
         from manip_il.doctor.examine import repair
 
-        root = named(self.dataset)
-        if not (findings := examine(root)):
+        root = _named(self.dataset)
+        if not (findings := _examine(root)):
             say("repair   nothing to repair")
         elif done := list(repair(root, findings)):
             for line in done:
                 say(f"repair   {line}")
-            findings = examine(root)
+            findings = _examine(root)
         else:
             say("repair   nothing that can be repaired")
-        say_verdict(root, findings)
+        _say_verdict(root, findings)
 
 
-def require_dataset_folder(root: Path) -> None:
-    """Raise `UsageError` unless there is such a folder; what it holds is for the check."""
-    require_folder(root, f"the folder of a LeRobot dataset{hub_hint(root, 'datasets/')}")
-
-
-def named(root: Path) -> Path:
+def _named(root: Path) -> Path:
     """Return the folder by its name: journals and copies beside it are named after it."""
     return root if root.name not in ("", "..") else root.resolve()
 
 
-def examine(root: Path) -> list[Finding]:
+def _examine(root: Path) -> list[Finding]:
     """Examine a dataset and print every finding."""
     from manip_il.doctor.examine import examine_folder
 
@@ -88,7 +80,7 @@ def examine(root: Path) -> list[Finding]:
     return findings
 
 
-def say_verdict(root: Path, findings: list[Finding]) -> None:
+def _say_verdict(root: Path, findings: list[Finding]) -> None:
     """Print how much is whole, and what its episodes draw; raises `NotWhole` with the numbers after errors."""
     from manip_il.data.dataset import Dataset
     from manip_il.doctor.examine import has_errors
@@ -121,33 +113,14 @@ def _span(values: list[Any]) -> str:
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
-    """Compare joints, state and compiled model with those of the robot and task in this program."""
-    from manip_il.collect.environments import env_fingerprint, env_spec, is_known
-    from manip_il.data.fingerprint import compare_fingerprints
+    """Compare joints, observations and compiled model with those of the robot and task in this program."""
     from manip_il.data.lerobot_layout import OURS
     from manip_il.doctor.finding import Finding, warning
-    from manip_il.sim.env import EnvConfig
-    from manip_il.sim.variation import OLDER
 
     if (own := dataset.own) is None:
         return
-    spec, fingerprint = own.spec, own.fingerprint
-    if not is_known(spec.robot, spec.task):  # a user's own arm or task, of which a dataset holds the name alone
-        return
-    env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
-    here = env_spec(env)
-    for what in ("joint_names", "environment_state_names", "sim_state_size", "action_meaning"):
-        found, wanted = getattr(spec, what), getattr(here, what)
-        older = what == "sim_state_size" and here.sim_state_size - found in OLDER  # before it held all draws
-        if found != wanted and not older:
-            text = f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here"
-            yield Finding(OURS, text, "use the version of this program that recorded it, or record again")
-    ours = env_fingerprint(env)
-    theirs = {key: value for key, value in fingerprint.items() if key in ours and key not in _NO_PART}
-    for text in compare_fingerprints("the dataset", theirs, "this program", {key: ours[key] for key in theirs}):
-        yield warning(OURS, text, f"if labels should be of today: manip-il data relabel {dataset.root}")
-
-
-def _short(value: Any) -> str:
-    text = ", ".join(value) if isinstance(value, tuple) else str(value)
-    return text if len(text) <= 100 else f"{text[:97]}..."
+    try:
+        for text in dataset_differences("the dataset", own.spec, own.fingerprint):
+            yield warning(OURS, text, f"if labels should be of today: manip-il data relabel {dataset.root}")
+    except ManipError as error:
+        yield Finding(OURS, str(error), "use the version of this program that recorded it, or record again")

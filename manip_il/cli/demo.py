@@ -1,27 +1,25 @@
-"""`manip-il quickstart`: demonstrations, cloning, DAgger, and a report that compares them."""
+"""`manip-il demo`: demonstrations, cloning, DAgger, and a report that compares them."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
-from manip_il import checks
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
-from manip_il.cli.dagger import FREE, DaggerOptions, learning_curve, round_timings, run_rounds
-from manip_il.cli.options import Open, command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
+from manip_il.cli.dagger import DaggerOptions, learning_curve, round_timings, run_rounds
+from manip_il.cli.options import Given, command_line, given, group, to_plain
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
 from manip_il.errors import UnknownName, UsageError
-from manip_il.learn.fit_config import MLPOptions
+from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import MLP
-from manip_il.option import option, option_of
+from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
@@ -30,83 +28,64 @@ if TYPE_CHECKING:
     from manip_il.evaluation.tables import PolicyRow
     from manip_il.evaluation.trial import Trial
 
-TIMINGS_FILE = "timings.json"
+RUN = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # in place of `manip-il dagger`'s own
+FIT = {"steps": 3_000, "batch_size": 256}
+_OF_RUN = (*RUN, "episodes_per_round", "disturbed_share", "seed")
 SUITES = {"nominal": "nominal", "disturbed": "knocked", "validation": "nominal"}  # by the folder of the evaluations
 
 
 @dataclass
-class PolicyGroup:
-    """`--policy.*` of the mlp that is fitted."""
-
-    type: str = option(MLP, "the policy; `manip-il train` trains every other LeRobot policy")
-    loss: str = option_of(MLPOptions, "loss")
-    width: int = option_of(MLPOptions, "width")
-    depth: int = option_of(MLPOptions, "depth")
-
-    def settings(self) -> Open:
-        """Return them as `--policy.*` of `manip-il train`; `UsageError` for another type."""
-        if self.type != MLP:
-            raise UsageError(
-                f"{UnknownName('policy', self.type, [MLP])}; LeRobot's policies (act, diffusion) are trained by "
-                "manip-il train and manip-il dagger, with --policy.type=..."
-            )
-        return to_plain(self)
-
-
-@dataclass
-class QuickstartOptions(common.EnvOptions):
+class DemoOptions:
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
     Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
-    the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows it.
+    the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows it. The policy is an mlp: manip-il
+    train and manip-il dagger take every other.
     """
 
-    example: ClassVar[str] = "manip-il quickstart --output_dir=runs/quickstart"
-    demonstrations: int = option_of(RunConfig, "demonstrations", 100)
-    rounds: int = option_of(RunConfig, "rounds", 3)
-    episodes_per_round: int = option_of(RunConfig, "episodes_per_round", help_text="rollouts per round")
-    disturbed_share: float = option_of(RunConfig, "disturbed_share")
-    policy: PolicyGroup = field(default_factory=PolicyGroup)
-    steps: int = option(3_000, "gradient steps per fit")
-    batch_size: int = option(256, "frames per step")
-    validation_episodes: int = option_of(RunConfig, "validation_episodes", 100)
-    test_episodes: int = option(200, "unseen test episodes, used for no choice")
-    disturbed_episodes: int = option(100, "the first of them again, disturbed")
-    seed: int = common.seed_option()
-    engine: Literal["local", "ray"] = common.engine_option()
-    workers: int | None = common.workers_option()
-    output_dir: Path = option(Path("runs/quickstart"), "folder of the run")
-    resume: bool = option(False, "continue an interrupted run")
-    overwrite: bool = option(False, "replace an existing run")
+    example: ClassVar[str] = "manip-il demo --output_dir=runs/demo"
+    first: ClassVar[tuple[str, ...]] = ("robot.type", "task.type", "rounds", "test_episodes", "output_dir", "resume")
+    env: Given = common.env_given()
+    settings: Given = given(RunConfig, prefix="", only=_OF_RUN, defaults=RUN)
+    fit: Given = given(FitConfig, prefix="", only=("policy", "steps", "batch_size"), defaults=FIT)
+    test_episodes: int = option(200, "unseen test episodes, used for no choice", at_least=1)
+    disturbed_episodes: int = option(100, "the first of them again, disturbed", at_least=1)
+    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
+    output: ResumableOutput = group(ResumableOutput(Path("runs/demo")), prefix="")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        for name in ("test_episodes", "disturbed_episodes"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} is {getattr(self, name)}; expected at least 1")
-        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-        replace(self._dagger(), output_dir=self.output_dir, resume=self.resume, overwrite=self.overwrite).check()
+        if (kind := self.fit.get("policy", {}).get("type", MLP)) != MLP:
+            raise UsageError(
+                f"{UnknownName('policy', kind, [MLP])}; LeRobot's policies (act, diffusion) are trained by "
+                "manip-il train and manip-il dagger, with --policy.type=..."
+            )
+        self._dagger().check()
 
     def run(self) -> None:
         """Run what is not there yet, print the table, write the report."""
-        started = time.monotonic()
         config = self._dagger().config()
-        with open_output(self, FREE) as folder:
-            from manip_il.collect.workers import Engine
-
+        with self.output.open(self) as folder:
             kept = f"every finished episode, round and evaluation, in {folder}"
-            with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+            with Stages(kept) as stages, self.engine.open() as engine:
                 engine.warm_up(learned=True)
-                quickstart = _Quickstart(self, config, engine, stages)
-                quickstart.add_time("start", time.monotonic() - started)
-                quickstart.run()
+                _Demo(self, config, engine, stages).run()
+
+    @property
+    def seed(self) -> int:
+        """Shift of every random stream."""
+        return self.settings.get("seed", 0)
+
+    @property
+    def validation_episodes(self) -> int:
+        """Episodes that choose the best round."""
+        return self.settings.get("validation_episodes", RUN["validation_episodes"])
 
     def _dagger(self) -> DaggerOptions:
         """Return the options of the DAgger run."""
-        shared = ("robot", "task", "env", "demonstrations", "rounds", "episodes_per_round", "steps")
-        shared += ("disturbed_share", "batch_size", "validation_episodes", "seed")
-        same = {name: getattr(self, name) for name in shared}
-        return DaggerOptions(**same, policy=self.policy.settings(), workers=self.workers)
+        return DaggerOptions(
+            env=self.env, settings=RUN | self.settings, fit=FIT | self.fit, engine=self.engine, output=self.output
+        )
 
 
 @dataclass(frozen=True)
@@ -120,14 +99,13 @@ class Contestant:
     labels: int | None = None
 
 
-class _Quickstart:
-    """One run of the quickstart: its parts one after the other, each of which skips what is done."""
+class _Demo:
+    """One run of the demo: its parts one after the other, each of which skips what is done."""
 
-    def __init__(self, options: QuickstartOptions, config: RunConfig, engine: Engine, stages: Stages) -> None:
+    def __init__(self, options: DemoOptions, config: RunConfig, engine: Engine, stages: Stages) -> None:
         self.options, self.config, self.engine, self.stages = options, config, engine, stages
-        self.folder = options.output_dir
-        path = self.folder / TIMINGS_FILE
-        self.timings = read_timings(path) if path.is_file() else {}
+        self.folder = options.output.output_dir
+        self.timings: dict[str, float] = {}  # of the parts [s], in this run
 
     def run(self) -> None:
         """Run every part, then print the table and write the report."""
@@ -155,7 +133,7 @@ class _Quickstart:
         )
 
     def _contestants(self, results: list[RoundResult]) -> list[Contestant]:
-        from manip_il.cli.cloning_baseline import clone_with_labels
+        from manip_il.algorithms.cloning_baseline import clone_with_labels
         from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 
         first, best = results[0], best_round(results)
@@ -246,9 +224,9 @@ class _Quickstart:
             rows,
             *films,
             [learning_curve(self.folder / "dagger"), beside],
-            title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",
-            verdict=quickstart_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
-            command=command_line("quickstart", self.options),
+            title=f"Demo: {self.config.env.robot} {self.config.env.task}",
+            verdict=demo_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
+            command=command_line("demo", self.options),
             facts=(
                 *facts,
                 f"{self.config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.",
@@ -260,26 +238,12 @@ class _Quickstart:
 
     @contextmanager
     def _timed(self, part: str) -> Generator[None]:
-        """Add the time of a part, also where it is interrupted, to that of earlier runs."""
         started = time.monotonic()
-        try:
-            yield
-        finally:
-            self.add_time(part, time.monotonic() - started)
-
-    def add_time(self, part: str, seconds: float) -> None:
-        """Add the time of a part [s] and write the file."""
-        self.timings[part] = round(self.timings.get(part, 0.0) + seconds, 2)
-        atomic_write(self.folder / TIMINGS_FILE, json.dumps(self.timings, indent=1) + "\n")
+        yield
+        self.timings[part] = time.monotonic() - started
 
 
-def read_timings(path: Path) -> dict[str, float]:
-    """Return the time of every part [s]."""
-    timings = checks.read_json(path, f"the {TIMINGS_FILE} of a quickstart")
-    return {name: checks.number(f"{path}: {name}", seconds, 0) for name, seconds in timings.items()}
-
-
-def quickstart_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
+def demo_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
     """Return the report's first sentence; significant: whether DAgger differs from cloning with as many labels."""
     from manip_il.evaluation.intervals import format_percent
 

@@ -1,0 +1,247 @@
+"""`manip-il data render`, `redraw`, `relabel`, `build`, `merge`: a dataset out of one that is there."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from manip_il.cli import common_options as common
+from manip_il.cli.inputs import require_dataset, require_folder
+from manip_il.cli.options import Given
+from manip_il.cli.outputs import prepare_output, require_output
+from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.record import left_out, require_repo_id
+from manip_il.data.atomic import exclusive
+from manip_il.errors import ManipError, UsageError
+from manip_il.option import option
+from manip_il.sim.config import CAMERAS, Look
+
+if TYPE_CHECKING:
+    from manip_il.sim.config import CameraConfig
+
+_RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
+
+
+def _require_journals(path: Path) -> None:
+    require_folder(path, "one of episode-*.mcap files")
+
+
+def _require_target(source: Path, target: Path, *, overwrite: bool) -> None:
+    """Raise `UsageError` unless TARGET is a new folder that neither holds the source nor lies in it."""
+    inside, outside = source.resolve(), target.resolve()
+    if inside.is_relative_to(outside) or outside.is_relative_to(inside):
+        raise UsageError(f"TARGET {target} overlaps SOURCE {source}; expected a folder of its own")
+    require_output(target, overwrite=overwrite)
+
+
+@dataclass
+class BuildOptions:
+    """Build the LeRobot dataset of a folder of journals.
+
+    The same journals give the same bytes, those that record wrote. Unreadable journals are reported and left out; the
+    exit code is then 1.
+    """
+
+    example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
+    journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True, check=_require_journals)
+    dataset: Path = option(MISSING, "folder of the dataset", positional=True)
+    repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded", check=require_repo_id)
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        require_output(self.dataset, overwrite=self.overwrite)
+
+    def run(self) -> None:
+        """Build the dataset; `ManipError` where a journal could not be read."""
+        from manip_il.data.build import build
+
+        with exclusive(self.dataset):
+            result = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
+        say(f"built {result.info.episodes:,} episodes, {result.info.frames:,} frames; {left_out(result.failed)}")
+        say(f"dataset: {self.dataset}")
+        warn(*result.damaged)
+        if result.damaged:
+            raise ManipError(
+                f"{len(result.damaged)} journal{'s' if len(result.damaged) > 1 else ''} could not be read: the dataset "
+                "lacks them; record them again by `manip-il record ... --resume=true`"
+            )
+
+
+@dataclass
+class MergeOptions:
+    """Merge the episodes of several datasets, in the order given, into one.
+
+    Refused if robot, task, rate or cameras differ. Provenance names the sources.
+    """
+
+    example: ClassVar[str] = "manip-il data merge datasets/demos datasets/more --output=datasets/both"
+    datasets: list[Path] = option(MISSING, "two or more folders of datasets", positional=True, check=require_dataset)
+    output: Path = option(MISSING, "folder of the new dataset")
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        if len(self.datasets) < 2:
+            raise UsageError(f"{self.datasets[0]} is the only one; expected two or more datasets to merge")
+        for path in self.datasets:
+            _require_target(path, self.output, overwrite=self.overwrite)
+
+    def run(self) -> None:
+        """Merge; the new dataset appears when it is whole."""
+        from manip_il.data.build import local_id, merge_datasets
+
+        with exclusive(self.output):
+            prepare_output(self.output, resume=False, overwrite=self.overwrite)
+            info = merge_datasets(self.datasets, self.output, repo_id=local_id(self.output.absolute().name))
+        say(f"merged {info.episodes:,} episodes, {info.frames:,} frames")
+        say(f"dataset: {self.output}")
+
+
+@dataclass
+class RenderOptions:
+    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. Nothing is simulated."""
+
+    example: ClassVar[str] = "manip-il data render datasets/demos datasets/dim --cameras=front --look.brightness=0.6"
+    source: Path = option(
+        MISSING, "a dataset of this program, with or without pictures", positional=True, check=require_dataset
+    )
+    target: Path = option(MISSING, "folder of the new dataset", positional=True)
+    robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
+    cameras: list[str] = option(lambda: list(CAMERAS), common.CAMERAS_HELP)
+    image: Given = common.image_given()
+    look: Look = field(default_factory=Look)
+    workers: int | None = common.processes_option()
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        _require_target(self.source, self.target, overwrite=self.overwrite)
+        _cameras(self.cameras, self.image, self.look)
+
+    def run(self) -> None:
+        """Render every episode; TARGET appears when all are there."""
+        from manip_il.collect.edits import Target, open_source, render_dataset
+        from manip_il.collect.workers import default_workers
+
+        cameras = _cameras(self.cameras, self.image, self.look)
+        source, workers = open_source(self.source, self.robot), self.workers or default_workers()
+        warn(*source.warnings)
+        with exclusive(self.target), progress(source.dataset.info.episodes, f"render {self.source}") as bar:
+            info = render_dataset(source, cameras, Target(self.target, workers, self.overwrite, bar.advance))
+        say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames: {_pictures_text(cameras)}")
+        say(f"dataset: {self.target}")
+
+
+@dataclass
+class RelabelOptions:
+    """Relabel every state of a dataset with the current expert, in place of recording again.
+
+    TARGET is DATASET with other labels: what was executed, pictures and all else stay as they are. States in which the
+    expert was not asked are labelled, too. Says how many labels changed.
+    """
+
+    example: ClassVar[str] = "manip-il data relabel datasets/demos"
+    dataset: Path = option(
+        MISSING, "a dataset of this program, with or without pictures", positional=True, check=require_dataset
+    )
+    target: Path | None = option(None, "folder of the new dataset; by default DATASET_relabelled", positional=True)
+    robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
+    workers: int | None = common.processes_option()
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        _require_target(self.dataset, self._target(), overwrite=self.overwrite)
+
+    def run(self) -> None:
+        """Label every state; TARGET appears when all are labelled."""
+        from manip_il.collect.edits import Target, open_source, relabel_dataset
+        from manip_il.collect.workers import default_workers
+
+        target, workers = self._target(), self.workers or default_workers()
+        source = open_source(self.dataset, self.robot)
+        warn(*source.warnings)
+        with exclusive(target), progress(source.dataset.info.episodes, f"relabel {self.dataset}") as bar:
+            changed = relabel_dataset(source, Target(target, workers, self.overwrite, bar.advance))
+        info, what = source.dataset.info, "all labels are as they were"
+        if changed:
+            what = f"{changed:,} labels differ: by more than 1 % of a joint's longest step, in phase, or in being sound"
+        say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {what}")
+        say(f"dataset: {target}")
+
+    def _target(self) -> Path:
+        folder = self.dataset.absolute()
+        return self.target or self.dataset.with_name(f"{folder.name}_relabelled")
+
+
+@dataclass
+class RedrawOptions:
+    """Draw goals, untouched objects and looks anew in the states that were visited; the expert labels, cameras see.
+
+    TARGET is a LeRobot dataset to train policies on pictures from, each frame an episode of its own. Scenes without a
+    sound label are left out.
+    """
+
+    example: ClassVar[str] = "manip-il data redraw runs/dagger datasets/redrawn --frames=20000"
+    source: Path = option(MISSING, "a dataset of this program, or the folder of a DAgger run", positional=True)
+    target: Path = option(MISSING, "folder of the new dataset", positional=True)
+    frames: int = option(20_000, "scenes to draw", at_least=1)
+    scenes: bool = option(True, "draw goals and objects anew; false: states as they were visited")
+    branch_steps: int = option(
+        1, "control steps that the expert drives on from every scene, for act and diffusion", at_least=1
+    )
+    robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
+    cameras: list[str] = option(lambda: list(CAMERAS), common.CAMERAS_HELP)
+    image: Given = common.image_given(small=True)
+    vary: list[str] = option(list, "how every frame looks: view, clutter, object (its colour), or YAMLs of ranges")
+    seed: int = common.seed_option()
+    workers: int | None = common.processes_option()
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        _require_target(self._dataset(), self.target, overwrite=self.overwrite)
+        _cameras(self.cameras, self.image, small=True)
+
+    def run(self) -> None:
+        """Draw all frames; TARGET appears when they are there."""
+        self.make()
+        policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
+        train = f"manip-il train --dataset.root={self.target} --policy.type={policy}"
+        say(f"next: {train} --output_dir=runs/{self.target.name}")
+
+    def make(self) -> None:
+        """Draw all frames, and say nothing of what comes next."""
+        from manip_il.collect.edits import Target, open_source, redraw_dataset
+        from manip_il.collect.scenes import CHUNK, Scenes
+        from manip_il.collect.workers import default_workers
+        from manip_il.evaluation.suites import varied
+
+        cameras = _cameras(self.cameras, self.image, small=True)
+        source = open_source(self._dataset(), self.robot)
+        warn(*source.warnings)
+        conditions, workers = varied(self.vary, source.env, sees=True), self.workers or default_workers()
+        scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
+        with exclusive(self.target), progress(self.frames, f"redraw {self._dataset()}") as bar:
+            target = Target(self.target, workers, self.overwrite, lambda: bar.advance(CHUNK))
+            info = redraw_dataset(source, scenes, target)
+        left, drawn = self.frames - info.episodes, f"{info.episodes:,} scenes, {info.frames:,} frames"
+        say(f"redrew {drawn}: {_pictures_text(cameras)}; {left:,} left out, without a sound label")
+        say(f"dataset: {self.target}")
+
+    def _dataset(self) -> Path:
+        root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
+        require_dataset(root)
+        return root
+
+
+def _cameras(names: list[str], sizes: Given, look: Look | None = None, *, small: bool = False) -> CameraConfig:
+    if (cameras := common.camera_config(names, sizes, look, small=small)) is None:
+        raise UsageError(f"--cameras names none; expected any of {', '.join(CAMERAS)}")
+    return cameras
+
+
+def _pictures_text(cameras: CameraConfig) -> str:
+    return f"{', '.join(cameras.names)}, {cameras.height} x {cameras.width} pixels"

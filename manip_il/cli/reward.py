@@ -1,0 +1,352 @@
+"""`manip-il reward irl|pairs|ask|answer|fit` and `data score`: rewards from demonstrations and from preferences."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from manip_il.cli.inputs import load_reward, require_dataset, require_file, require_folder
+from manip_il.cli.options import command_line, group, to_plain
+from manip_il.cli.outputs import REPORT_FILE, Output, atomic_write, require_short_path
+from manip_il.cli.progress import progress, say, warn
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.option import option
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from manip_il.preferences.frames import Frames
+
+METHODS = ("max_margin", "bayesian", "max_entropy")
+PROGRESS = "progress"
+_PAIRS = "pairs.json of manip-il reward pairs"
+
+
+def _require_pairs(path: Path) -> None:
+    require_file(path, _PAIRS)
+
+
+def _require_answers(path: Path) -> None:
+    require_file(path, "preferences.json of manip-il reward ask or answer")
+
+
+def _require_method(method: str) -> None:
+    if method not in METHODS:
+        raise UnknownName("method", method, METHODS)
+
+
+def _require_reward(path: Path) -> None:
+    require_folder(path, "a reward of manip-il reward fit")
+
+
+def _seed(what: str) -> Any:
+    return option(0, f"seed of {what}, 0 to 1000", at_least=0, at_most=1000)
+
+
+@dataclass
+class IrlOptions:
+    """Learn what the demonstrations of a dataset of carry care about: the weights of a reward.
+
+    Writes reward.json, which --task.reward takes, and report.html: the weights, and the cost over the table.
+    """
+
+    example: ClassVar[str] = "manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl"
+    dataset: Path = option(MISSING, "demonstrations of the task carry", positional=True, check=require_dataset)
+    method: str = option("max_entropy", ", ".join(METHODS), check=_require_method)
+    seed: int = _seed("what is drawn at random")
+    output: Output = group(Output(Path("runs/irl")), prefix="")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self.output.check()
+
+    def run(self) -> None:
+        """Read, learn, write the reward and the page, print the weights."""
+        from manip_il.algorithms.inverse import read_carried
+        from manip_il.algorithms.inverse_report import (
+            FILE_NAME,
+            PAGE,
+            Inverse,
+            inverse_report,
+            open_line,
+            summary_lines,
+        )
+        from manip_il.data.dataset import Dataset
+        from manip_il.evaluation.results import write_json
+        from manip_il.rewards.methods import learn
+        from manip_il.seeding import rng_for, stream_base
+
+        info, begin, timings = Dataset.open(self.dataset).summary, time.monotonic(), dict[str, float]()
+        with progress(info.episodes, f"irl {self.dataset}") as bar:
+            carried = read_carried(self.dataset, bar.advance)
+        timings["reading"] = time.monotonic() - begin
+        begin, rng = time.monotonic(), rng_for(stream_base("training", self.seed), "irl")
+        learnt = learn(self.method, [one.demonstration for one in carried], rng)
+        timings["learning"] = time.monotonic() - begin
+        found = Inverse(str(self.dataset), tuple(carried), learnt)
+        with self.output.open(self) as folder:
+            write_json(folder / FILE_NAME, found.to_json())
+            inverse_report(found, command_line("reward irl", self), to_plain(self), timings).write(folder / PAGE)
+        for line in summary_lines(found):
+            say(line)
+        if line := open_line(found):
+            warn(line)
+        say(f"report: {folder / PAGE}")
+        robot = "" if info.robot == "panda" else f"--robot.type={info.robot} "
+        say(f"next: manip-il eval --policy.type=expert {robot}--task.type=carry --task.reward={folder / FILE_NAME}")
+
+
+@dataclass
+class PairsOptions:
+    """Choose pairs of clips of one task's datasets, to be compared by people (ask) or simulated teachers (answer).
+
+    A SOURCE is a dataset or a run: each round's dataset of a DAgger run is a source. Every source is in as many pairs
+    as any other. Clips are whole: episodes that are shorter than --clip are left out.
+    """
+
+    example: ClassVar[str] = "manip-il reward pairs runs/dagger --count=200 --output=pairs.json"
+    sources: list[Path] = option(MISSING, "LeRobot datasets with our columns, or runs", positional=True)
+    clip: int = option(20, "length of a clip [control steps]", at_least=1)
+    count: int = option(200, "number of pairs", at_least=1)
+    reward: Path | None = option(
+        None, "choose those about which the networks of this reward disagree most", check=_require_reward
+    )
+    seed: int = _seed("the choice")
+    output: Path = option(Path("pairs.json"), "the file")
+    overwrite: bool = option(False, "replace an existing file")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        _require_new_file(self.output, ".json", self.overwrite)
+
+    def run(self) -> None:
+        """Read the sources, choose, and write the pairs."""
+        from manip_il.evaluation.results import write_json
+        from manip_il.preferences.choose import choose_pairs, open_supply
+        from manip_il.preferences.frames import find_datasets
+        from manip_il.seeding import rng_for, stream_base
+
+        reward = load_reward(self.reward) if self.reward else None
+        supply = open_supply(find_datasets(self.sources), self.clip)
+        if reward is not None:
+            reward.check_fits(str(supply.roots[0]), supply.frames[0].spec)
+        rng = rng_for(stream_base("training", self.seed), "pairs")
+        members = reward.members if reward is not None else None
+        pairs = choose_pairs(supply, self.count, self.seed, rng, members)
+        write_json(self.output, pairs.to_json())
+        if supply.too_short:
+            warn(f"{supply.too_short:,} episodes are shorter than {self.clip} control steps: no clip is from them")
+        say(f"{len(pairs):,} pairs from {len(pairs.sources)} datasets: {self.output}")
+        say(f"next: manip-il reward ask {self.output} --output=ask.html")
+
+
+@dataclass
+class AskOptions:
+    """Write one page that shows the pairs as films and asks which is better: offline, on a phone too.
+
+    Keys: left and right arrow, down for equal, S to skip, U to undo. The answers stay in the browser until they are
+    saved as preferences.json.
+    """
+
+    example: ClassVar[str] = "manip-il reward ask pairs.json --output=ask.html"
+    pairs: Path = option(MISSING, _PAIRS, positional=True, check=_require_pairs)
+    output: Path = option(Path("ask.html"), "the page")
+    robot: Path | None = option(None, "the YAML of the sources' robot, where that does not ship")
+    overwrite: bool = option(False, "replace an existing file")
+
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        _require_new_file(self.output, ".html", self.overwrite)
+
+    def run(self) -> None:
+        """Render the films and write the page."""
+        from manip_il.preferences.asking import render_films, render_page
+        from manip_il.preferences.pairs import Pairs, read_clips
+
+        clips = read_clips(Pairs.read(self.pairs))
+        with progress(len(clips.pairs), "render") as bar:
+            films = render_films(clips, str(self.robot) if self.robot else None, bar.advance)
+        page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
+        atomic_write(self.output, page)
+        say(f"{len(clips.pairs):,} pairs, {len(page) / 1e6:.1f} MB: {self.output}")
+        say("open it in a browser, compare, and save the answers as preferences.json")
+        say(f"next: manip-il reward fit {self.pairs} preferences.json --output_dir=runs/reward")
+
+
+@dataclass
+class AnswerOptions:
+    """Answer pairs by a simulated teacher, who compares the clips' true progress (B-Pref, Lee et al. 2021).
+
+    perfect; boltzmann:TEMPERATURE, who is less sure where returns are near; mistaken:EPSILON, the wrong way round in a
+    share of the pairs; myopic:GAMMA, for whom a clip's end counts most; skipping:DELTA, who skips pairs in which
+    neither clip has DELTA of the mean return. A clip's return is the sum of progress over its steps.
+    """
+
+    example: ClassVar[str] = "manip-il reward answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
+    pairs: Path = option(MISSING, _PAIRS, positional=True, check=_require_pairs)
+    teacher: str = option("perfect", "perfect, boltzmann[:1], mistaken[:0.1], myopic[:0.9] or skipping[:0.1]")
+    seed: int = _seed("the teacher's chances")
+    output: Path = option(Path("preferences.json"), "the file")
+    overwrite: bool = option(False, "replace an existing file")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        from manip_il.preferences.teachers import Teacher
+
+        Teacher.parse(self.teacher)
+        _require_new_file(self.output, ".json", self.overwrite)
+
+    def run(self) -> None:
+        """Compare every pair and write the answers."""
+        from manip_il.evaluation.results import write_json
+        from manip_il.preferences.pairs import Pairs, read_clips
+        from manip_il.preferences.teachers import Teacher, answer_pairs
+        from manip_il.seeding import rng_for, stream_base
+
+        clips = read_clips(Pairs.read(self.pairs))
+        rng = rng_for(stream_base("training", self.seed), "teacher")
+        found = answer_pairs(Teacher.parse(self.teacher), clips, rng)
+        write_json(self.output, found.to_json())
+        given = [one.answer for one in found.answers]
+        counts = ", ".join(f"{given.count(answer):,} {answer}" for answer in dict.fromkeys(sorted(given)))
+        say(f"{counts}: {self.output}")
+        say(f"next: manip-il reward fit {self.pairs} {self.output} --output_dir=runs/reward")
+
+
+@dataclass
+class FitOptions:
+    """Learn a reward of state and action from answers about pairs (Bradley-Terry): an ensemble of small networks.
+
+    Every pair is held out by one network; agreement on those is in report.html. ANSWERS are files of
+    ask or answer, of one person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model
+    holds the reward.
+    """
+
+    example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
+    pairs: Path = option(MISSING, _PAIRS, positional=True, check=_require_pairs)
+    answers: list[Path] = option(MISSING, "preferences.json of ask or answer", positional=True, check=_require_answers)
+    more_pairs: list[Path] = option(
+        list, "further files of pairs of the same task and length of clip", check=_require_pairs
+    )
+    members: int = option(8, "networks of the ensemble, and folds of the pairs", at_least=3, at_most=64)
+    seed: int = _seed("weights, folds and batches")
+    output: Output = group(Output(Path("runs/reward")), prefix="")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self.output.check()
+
+    def run(self) -> None:
+        """Fit, measure on held-out pairs, write the reward and the page."""
+        from manip_il.learn.reward import shape_for
+        from manip_il.preferences.answers import Preferences, join_answers
+        from manip_il.preferences.fitting import fit_answers, fit_report, summary_lines
+        from manip_il.preferences.pairs import Pairs, join_pairs, read_clips
+        from manip_il.seeding import stream_base
+
+        pairs = [Pairs.read(path) for path in (self.pairs, *self.more_pairs)]
+        given = [Preferences.read(path, pairs) for path in self.answers]
+        begin, answers, clips = time.monotonic(), join_answers(given), read_clips(join_pairs(pairs))
+        with progress(None, f"fit {len(answers.better):,} answers") as bar:
+            shape = shape_for(clips.frames[0].spec, self.members)
+            found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.advance)
+        timings = {"fit": time.monotonic() - begin}
+        who = [one.who or "somebody" for one in given]
+        with self.output.open(self) as folder:
+            self._write(folder, found, clips)
+            page = folder / REPORT_FILE
+            command = command_line("reward fit", self)
+            fit_report(found, clips, answers, who, command, to_plain(self), timings).write(page)
+        for line in summary_lines(found, answers):
+            say(line)
+        if answers.contradictory:
+            warn(f"{answers.contradictory:,} pairs are answered left and right: both answers count")
+        say(f"report: {page}")
+        say(f"next: manip-il data score DATASET --reward={folder} --output_dir=runs/scores")
+
+    def _write(self, folder: Path, found: Any, clips: Any) -> None:
+        from manip_il.data.dataset import Dataset
+        from manip_il.evaluation.results import write_json
+        from manip_il.learn.reward import write_reward
+        from manip_il.learn.training_state import PRETRAINED_MODEL
+
+        target = folder / PRETRAINED_MODEL
+        target.mkdir(parents=True, exist_ok=True)
+        fingerprint = Dataset.open(Path(clips.pairs.sources[0].root)).fingerprint
+        options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.length}
+        write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
+        write_json(folder / "fit.json", found.to_json())
+
+
+@dataclass
+class ScoreOptions:
+    """Score every frame and episode of a dataset by a reward, and list the worst episodes.
+
+    Writes scores.json, report.html, and rabc.parquet: weights of frames, for manip-il train --weights= and for
+    lerobot-train --sample_weighting.progress_path=. Where the dataset says which episodes failed, how well the score
+    finds them stands beside what true progress would find.
+    """
+
+    example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"
+    dataset: Path = option(MISSING, "the dataset's folder", positional=True, check=require_dataset)
+    reward: str = option(MISSING, "folder of manip-il reward fit; progress: true progress")
+    output: Output = group(Output(Path("runs/scores")), prefix="")
+
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        if self.reward != PROGRESS:
+            require_folder(Path(self.reward), "a reward of manip-il reward fit, or the word progress")
+        self.output.check()
+
+    def run(self) -> None:
+        """Score, print the worst episodes, write the files."""
+        from manip_il.evaluation.results import write_json
+        from manip_il.evaluation.tables import print_table
+        from manip_il.preferences.frames import read_frames
+        from manip_il.preferences.scores import (
+            FILE_NAME,
+            WEIGHTS_FILE,
+            Scores,
+            fact_lines,
+            score_report,
+            worst_table,
+            write_weights,
+        )
+
+        begin, data = time.monotonic(), read_frames(self.dataset)
+        scores = Scores(str(self.dataset), self.reward, data, self._scores(data))
+        timings = {"scoring": time.monotonic() - begin}
+        with self.output.open(self) as folder:
+            write_json(folder / FILE_NAME, scores.to_json())
+            write_weights(folder / WEIGHTS_FILE, scores)
+            page = folder / REPORT_FILE
+            score_report(scores, command_line("data score", self), to_plain(self), timings).write(page)
+        print_table(worst_table(scores))
+        for line in fact_lines(scores):
+            say(line)
+        say(f"report: {page}")
+        weights = f"--weights={folder / WEIGHTS_FILE}"
+        say(f"next: manip-il train --dataset.root={self.dataset} {weights} --output_dir=runs/weighted")
+
+    def _scores(self, data: Frames) -> NDArray[np.float64]:
+        """Score of every frame, (N,)."""
+        import numpy as np
+
+        if self.reward == PROGRESS:
+            if data.progress is None:
+                raise ManipError(f"{self.dataset} has no column progress; give --reward=FOLDER")
+            return data.progress
+        reward = load_reward(Path(self.reward))
+        reward.check_fits(str(self.dataset), data.spec)
+        return np.clip(reward.of_inputs(data.inputs).astype(np.float64), 0.0, 1.0)
+
+
+def _require_new_file(path: Path, suffix: str, overwrite: bool) -> None:
+    require_short_path(path)
+    if path.suffix != suffix:
+        raise UsageError(f"--output is {path}; expected a file, NAME{suffix}")
+    if path.is_dir() or (path.exists() and not overwrite):
+        raise UsageError(f"{path} exists already; choose another --output, or give --overwrite=true")
