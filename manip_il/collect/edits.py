@@ -25,7 +25,7 @@ from manip_il.data.episodes import to_episode
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import DatasetInfo
 from manip_il.data.lerobot_layout import OURS
-from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
@@ -128,7 +128,7 @@ def relabel_dataset(source: Source, target: Target) -> int:
 def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> DatasetInfo:
     """Write `source` anew with these cameras' pictures in place of its own; every other column stays as it is.
 
-    Raises `RenderError` if there is no OpenGL, and what reading and `new_dataset` raise.
+    Raises `RenderError` if there is no OpenGL, and what reading and `write_dataset` raise.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
     spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
@@ -168,20 +168,19 @@ def _write[T](
     pieces: Iterable[T],
 ) -> DatasetInfo:
     """Write the episodes that workers make of each piece, in order."""
-    repo_id = local_id(target.root.name)
-    with (
-        new_dataset(target.root, spec, repo_id=repo_id, fingerprint=fingerprint, replace=target.replace) as writer,
-        closing(map_in_order(work, pieces, target.workers)) as made,
-    ):
+
+    def episodes() -> Iterator[Episode]:
         empty = True
-        for _, episodes in made:
-            for episode in episodes:
-                writer.add(episode)
-                empty = False
+        for _, found in made:
+            yield from found
+            empty = empty and not found
             target.on_piece()
         if empty:
             raise NothingToLearnError("no scene has a sound label of the expert: there is nothing to learn from")
-        return writer.finish(provenance)
+
+    about: dict[str, Any] = {"repo_id": local_id(target.root.name), "fingerprint": fingerprint}
+    with closing(map_in_order(work, pieces, target.workers)) as made:
+        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, **about)
 
 
 def label_episode(env: EnvConfig, episode: Episode) -> Columns:

@@ -106,11 +106,7 @@ def record(
     `build(journals, root)` gives the same bytes later. replace: as in `new_folder`.
     """
     recording.write(journals)
-    journal, selection = journal_of(journals, job), recording.selection()
-    with recording.open(root, journal.spec, journal.fingerprint, replace=replace) as writer:
-        for episode in selection.take(episodes):
-            writer.add(episode)
-        return writer.finish(recording.provenance | selection.provenance), selection.failed
+    return recording.make(episodes, root, replace=replace)
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.records import Attachment, Chunk, DataEnd, Metadata
@@ -36,7 +36,6 @@ _NPY = ".npy"
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
 _FINAL = "final/"  # what journals of before had of the observation after the last frame
-_LARGEST = 4 * 1024**3  # [bytes]
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class Journal:
     def encode(self, episode: Episode) -> bytes:
         """Return the content of an episode's journal; the same episode gives the same bytes.
 
-        Raises `ManipError` for a column that numpy can only pickle.
+        Raises `ValueError` for a column that numpy can only pickle.
         """
         stream = BytesIO()
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
@@ -79,28 +78,22 @@ class Journal:
         channels, times = foxglove.episode_channels(episode, self.spec), foxglove.frame_times(episode, self.spec)
         foxglove.add_channels(writer, list(channels), times)
         for key, column in episode.columns.items():
-            if key.startswith(IMAGES):
-                continue  # pictures travel as messages, without loss as well
-            writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
+            if not key.startswith(IMAGES):  # pictures travel as messages, without loss as well
+                numbers = BytesIO()
+                np.save(numbers, column, allow_pickle=False)
+                writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", numbers.getvalue())
         writer.finish()
         return stream.getvalue()
 
-    def store(self, seed: int, content: bytes) -> None:
-        """Write what `encode` gave to disk, in place of an earlier file of the seed.
-
-        Raises `ManipError` where the disk is full or may not be written.
-        """
+    def store(self, seed: int, content: bytes) -> Path:
+        """Write what `encode` gave to disk, in place of an earlier file of the seed; return its path."""
         path = episode_path(self.folder, seed)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_file(path, content)
-        except OSError as error:
-            raise ManipError(f"cannot write {path}: {error.strerror}") from error
+        write_file(path, content)
+        return path
 
     def write(self, episode: Episode) -> Path:
         """Encode and store one episode; return its path."""
-        self.store(episode.seed, self.encode(episode))
-        return episode_path(self.folder, episode.seed)
+        return self.store(episode.seed, self.encode(episode))
 
     def read(self, seed: int) -> tuple[Header, Episode] | None:
         """Return what `read_journal` gives for a seed.
@@ -126,8 +119,15 @@ class Journal:
         """
         for leftover in self.folder.glob(f".episode-*{PARTIAL}"):
             leftover.unlink(missing_ok=True)
-        header = next(filter(None, map(_header_or_none, list_episodes(self.folder))), None)
-        if header is None:
+        for path in list_episodes(self.folder):
+            try:
+                header = read_header(path)
+                break
+            except OlderSchemaError:
+                raise
+            except ManipError:  # set aside when its turn comes
+                continue
+        else:
             return []
         here = f"{self.spec.robot} {self.spec.task}"
         check_same_spec(str(self.folder), header.spec, here, self.spec)
@@ -153,64 +153,48 @@ def list_episodes(folder: Path) -> list[Path]:
     return [episode_path(folder, seed) for seed in list_seeds(folder)]
 
 
+def read_header(path: Path) -> Header:
+    """Return the header of a whole journal. Raises what `read_journal` raises."""
+    return read_journal(path)[0]
+
+
 def read_journal(path: Path) -> tuple[Header, Episode]:
     """Return the header and the episode as they were written, bit for bit.
 
-    Raises `ManipError` naming the file if it is cut short, changed, or none of ours.
+    Raises `ManipError` naming the file if it is cut short, changed, or none of ours, `OlderSchemaError` for another
+    version of ours.
     """
-    return _read_file(path)
-
-
-def read_header(path: Path) -> Header:
-    """Return the header of a whole journal. Raises what `read_journal` raises."""
-    return _read_file(path)[0]
-
-
-def _read_file(path: Path) -> tuple[Header, Episode]:
-    """What `read_journal` gives; every error names the file."""
     try:
-        return _read(checks.read_bytes(path, "an episode's journal", _LARGEST))
+        with path.open("rb") as stream:
+            return _read(stream)
     except OlderSchemaError as error:
         error.args = (f"{path}: {error}",)
         raise
     except Exception as error:  # what has right checksums and is none of ours can make a parser raise anything
-        if str(path) in str(error):
-            raise
-        why = str(error) or type(error).__name__
+        why = checks.one_line(error) or type(error).__name__
         raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error
 
 
-def _read(content: bytes) -> tuple[Header, Episode]:
-    """Take a file apart whose checksum is right."""
-    header: Header | None = None
+def _read(stream: BinaryIO) -> tuple[Header, Episode]:
+    """Take a file apart, whose checksums are compared."""
+    texts: Mapping[str, str] = {}
     columns: dict[str, NDArray[Any]] = {}
     chunks: list[Chunk] = []
-    for record in StreamReader(BytesIO(content), emit_chunks=True, validate_crcs=True).records:
+    for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
         if isinstance(record, Metadata) and record.name == _RECORD:
-            header = _from_texts(record.metadata)
+            texts = record.metadata
         elif isinstance(record, Attachment) and not record.name.startswith(_FINAL):
             columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
         elif isinstance(record, Chunk):
             chunks.append(record)
         elif isinstance(record, DataEnd):  # the checksum that it holds was right
             break
-    if header is None:
-        raise ValueError(f"it has no record called {_RECORD}")
+    header = _from_texts(texts)  # now that all checksums were right
     if header.spec.cameras:  # else nothing in the messages is needed
-        shape = (header.frames, *header.spec.image_size, 3)
-        pictures = foxglove.read_images(chunks, shape)
+        pictures = foxglove.read_images(chunks, (header.frames, *header.spec.image_size, 3))
         columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
     ends = header.success, header.success_at_end
     return header, Episode(header.seed, columns, *ends, instruction=header.instruction, drawn=header.drawn)
-
-
-def _header_or_none(path: Path) -> Header | None:
-    try:
-        return read_header(path)
-    except OlderSchemaError:
-        raise
-    except ManipError:
-        return None
 
 
 def _to_texts(header: Header) -> dict[str, str]:
@@ -227,17 +211,6 @@ def _from_texts(texts: Mapping[str, str]) -> Header:
         raise OlderSchemaError("1", schema.VERSION)
     if found != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
-    values: dict[str, Any] = {
-        name: checks.parse_json(f"its {name}", text) for name, text in texts.items() if name != "format"
-    }
+    values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
     values["spec"] = RobotTaskSpec.from_json(values["spec"])
     return Header(**values)
-
-
-def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
-    stream = BytesIO()
-    try:
-        np.save(stream, column, allow_pickle=False)
-    except ValueError as error:
-        raise ManipError(f"episode with seed {seed}, column {key!r} of dtype {column.dtype}: {error}") from error
-    return stream.getvalue()

@@ -32,7 +32,7 @@ def roots(
     """Ours with either codec, in several files; what LeRobot records; what it makes of two by aggregating."""
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    from .record_lerobot import main as record
+    from .record_lerobot import record
 
     folder = tmp_path_factory.mktemp("datasets")
     for codec in ("h264", "libsvtav1"):
@@ -40,7 +40,7 @@ def roots(
         write(five, folder / codec, two, video=VideoConfig(codec), video_files_size_in_mb=0.001)
     os.environ.setdefault("SVT_LOG", "1")  # or the encoder tells its life
     for kind in RECORDED:
-        record(folder / kind, kind, 3, "finalize")
+        record(folder / kind, kind, 3)
     pair = [folder / "video", folder / "video"]
     aggregate_datasets(["a/one", "a/two"], "a/all", roots=pair, aggr_root=folder / "aggregated")
     return {path.name: path for path in folder.iterdir()}

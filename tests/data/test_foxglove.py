@@ -7,7 +7,6 @@ import json
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.records import Chunk
@@ -16,7 +15,6 @@ from mcap.writer import Writer
 
 from manip_il.data import foxglove
 from manip_il.data import schema as s
-from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..mcap.use import decoded
@@ -85,9 +83,3 @@ def test_the_scalars_schema_is_lerobots() -> None:
 
     assert foxglove.SCALARS == lerobots._SCALARS_SCHEMA
     assert lerobots._foxglove_topic(s.IMAGES + "front", is_image=True) == foxglove.IMAGE_TOPICS + "front"
-
-
-@pytest.mark.parametrize("pictures", [np.zeros((2, 4, 4, 3)), np.zeros((2, 4, 4, 1), np.uint8), np.zeros(2, np.uint8)])
-def test_pictures_of_another_kind_are_refused(pictures: np.ndarray) -> None:
-    with pytest.raises(ManipError, match=r"column 'observation\.images\.front' is .*expected pictures"):
-        list(foxglove.episode_channels(Episode(1, {s.IMAGES + "front": pictures}, True, True), SPEC))

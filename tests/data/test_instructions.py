@@ -85,7 +85,7 @@ def test_the_doctor_finds_nothing_amiss_and_mcap_and_the_card_have_every_text(tm
 
 def test_a_number_without_a_text_is_an_error(root):
     pq.write_table(layout.tasks_table([RED]), root / layout.TASKS)
-    with pytest.raises(ManipError, match=r"rows have the task 1, which meta/tasks\.parquet does not hold"):
+    with pytest.raises(ManipError, match=r"rows have the task 1, which meta/tasks\.parquet lacks"):
         texts(root)
 
 

@@ -46,7 +46,7 @@ def any_episode(draw: st.DrawFn) -> Episode:
             dtype, shapes, elements={"allow_nan": False, "allow_infinity": False} if "f" in dtype else None
         )
     )
-    names = st.sampled_from([s.ACTION, s.STATE, s.SUCCESS, "a/b", "é %s", "x.npy", s.ENVIRONMENT_STATE])
+    names = st.sampled_from([s.SEED, s.SIM_STATE, s.BETA, "a/b", "é %s", "x.npy", s.ROUND])
     columns: dict[str, Any] = draw(st.dictionaries(names, arrays, min_size=1, max_size=5))
     seed = draw(st.integers(0, 2**63 - 1))
     return Episode(seed, columns, draw(st.booleans()), draw(st.booleans()))
@@ -136,13 +136,13 @@ def test_another_mcap_and_a_missing_file_are_refused(tmp_path):
         writer.finish()
     with pytest.raises(ManipError, match="not a complete episode"):
         journal.read_journal(other)
-    with pytest.raises(ManipError, match=r"cannot read .*episode-000000000002\.mcap: No such file"):
+    with pytest.raises(ManipError, match=r"episode-000000000002\.mcap is not a complete episode: .*No such file"):
         journal.read_header(tmp_path / "episode-000000000002.mcap")
 
 
 def test_what_cannot_be_read_again_is_not_written(tmp_path, spec):
     episode = Episode(1, {"x": np.array([{}, {}], dtype=object)}, True, True)
-    with pytest.raises(ManipError, match="column 'x' of dtype object"):
+    with pytest.raises(ValueError, match="allow_pickle"):
         journal.Journal(tmp_path, spec, {}).write(episode)
     assert list(tmp_path.iterdir()) == []
 
