@@ -52,7 +52,7 @@ def _demonstrate(config: RunConfig, labels: int, round_0: Path, folder: Path, en
     while True:
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, config.seed)
         found = list(collect_successes(engine, job, seeds, count, journals, stages.episode))
-        frames = sum(header.frames for header, _ in found if header.success)
+        frames = sum(len(episode) for _, episode in found if episode.success)
         if frames >= labels:
             break
         count = max(count + 1, math.ceil(count * labels / frames))

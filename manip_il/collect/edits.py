@@ -23,7 +23,7 @@ from manip_il.data.build import dataset_sha256, local_id, rewrite_columns
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.episodes import to_episode
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.info import DatasetInfo
+from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
@@ -125,7 +125,7 @@ def relabel_dataset(source: Source, target: Target) -> int:
     return changed
 
 
-def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> DatasetInfo:
+def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> Info:
     """Write `source` anew with these cameras' pictures in place of its own; every other column stays as it is.
 
     Raises `RenderError` if there is no OpenGL, and what reading and `write_dataset` raise.
@@ -141,7 +141,7 @@ def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> Dat
     return _write(target, spec, fingerprint, provenance, work, episodes)
 
 
-def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> DatasetInfo:
+def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> Info:
     """Write the dataset of other scenes of a dataset's states, each frame or branch an episode.
 
     The same seed gives the same scenes, and more frames begin with the same ones. Raises `NothingToLearnError` if no
@@ -166,7 +166,7 @@ def _write[T](
     provenance: Mapping[str, Any],
     work: Callable[[T], list[Episode]],
     pieces: Iterable[T],
-) -> DatasetInfo:
+) -> Info:
     """Write the episodes that workers make of each piece, in order."""
 
     def episodes() -> Iterator[Episode]:

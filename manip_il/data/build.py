@@ -21,8 +21,8 @@ from manip_il.data.atomic import write_file
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.info import DatasetInfo, reading
-from manip_il.data.journal import Header, list_episodes, read_journal
+from manip_il.data.info import Info, reading
+from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.lerobot_write import Columns, Films, write_dataset
 from manip_il.data.schema import LABEL_VALID, check_same_spec
 from manip_il.data.video_config import VideoConfig
@@ -31,7 +31,7 @@ from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
-Rollouts = Iterable[tuple[Header, Episode]]
+Rollouts = Iterable[tuple[Journal, Episode]]
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Recording:
             checks.repo_id("repo_id", data.get("repo_id"))
             return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
 
-    def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[DatasetInfo, int]:
+    def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
         """Write the dataset of rollouts in seed order; its counts, and how many failed episodes were left out.
 
         Every rollout is taken, also once the dataset is full. The first one's environment is the dataset's; another
@@ -86,11 +86,11 @@ class Recording:
         def selected() -> Iterator[Episode]:
             nonlocal failed, found
             labels = 0
-            for header, rollout in itertools.chain([first], rollouts):
-                _check_source(header, about)
+            for journal, rollout in itertools.chain([first], rollouts):
+                _check_source(journal, rollout.seed, about)
                 if self._is_full(found, labels):
                     continue
-                seeds.append(header.seed)
+                seeds.append(rollout.seed)
                 for part in parts(rollout):
                     if self._is_full(found, labels):
                         break
@@ -119,11 +119,11 @@ class Recording:
         return any(most is not None and found >= most for most, found in asked)
 
 
-def _check_source(header: Header, first: Header) -> None:
-    name = f"the journal of seed {header.seed}"
-    if header.spec != first.spec:
-        raise MismatchError("robot, task or cameras", name, header.spec, "the first", first.spec)
-    for line in compare_fingerprints(name, header.fingerprint, "the first", first.fingerprint):
+def _check_source(journal: Journal, seed: int, first: Journal) -> None:
+    name = f"the journal of seed {seed}"
+    if journal.spec != first.spec:
+        raise MismatchError("robot, task or cameras", name, journal.spec, "the first", first.spec)
+    for line in compare_fingerprints(name, journal.fingerprint, "the first", first.fingerprint):
         _LOG.warning("%s", line)
 
 
@@ -144,7 +144,7 @@ def local_id(folder: str) -> str:
 class BuildResult:
     """A built dataset. failed: episodes left out as they failed. damaged: what is wrong with each unreadable file."""
 
-    info: DatasetInfo
+    info: Info
     failed: int
     damaged: tuple[str, ...]
 
@@ -159,7 +159,7 @@ def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bo
     if repo_id is not None:
         recording = dataclasses.replace(recording, repo_id=repo_id)
 
-    def readable() -> Iterator[tuple[Header, Episode]]:
+    def readable() -> Iterator[tuple[Journal, Episode]]:
         for path in list_episodes(journals):
             try:
                 yield read_journal(path)
@@ -180,7 +180,7 @@ def merge_datasets(
     repo_id: str,
     fingerprint: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
-) -> DatasetInfo:
+) -> Info:
     """Merge the episodes of several datasets, in order, into one: equal to `write_dataset` of them.
 
     The fingerprint is the first one's unless given; if theirs differ, a warning is logged. The provenance names the
@@ -208,7 +208,7 @@ def merge_datasets(
 
 def rewrite_columns(
     dataset: Dataset, target: Path, columns: Iterable[Columns], provenance: Mapping[str, Any], **options: Any
-) -> DatasetInfo:
+) -> Info:
     """Write a dataset to `target` with these columns in place of its own; films are copied.
 
     columns: of every episode in stored order, name -> (T,) or (T, d). options: those of `write_dataset`. Raises what

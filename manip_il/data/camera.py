@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -75,25 +76,6 @@ class Camera:
             raise ManipError(f"{root}: its files of {key} do not hold each of {info.frames} frames once")
         return cls(root, key, info.fps, info.frames, feature.picture_size, films, tuple(parts))
 
-    @property
-    def shape(self) -> tuple[int, int, int, int]:
-        """Shape of all its pictures, channels before pixels: (N, 3, height, width)."""
-        return (self.frames, 3, *self.size)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of all its pictures as uint8 [bytes]."""
-        return self.frames * 3 * self.size[0] * self.size[1]
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return self.frames
-
-    def __getitem__(self, rows: I64) -> NDArray[np.uint8]:
-        """Return the pictures of these rows (...), in any order, channels before pixels: (..., 3, height, width)."""
-        read = np.ascontiguousarray(self.rows(rows.reshape(-1)).transpose(0, 3, 1, 2))
-        return read.reshape(*rows.shape, *read.shape[1:])
-
     def rows(self, rows: I64) -> Pictures:
         """Return the pictures of these rows (B,), decoded, (B, height, width, 3).
 
@@ -112,32 +94,32 @@ class Camera:
         They are in a nameless file of the temporary folder, mapped into memory, and go with the array. on_frames: is
         called with the number of frames decoded since the last call. Raises `ManipError` if there is no room.
         """
+        shape = self.frames, 3, *self.size
         with tempfile.TemporaryFile() as file:
+            size, folder = math.prod(shape), tempfile.gettempdir()
             try:
-                os.posix_fallocate(file.fileno(), 0, self.nbytes)  # else a full disk ends the process
+                os.posix_fallocate(file.fileno(), 0, size)  # else a full disk ends the process
             except OSError as error:
-                raise ManipError(
-                    f"cannot keep {self.nbytes / 1e9:.1f} GB of decoded pictures in {tempfile.gettempdir()}: "
-                    f"{error.strerror}; make room, or set TMPDIR to another disk"
-                ) from error
-            decoded = np.memmap(file, np.uint8, "r+", shape=self.shape)
+                what = f"cannot keep {size / 1e9:.1f} GB of decoded pictures in {folder}: {error.strerror}"
+                raise ManipError(f"{what}; make room, or set TMPDIR to another disk") from error
+            decoded = np.memmap(file, np.uint8, "r+", shape=shape)
 
         def fill(rows: I64) -> int:
-            decoded[rows[0] : rows[-1] + 1] = self[rows]
+            decoded[rows[0] : rows[-1] + 1] = self.rows(rows).transpose(0, 3, 1, 2)
             return len(rows)
 
+        # consecutive rows of one part each
+        step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
+        pieces = (
+            np.arange(start, min(start + step, part.row + part.count))
+            for part in self.parts
+            for start in range(part.row, part.row + part.count, step)
+        )
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
-            for count in threads.map(fill, self._pieces()):
+            for count in threads.map(fill, pieces):
                 if on_frames is not None:
                     on_frames(count)
         return decoded
-
-    def _pieces(self) -> Iterator[I64]:
-        """Consecutive rows of one part each."""
-        step = max(_PIECE, _PIECE_BYTES * self.frames // self.nbytes)
-        for part in self.parts:
-            for start in range(part.row, part.row + part.count, step):
-                yield np.arange(start, min(start + step, part.row + part.count))
 
     def _read(self, part: Part, rows: I64) -> Pictures:
         """Consecutive rows of one part."""

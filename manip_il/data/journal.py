@@ -10,7 +10,7 @@ import json
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -39,32 +39,12 @@ _FINAL = "final/"  # what journals of before had of the observation after the la
 
 
 @dataclass(frozen=True)
-class Header:
-    """An episode without its columns: how it ended, what it drew, and the environment that it comes from."""
-
-    seed: int
-    success: bool
-    success_at_end: bool
-    frames: int
-    spec: RobotTaskSpec
-    fingerprint: dict[str, Any]
-    instruction: str = ""  # of the episode, where it is not that of the spec
-    drawn: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Journal:
     """A folder of the journals of episodes of one environment."""
 
     folder: Path
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
-
-    def header(self, episode: Episode) -> Header:
-        """Return the header that an episode has here."""
-        ends = bool(episode.success), bool(episode.success_at_end)
-        about = self.spec, self.fingerprint, episode.instruction, episode.drawn
-        return Header(episode.seed, *ends, len(episode), *about)
 
     def encode(self, episode: Episode) -> bytes:
         """Return the content of an episode's journal; the same episode gives the same bytes.
@@ -74,7 +54,7 @@ class Journal:
         stream = BytesIO()
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=_RECORD)
-        writer.add_metadata(_RECORD, {"format": _FORMAT} | _to_texts(self.header(episode)))
+        writer.add_metadata(_RECORD, _to_texts(self, episode))
         channels, times = foxglove.episode_channels(episode, self.spec), foxglove.frame_times(episode, self.spec)
         foxglove.add_channels(writer, list(channels), times)
         for key, column in episode.columns.items():
@@ -95,7 +75,7 @@ class Journal:
         """Encode and store one episode; return its path."""
         return self.store(episode.seed, self.encode(episode))
 
-    def read(self, seed: int) -> tuple[Header, Episode] | None:
+    def read(self, seed: int) -> tuple[Journal, Episode] | None:
         """Return what `read_journal` gives for a seed.
 
         None for a damaged file, which is renamed to `<name>.damaged` with a warning, so that its seed is free. Raises
@@ -121,7 +101,7 @@ class Journal:
             leftover.unlink(missing_ok=True)
         for path in list_episodes(self.folder):
             try:
-                header = read_header(path)
+                there, _ = read_journal(path)
                 break
             except OlderSchemaError:
                 raise
@@ -130,12 +110,12 @@ class Journal:
         else:
             return []
         here = f"{self.spec.robot} {self.spec.task}"
-        check_same_spec(str(self.folder), header.spec, here, self.spec)
+        check_same_spec(str(self.folder), there.spec, here, self.spec)
         for what in ("task", "cameras", "image_size"):
-            left, right = getattr(header.spec, what), getattr(self.spec, what)
+            left, right = getattr(there.spec, what), getattr(self.spec, what)
             if left != right:
                 raise MismatchError(what, str(self.folder), left, here, right)
-        return compare_fingerprints(str(self.folder), header.fingerprint, "this machine", self.fingerprint)
+        return compare_fingerprints(str(self.folder), there.fingerprint, "this machine", self.fingerprint)
 
 
 def episode_path(folder: Path, seed: int) -> Path:
@@ -153,20 +133,15 @@ def list_episodes(folder: Path) -> list[Path]:
     return [episode_path(folder, seed) for seed in list_seeds(folder)]
 
 
-def read_header(path: Path) -> Header:
-    """Return the header of a whole journal. Raises what `read_journal` raises."""
-    return read_journal(path)[0]
-
-
-def read_journal(path: Path) -> tuple[Header, Episode]:
-    """Return the header and the episode as they were written, bit for bit.
+def read_journal(path: Path) -> tuple[Journal, Episode]:
+    """Return an episode as it was written, bit for bit, and the environment that it comes from.
 
     Raises `ManipError` naming the file if it is cut short, changed, or none of ours, `OlderSchemaError` for another
     version of ours.
     """
     try:
         with path.open("rb") as stream:
-            return _read(stream)
+            return _read(path.parent, stream)
     except OlderSchemaError as error:
         error.args = (f"{path}: {error}",)
         raise
@@ -175,7 +150,7 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
         raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error
 
 
-def _read(stream: BinaryIO) -> tuple[Header, Episode]:
+def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     """Take a file apart, whose checksums are compared."""
     texts: Mapping[str, str] = {}
     columns: dict[str, NDArray[Any]] = {}
@@ -189,28 +164,33 @@ def _read(stream: BinaryIO) -> tuple[Header, Episode]:
             chunks.append(record)
         elif isinstance(record, DataEnd):  # the checksum that it holds was right
             break
-    header = _from_texts(texts)  # now that all checksums were right
-    if header.spec.cameras:  # else nothing in the messages is needed
-        pictures = foxglove.read_images(chunks, (header.frames, *header.spec.image_size, 3))
-        columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
-    ends = header.success, header.success_at_end
-    return header, Episode(header.seed, columns, *ends, instruction=header.instruction, drawn=header.drawn)
-
-
-def _to_texts(header: Header) -> dict[str, str]:
-    """Return a header as JSON by name."""
-    values = {name: getattr(header, name) for name in ("seed", "success", "success_at_end", "frames")}
-    values |= {"spec": header.spec.to_json(), "fingerprint": header.fingerprint, "instruction": header.instruction}
-    values |= {"drawn": dict(header.drawn)} if header.drawn else {}
-    return {name: json.dumps(value) for name, value in values.items()}
-
-
-def _from_texts(texts: Mapping[str, str]) -> Header:
-    """Return the inverse of `_to_texts`; journals of older versions have neither instruction nor draws."""
     if (found := texts.get("format")) == "1":
         raise OlderSchemaError("1", schema.VERSION)
     if found != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
     values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
-    values["spec"] = RobotTaskSpec.from_json(values["spec"])
-    return Header(**values)
+    spec, fingerprint, frames = (
+        RobotTaskSpec.from_json(values.pop("spec")),
+        values.pop("fingerprint"),
+        values.pop("frames"),
+    )
+    if spec.cameras:  # else nothing in the messages is needed
+        pictures = foxglove.read_images(chunks, (frames, *spec.image_size, 3))
+        columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
+    # journals of older versions have neither instruction nor draws
+    return Journal(folder, spec, fingerprint), Episode(columns=columns, **values)
+
+
+def _to_texts(journal: Journal, episode: Episode) -> dict[str, str]:
+    """Return all but the columns as JSON by name."""
+    values: dict[str, Any] = {
+        "seed": episode.seed,
+        "success": bool(episode.success),
+        "success_at_end": bool(episode.success_at_end),
+        "frames": len(episode),
+        "spec": journal.spec.to_json(),
+        "fingerprint": journal.fingerprint,
+        "instruction": episode.instruction,
+    }
+    values |= {"drawn": dict(episode.drawn)} if episode.drawn else {}
+    return {"format": _FORMAT} | {name: json.dumps(value) for name, value in values.items()}

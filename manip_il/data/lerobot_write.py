@@ -21,7 +21,7 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
-from manip_il.data.info import PICTURES, DatasetInfo
+from manip_il.data.info import PICTURES, Info, read_info
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, fitted_columns
 from manip_il.data.statistics import PooledStatistics, column_statistics, picture_statistics, to_lists
@@ -49,8 +49,8 @@ def write_dataset(
     replace: bool = False,
     data_files_size_in_mb: float = layout.DATA_FILES_SIZE_IN_MB,
     video_files_size_in_mb: float = layout.VIDEO_FILES_SIZE_IN_MB,
-) -> DatasetInfo:
-    """Write the episodes, in order, as a dataset of this program's columns, which appears whole; its names and counts.
+) -> Info:
+    """Write the episodes, in order, as a dataset of this program's columns, which appears whole; return its description.
 
     They are taken one by one and not kept; the same ones in the same order give the same bytes, videos included. One
     that comes with films has them copied. provenance: where they came from; it is read after the last one. video:
@@ -62,29 +62,16 @@ def write_dataset(
     if spec.cameras and spec.video:
         try_encoder(video, spec.image_size, spec.fps)
     about = features(spec), spec.fps, spec.lerobot_type, video, sizes
-    success = success_at_end = 0
     with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about, drawn=True)) as writer:
         for item in episodes:
             episode, films = (item, None) if isinstance(item, Episode) else item
             columns = fitted_columns(episode, spec, writer.films if films else ())
             text = checks.text("instruction", episode.instruction or spec.instruction)
             writer.add_columns(columns, [text] * len(episode), json.dumps(dict(episode.drawn)), films)
-            success += episode.success
-            success_at_end += episode.success_at_end
         writer.close_files()
         ours = {"format": _FORMAT, "repo_id": repo_id, "spec": spec.to_json(), "fingerprint": dict(fingerprint)}
         layout.write_json(folder / layout.OURS, {**ours, "provenance": dict(provenance or {})})
-    return DatasetInfo(
-        root=root,
-        robot=spec.robot,
-        task=spec.task,
-        instruction=spec.instruction,
-        fps=spec.fps,
-        episodes=writer.episodes,
-        frames=writer.frames,
-        success=success,
-        success_at_end=success_at_end,
-    )
+    return read_info(root)
 
 
 class TableWriter:

@@ -14,7 +14,7 @@ from manip_il.collect.record import collect, collect_successes, journal_of, reco
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, build
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import Journal, list_episodes, read_header
+from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
@@ -46,7 +46,7 @@ class Recorded(Engine):
 
 
 def names(folder: Path) -> list[int]:
-    return [read_header(path).seed for path in list_episodes(folder)]
+    return [read_journal(path)[1].seed for path in list_episodes(folder)]
 
 
 def contents(folder: Path) -> list[bytes]:

@@ -83,7 +83,8 @@ def test_success_at_some_time_and_at_the_end_are_told_apart(tmp_path, make_episo
     lost = make_episode(3, success=False)
     lost.columns[s.SUCCESS][4] = True
     lost = dataclasses.replace(lost, success=True)
-    info = write_dataset([lost, make_episode(4)], tmp_path / "lift", spec, **OPTIONS)
+    write_dataset([lost, make_episode(4)], tmp_path / "lift", spec, **OPTIONS)
+    info = Dataset.open(tmp_path / "lift").summary
     assert (info.success, info.success_at_end) == (2, 1)
     assert [episode.success_at_end for episode in Dataset.open(tmp_path / "lift").read_episodes()] == [False, True]
 
@@ -100,7 +101,7 @@ def test_episodes_come_one_by_one_nothing_is_there_before_the_last_and_the_bytes
         origin.update(ORIGIN)
 
     info = write_dataset(one_by_one(), again, spec, origin, **OPTIONS)
-    assert info == Dataset.open(again).summary
+    assert info == Dataset.open(again).info
     assert digests(again) == digests(root)
 
 

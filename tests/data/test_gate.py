@@ -66,7 +66,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: Any, opened: list[str]):
     set_first(root, cell)
     with pytest.raises(ManipError, match=rf"cannot read .*lift/{DATA}"):
-        _ = Dataset.open(root).camera(KEY)[np.array([0])]
+        Dataset.open(root).frames(KEY, np.array([0]))
     refused = rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"
     with pytest.raises(ManipError, match=refused):
         check_arrived(root)

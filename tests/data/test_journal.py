@@ -74,7 +74,7 @@ def test_an_episode_comes_back_with_its_header_and_gives_the_same_bytes_again(tm
     for count, episode in enumerate(episodes, start=1):
         path = journal.Journal(tmp_path / "new" / "folder", spec, FINGERPRINT).write(episode)
         assert_same(journal.read_journal(path)[1], episode)
-        assert journal.read_header(path) == journal.Journal(tmp_path, spec, FINGERPRINT).header(episode)
+        assert journal.read_journal(path)[0] == journal.Journal(path.parent, spec, FINGERPRINT)
         again = journal.Journal(tmp_path / "again", spec, FINGERPRINT).write(episode)
         assert again.read_bytes() == path.read_bytes()
         assert len(list((tmp_path / "again").iterdir())) == count
@@ -119,9 +119,8 @@ def test_a_changed_byte_anywhere_is_refused_by_name_or_changes_nothing(filmed, p
 def test_a_file_cut_short_is_refused_and_set_aside_so_that_its_seed_is_free(path, caplog, spec, keep):
     data = path.read_bytes()[: int(path.stat().st_size * keep)]
     path.write_bytes(data)
-    for read in (journal.read_header, journal.read_journal):
-        with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
-            read(path)
+    with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
+        journal.read_journal(path)
     assert journal.Journal(path.parent, spec, FINGERPRINT).read(17) is None
     assert journal.list_seeds(path.parent) == []
     assert path.with_name("episode-000000000017.mcap.damaged").read_bytes() == data
@@ -137,7 +136,7 @@ def test_another_mcap_and_a_missing_file_are_refused(tmp_path):
     with pytest.raises(ManipError, match="not a complete episode"):
         journal.read_journal(other)
     with pytest.raises(ManipError, match=r"episode-000000000002\.mcap is not a complete episode: .*No such file"):
-        journal.read_header(tmp_path / "episode-000000000002.mcap")
+        journal.read_journal(tmp_path / "episode-000000000002.mcap")
 
 
 def test_what_cannot_be_read_again_is_not_written(tmp_path, spec):
@@ -225,7 +224,7 @@ def test_a_killed_recorder_loses_no_finished_episode(tmp_path, delay):
     found = journal.list_episodes(tmp_path)
     assert [journal.read_journal(path)[1].seed for path in found] == list(range(len(found)))
     assert len(found) >= len(told)
-    journal.Journal(tmp_path, journal.read_header(found[0]).spec, {}).prepare()
+    journal.Journal(tmp_path, journal.read_journal(found[0])[0].spec, {}).prepare()
     assert sorted(tmp_path.iterdir()) == found
 
 

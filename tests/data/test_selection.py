@@ -41,7 +41,7 @@ def recorded(rollouts: list[Episode], spec, folder: Path, recording: Recording) 
     journal = Journal(journals, spec, {})
     for episode in rollouts:
         journal.write(episode)
-    recording.make(((journal.header(episode), episode) for episode in rollouts), root)
+    recording.make(((journal, episode) for episode in rollouts), root)
     return root
 
 
