@@ -32,7 +32,7 @@ SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
 _LONGEST_MESSAGE = 1_000  # [characters]
-_REFUSED, _OUT_OF_MEMORY = 3, 4  # exit codes of a child process
+_REFUSED = 3  # exit code of a child process
 
 
 def one_line(error: BaseException) -> str:
@@ -194,13 +194,11 @@ def in_child(what: str, function: Callable[..., object], *arguments: object) -> 
     lines = done.stdout.decode(errors="replace").splitlines()
     if done.returncode == _REFUSED:
         raise ManipError(lines[-1])
-    what = lines[-1] if lines else what
-    if done.returncode == -signal.SIGALRM:
-        raise ManipError(f"{what} took more than {SECONDS_IN_CHILD:g} s to open")
-    if done.returncode == _OUT_OF_MEMORY or b"bad_alloc" in done.stderr:
-        raise ManipError(f"{what} needs more than {MEMORY_IN_CHILD / 1024**3:g} GB of memory to open")
     if done.returncode != 0:
-        raise ManipError(f"{what} cannot be opened: the process that read it ended with code {done.returncode}")
+        limits = f"{MEMORY_IN_CHILD / 1024**3:g} GB of memory and {SECONDS_IN_CHILD:g} s"
+        code = "out of memory" if b"bad_alloc" in done.stderr or b"MemoryError" in done.stderr else done.returncode
+        code = "out of time" if done.returncode == -signal.SIGALRM else code
+        raise ManipError(f"{lines[-1] if lines else what} cannot be opened in {limits}: {code}")
 
 
 def opening(name: str) -> None:
@@ -219,8 +217,6 @@ def answer_parent() -> None:
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         function(*arguments)
-    except MemoryError:
-        os._exit(_OUT_OF_MEMORY)
     except ManipError as error:
         sys.stdout.write(" ".join(str(error).split()) + "\n")
         sys.stdout.flush()

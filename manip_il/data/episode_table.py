@@ -28,11 +28,10 @@ I64, F64 = NDArray[np.int64], NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Clips:
-    """Places of one camera's episodes, one entry an episode: a video file, start and stop in it [s]."""
+    """Places of one camera's episodes, one entry an episode: a video file, and the start in it [s]."""
 
     files: list[str]
     starts: F64
-    stops: F64
 
 
 @dataclass(frozen=True)
@@ -101,4 +100,4 @@ def _clips(table: pa.Table, info: Info, key: str) -> Clips:
     before = f"videos/{key}"
     places = zip(*(_numbers(table, f"{before}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True)
     files = [info.video_path.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places]
-    return Clips(files, *(_numbers(table, f"{before}/{name}_timestamp", pa.float64()) for name in ("from", "to")))
+    return Clips(files, _numbers(table, f"{before}/from_timestamp", pa.float64()))

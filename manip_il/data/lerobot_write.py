@@ -50,13 +50,13 @@ def write_dataset(
     data_files_size_in_mb: float = layout.DATA_FILES_SIZE_IN_MB,
     video_files_size_in_mb: float = layout.VIDEO_FILES_SIZE_IN_MB,
 ) -> Info:
-    """Write the episodes, in order, as a dataset of this program's columns, which appears whole; return its description.
+    """Write the episodes, in order, as a dataset of this program's columns; return what its `info.json` says.
 
-    They are taken one by one and not kept; the same ones in the same order give the same bytes, videos included. One
-    that comes with films has them copied. provenance: where they came from; it is read after the last one. video:
-    LeRobot's settings by default. replace: as in `new_folder`. Raises `FolderExistsError` if `root` holds something,
-    `UsageError` for pictures or settings that the encoder refuses, both before an episode is taken; what
-    `fitted_columns` raises for one that does not fit; `ManipError` if there is none, or no space.
+    It appears whole. Episodes are taken one by one and not kept; the same ones in the same order give the same bytes,
+    videos included. One that comes with films has them copied. provenance: where they came from; it is read after the
+    last one. video: LeRobot's settings by default. replace: as in `new_folder`. Raises `FolderExistsError` if `root`
+    holds something, `UsageError` for pictures or settings that the encoder refuses, both before an episode is taken;
+    what `fitted_columns` raises for one that does not fit; `ManipError` if there is none, or no space.
     """
     video, sizes = video or VideoConfig(), (data_files_size_in_mb, video_files_size_in_mb)
     if spec.cameras and spec.video:

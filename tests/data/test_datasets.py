@@ -61,15 +61,6 @@ def test_a_table_can_be_of_some_columns_and_an_episode_is_rows_of_it(root, episo
     np.testing.assert_array_equal(table[s.ACTION][dataset.rows_of(2)], episodes[2].columns[s.ACTION])
 
 
-def test_scalars_may_be_columns_without_width(root, tmp_path, episodes, spec):
-    flat = [
-        dataclasses.replace(one, columns={key: v[:, 0] if v.shape[1] == 1 else v for key, v in one.columns.items()})
-        for one in episodes
-    ]
-    write_dataset(flat, tmp_path / "flat", spec, provenance=ORIGIN, **OPTIONS)
-    assert digests(tmp_path / "flat") == digests(root)
-
-
 def test_what_a_dataset_says_of_itself(root, spec):
     assert Dataset.open(root).spec == spec
     assert Dataset.open(root).fingerprint == FINGERPRINT
@@ -77,16 +68,6 @@ def test_what_a_dataset_says_of_itself(root, spec):
     info = Dataset.open(root).summary
     assert (info.robot, info.task, info.fps, info.episodes, info.frames) == ("panda", "lift", 20, 3, 20)
     assert (info.success, info.success_at_end) == (2, 2)
-
-
-def test_success_at_some_time_and_at_the_end_are_told_apart(tmp_path, make_episode, spec):
-    lost = make_episode(3, success=False)
-    lost.columns[s.SUCCESS][4] = True
-    lost = dataclasses.replace(lost, success=True)
-    write_dataset([lost, make_episode(4)], tmp_path / "lift", spec, **OPTIONS)
-    info = Dataset.open(tmp_path / "lift").summary
-    assert (info.success, info.success_at_end) == (2, 1)
-    assert [episode.success_at_end for episode in Dataset.open(tmp_path / "lift").read_episodes()] == [False, True]
 
 
 def test_episodes_come_one_by_one_nothing_is_there_before_the_last_and_the_bytes_are_the_same(

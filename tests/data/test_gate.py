@@ -120,13 +120,3 @@ def test_a_row_whose_task_has_no_text_is_one_line(root: Path):
     own[-1] = 7
     with pytest.raises(ManipError, match=r"lift: rows have the task 7, which meta/tasks\.parquet lacks"):
         meta.joint_tasks(own)
-
-
-def test_pandas_metadata_that_names_no_column_is_not_looked_at(
-    tmp_path: Path, two: s.RobotTaskSpec, filmed: list[Episode]
-):
-    root = write(filmed, tmp_path / "film", two)
-    tasks = pq.read_table(root / layout.TASKS)
-    about = json.dumps({"index_columns": ["absent"], "columns": [{"name": 3}], "column_indexes": [7]})
-    pq.write_table(tasks.replace_schema_metadata({"pandas": about}), root / layout.TASKS)
-    assert JoinedDatasets([root]).tasks == tasks.column("task").to_pylist()

@@ -24,7 +24,6 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import journal
 from manip_il.data import schema as s
-from manip_il.data.foxglove import SCALARS
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -80,14 +79,6 @@ def test_an_episode_comes_back_with_its_header_and_gives_the_same_bytes_again(tm
         assert len(list((tmp_path / "again").iterdir())) == count
 
 
-def test_files_are_listed_in_the_order_of_their_seeds(tmp_path, make_episode, spec):
-    seeds = [110_000_000_000, 7, 3, 1_000_000]
-    paths = {seed: journal.Journal(tmp_path, spec, {}).write(make_episode(seed, 2)) for seed in seeds}
-    assert paths[7].name == "episode-000000000007.mcap"
-    assert journal.list_episodes(tmp_path) == [paths[seed] for seed in sorted(seeds)]
-    assert journal.list_episodes(tmp_path / "nothing") == []
-
-
 @pytest.fixture
 def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
     return journal.Journal(tmp_path, spec, FINGERPRINT).write(make_episode(17, 4))
@@ -115,9 +106,8 @@ def test_a_changed_byte_anywhere_is_refused_by_name_or_changes_nothing(filmed, p
     assert re.match(r"^.*episode-000000000018\.mcap is not a complete episode: .*$", message)
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.1, 0.5])
-def test_a_file_cut_short_is_refused_and_set_aside_so_that_its_seed_is_free(path, caplog, spec, keep):
-    data = path.read_bytes()[: int(path.stat().st_size * keep)]
+def test_a_file_cut_short_is_refused_and_set_aside_so_that_its_seed_is_free(path, caplog, spec):
+    data = path.read_bytes()[: path.stat().st_size // 2]
     path.write_bytes(data)
     with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
         journal.read_journal(path)
@@ -181,22 +171,6 @@ def test_foxglove_sees_joints_frames_and_scalars(tmp_path, make_episode, spec):
     assert scalars[s.EXPERT_PHASE] == episode.columns[s.EXPERT_PHASE][2]
 
 
-def test_channels_carry_foxgloves_schemas(path):
-    summary = make_reader(io.BytesIO(path.read_bytes())).get_summary()
-    assert summary is not None
-    schemas = {schema.name: schema for schema in summary.schemas.values()}
-    encodings = {name: schema.encoding for name, schema in schemas.items()}
-    assert encodings == {
-        "foxglove.FrameTransforms": "protobuf",
-        "foxglove.JointStates": "protobuf",
-        "lerobot.Scalars": "jsonschema",
-    }
-    assert json.loads(schemas["lerobot.Scalars"].data) == SCALARS
-    encodings = {channel.topic: channel.message_encoding for channel in summary.channels.values()}
-    assert encodings.pop("/scalars") == "json"
-    assert set(encodings.values()) == {"protobuf"}
-
-
 _RECORDER = """
 import sys
 from pathlib import Path
@@ -211,26 +185,18 @@ for seed in range(100_000):
 """
 
 
-@pytest.mark.parametrize("delay", [0.001, 0.0017])
-def test_a_killed_recorder_loses_no_finished_episode(tmp_path, delay):
+def test_a_killed_recorder_loses_no_finished_episode(tmp_path):
     command = [sys.executable, "-c", _RECORDER, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[1]) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "0\n"
         with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(delay)
+            process.wait(0.0017)
         os.kill(process.pid, signal.SIGKILL)
         told = [0, *(int(line) for line in process.stdout.read().split())]
     found = journal.list_episodes(tmp_path)
     assert [journal.read_journal(path)[1].seed for path in found] == list(range(len(found)))
     assert len(found) >= len(told)
-    journal.Journal(tmp_path, journal.read_journal(found[0])[0].spec, {}).prepare()
+    (tmp_path / ".episode-000000000007.mcap.x1y2.partial").write_bytes(b"half")
+    assert journal.Journal(tmp_path, journal.read_journal(found[0])[0].spec, {}).prepare() == []
     assert sorted(tmp_path.iterdir()) == found
-
-
-def test_leftovers_are_cleared_and_finished_files_kept(path, spec):
-    leftover = path.with_name(f".{path.name}.x1y2.partial")
-    leftover.write_bytes(b"half")
-    assert journal.list_episodes(path.parent) == [path]
-    assert journal.Journal(path.parent, spec, FINGERPRINT).prepare() == []
-    assert list(path.parent.iterdir()) == [path]

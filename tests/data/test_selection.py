@@ -60,11 +60,6 @@ def test_parts_are_the_rollout_cut_behind_every_done(rollout):
         np.testing.assert_array_equal(np.concatenate([piece.columns[key] for piece in pieces]), column)
 
 
-def test_an_episode_with_one_end_is_its_only_part(make_episode):
-    episode = make_episode(7)
-    assert parts(episode) == [episode]
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
