@@ -222,7 +222,7 @@ class Dataset:
         left_out = {} if pictures else self.spec.image_keys
         shapes = {key: one["shape"] for key, one in s.features(self.spec).items() if key not in left_out}
         stored = [key for key in shapes if key not in cameras]
-        row = 0
+        texts, drawn, row = self.tasks, self.episodes.drawn, 0
         for piece in self.pieces([*stored, layout.EPISODE_INDEX, layout.TASK_INDEX]):
             index, task = (piece[name].reshape(-1) for name in (layout.EPISODE_INDEX, layout.TASK_INDEX))
             starts = np.flatnonzero(np.diff(index, prepend=-1))
@@ -231,11 +231,11 @@ class Dataset:
                     key: camera.rows(np.arange(row + start, row + stop)) for key, camera in cameras.items()
                 }
                 own |= {key: piece[key][start:stop].reshape(-1, *shapes[key]) for key in stored}
-                if int(task[start]) not in self.tasks:
+                if (text := texts.get(int(task[start]))) is None:
                     raise ManipError(f"{self.root}: rows have the task {task[start]}, which {layout.TASKS} lacks")
-                columns, drawn = {key: own[key] for key in shapes}, self.episodes.drawn.get(int(index[start]), {})
-                solved, text = columns[s.SUCCESS], self.tasks[int(task[start])]
-                yield Episode(int(columns[s.SEED].flat[0]), columns, bool(solved.any()), bool(solved[-1]), text, drawn)
+                columns, solved = {key: own[key] for key in shapes}, own[s.SUCCESS]
+                ends = bool(solved.any()), bool(solved[-1])
+                yield Episode(int(own[s.SEED].flat[0]), columns, *ends, text, drawn.get(int(index[start]), {}))
             row += len(index)
 
     @cached_property

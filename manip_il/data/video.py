@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -77,9 +77,9 @@ class CameraFiles:
             encoder = _new_encoder(self._config, size, self._fps)
         clip = Clip(chunk, number, self._frames, len(frames))
         for picture in frames:
-            self._mux(encoder.encode(_video_frame(picture, self._frames, self._fps)))
+            self._mux(_encode(encoder, _video_frame(picture, self._frames, self._fps)))
             self._frames += 1
-        self._mux(encoder.encode(None))
+        self._mux(_encode(encoder, None))
         return clip
 
     def close(self) -> None:
@@ -122,6 +122,21 @@ class CameraFiles:
             cast(OutputContainer, self._container).mux_one(packet)
 
 
+def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Packet]:
+    """Encode a frame, or what is left; the first one opens the encoder.
+
+    SVT-AV1, if root runs it, makes the thread that opens it, and its own, real-time ones (SCHED_FIFO) for good: these,
+    and every process that they start, would starve all others.
+    """
+    opens = not encoder.is_open
+    packets = encoder.encode(frame)
+    if opens and os.geteuid() == 0 and encoder.name == "libsvtav1":
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with suppress(OSError):  # it has ended
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+    return packets
+
+
 def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoCodecContext:
     encoder = cast(VideoCodecContext, av.CodecContext.create(config.vcodec, "w"))
     encoder.options = config.options()
@@ -151,8 +166,8 @@ def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
             if len(av.VideoFormat(config.pix_fmt).components) < 3:
                 raise ValueError(f"{config.pix_fmt} has no colour")
             encoder = _new_encoder(config, size, fps)
-            encoder.encode(_video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
-            encoder.encode(None)
+            _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
+            _encode(encoder, None)
         except (av.FFmpegError, ValueError) as error:
             reason = log[0][2].strip() if log else str(error)
             raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {reason}") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import resource
 import shutil
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
+from manip_il.data.video import try_encoder
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
@@ -110,6 +112,11 @@ def test_settings_that_cannot_be_are_refused_before_anything_is_written(tmp_path
     with pytest.raises(error, match=message):
         write([], tmp_path / "lift", two, video=VideoConfig(**settings))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_makes_no_thread_a_real_time_one():
+    try_encoder(VideoConfig(vcodec="libsvtav1"), (64, 64), 10)
+    assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {os.SCHED_OTHER}
 
 
 def test_pictures_of_another_size_are_refused(tmp_path, make_episode, filmed, two):
