@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il import checks
@@ -156,6 +157,12 @@ class Dataset:
         paths = sorted(self.root.glob(layout.DATA_FILES))
         if not paths:
             raise ManipError(f"{self.root} has no data: no file matches {layout.DATA_FILES}")
+        rows = 0
+        for path in paths:
+            with reading(path):
+                rows += pq.read_metadata(path).num_rows
+        if rows != len(self):
+            raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
         return paths
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
@@ -176,14 +183,10 @@ class Dataset:
         for name in names:
             if name not in known:
                 raise UnknownName(f"column in {self.root}", name, known)
-        rows = 0
         for path in self.data_files:
             with reading(path):
                 table = read_file(path, names)
                 piece = {name: to_numpy(table.column(name), self.features[name]) for name in names}
-            rows += len(table)
-            if rows > len(self) or (rows < len(self) and path == self.data_files[-1]):
-                raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
             yield piece
 
     def camera(self, key: str) -> Camera:
