@@ -28,7 +28,7 @@ from _machine import describe_machine
 from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
-from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.learn.reward import LearnedReward
@@ -130,10 +130,8 @@ def join(good: Path, bad: Path, target: Path) -> None:
     """Write the episodes of two datasets as one, with what was executed as the label, as a recorder knows no other."""
     spec, episodes = Dataset.open(good).spec, [[*Dataset.open(root).read_episodes()] for root in (good, bad)]
     count = min(map(len, episodes))
-    with new_dataset(target, spec, repo_id="a/half", fingerprint=Dataset.open(good).fingerprint) as writer:
-        for episode in (one for group in episodes for one in group[:count]):
-            writer.add(as_recorded(episode))
-        writer.finish({})
+    fitted = (as_recorded(one) for group in episodes for one in group[:count])
+    write_dataset(fitted, target, spec, repo_id="a/half", fingerprint=Dataset.open(good).fingerprint)
 
 
 def as_recorded(episode: Episode) -> Episode:

@@ -17,7 +17,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,12 +27,12 @@ from _machine import describe_machine
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks, here and in the limit
 
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect, provenance
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording
-from manip_il.data.journal import episode_path, list_episodes, read_journal
+from manip_il.data.journal import Journal, episode_path, list_episodes, read_journal
+from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
@@ -119,20 +119,19 @@ def record_seconds(
 ) -> float:
     """Seconds of `manip-il record`'s own path. between: called after every episode, while the clock stands still."""
     journals = root.with_name(f"{root.name}.journals")
-    recording = Recording("local/x", provenance=provenance(job))
     paused = 0.0
     started = time.perf_counter()
-    spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
-    selection = recording.selection()
-    with recording.open(root, spec, fingerprint) as writer:
-        for header, rollout in collect(engine, job, seeds, journals):
-            for episode in selection.take([(header, rollout)]):
-                writer.add(episode)
+
+    def rollouts() -> Iterator[tuple[Journal, Episode]]:
+        nonlocal paused
+        for journal, episode in collect(engine, job, seeds, journals):
+            yield journal, episode
             if between is not None:
                 paused -= time.perf_counter()
-                between(episode_path(journals, header.seed))
+                between(episode_path(journals, episode.seed))
                 paused += time.perf_counter()
-        writer.finish(recording.provenance | selection.provenance)
+
+    Recording("local/x", provenance=provenance(job)).make(rollouts(), root)
     return time.perf_counter() - started - paused
 
 

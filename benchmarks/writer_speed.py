@@ -2,7 +2,7 @@
 
 python benchmarks/writer_speed.py [--quick]
 
-Ours is `new_dataset` with `add` an episode and `finish`; the peer is `add_frame` a frame, `save_episode` an episode and
+Ours is `write_dataset`; the peer is `add_frame` a frame, `save_episode` an episode and
 `finalize`, with its pictures encoded after every episode (its default) or while it records (streaming). Both have
 the whole dataset on file in the end, both with LeRobot's default video settings. By turns in the same run; the median
 ratio over the repeats counts. The peer's time an episode grows with its video file, ours does not: longer datasets
@@ -27,7 +27,7 @@ from lerobot.datasets import LeRobotDataset
 
 import datasets
 from manip_il.data import schema as s
-from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.video import VideoConfig
 from manip_il.mdp import Episode
 
@@ -80,10 +80,7 @@ def rate(write: Write, spec: s.RobotTaskSpec, episodes: list[Episode]) -> float:
 
 
 def ours(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
-    with new_dataset(root, spec, repo_id=REPO, fingerprint={}, video=VideoConfig("libsvtav1")) as writer:
-        for episode in episodes:
-            writer.add(episode)
-        writer.finish()
+    write_dataset(episodes, root, spec, repo_id=REPO, fingerprint={}, video=VideoConfig("libsvtav1"))
 
 
 def peer_default(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode], streaming: bool = False) -> None:

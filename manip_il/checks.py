@@ -12,7 +12,6 @@ import math
 import os
 import pickle
 import re
-import reprlib
 import resource
 import signal
 import stat
@@ -22,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError, UsageError, shorten
 
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
@@ -32,22 +31,8 @@ MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
-_LONGEST_PRINTED = 300  # [characters]
 _LONGEST_MESSAGE = 1_000  # [characters]
-_REFUSED, _OUT_OF_MEMORY = 3, 4  # exit codes of a child process
-_PRINTED = reprlib.Repr()
-_PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
-_PRINTED.maxlevel = 2
-_PRINTED.maxlist = _PRINTED.maxtuple = _PRINTED.maxdict = _PRINTED.maxset = 4
-
-
-def shorten(value: object) -> str:
-    """Return `repr(value)` in at most 300 characters, whatever the value is."""
-    try:
-        printed = _PRINTED.repr(value)
-    except ValueError:  # an int of more digits than Python prints
-        printed = f"a huge {type(value).__name__}"
-    return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
+_REFUSED = 3  # exit code of a child process
 
 
 def one_line(error: BaseException) -> str:
@@ -209,13 +194,11 @@ def in_child(what: str, function: Callable[..., object], *arguments: object) -> 
     lines = done.stdout.decode(errors="replace").splitlines()
     if done.returncode == _REFUSED:
         raise ManipError(lines[-1])
-    what = lines[-1] if lines else what
-    if done.returncode == -signal.SIGALRM:
-        raise ManipError(f"{what} took more than {SECONDS_IN_CHILD:g} s to open")
-    if done.returncode == _OUT_OF_MEMORY or b"bad_alloc" in done.stderr:
-        raise ManipError(f"{what} needs more than {MEMORY_IN_CHILD / 1024**3:g} GB of memory to open")
     if done.returncode != 0:
-        raise ManipError(f"{what} cannot be opened: the process that read it ended with code {done.returncode}")
+        limits = f"{MEMORY_IN_CHILD / 1024**3:g} GB of memory and {SECONDS_IN_CHILD:g} s"
+        code = "out of memory" if b"bad_alloc" in done.stderr or b"MemoryError" in done.stderr else done.returncode
+        code = "out of time" if done.returncode == -signal.SIGALRM else code
+        raise ManipError(f"{lines[-1] if lines else what} cannot be opened in {limits}: {code}")
 
 
 def opening(name: str) -> None:
@@ -234,8 +217,6 @@ def answer_parent() -> None:
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         function(*arguments)
-    except MemoryError:
-        os._exit(_OUT_OF_MEMORY)
     except ManipError as error:
         sys.stdout.write(" ".join(str(error).split()) + "\n")
         sys.stdout.flush()

@@ -6,11 +6,17 @@ The command line turns every `ManipError` into one line on standard error and it
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable, Sequence
 
 _FEW = 3  # names that an error offers
 _BEGINNING = 3  # characters of a name that tell it from others
-_LONGEST_NAME = 200  # [characters] of a name that is compared or printed
+_LONGEST_NAME = 200  # [characters] of a name that is compared
+_LONGEST_PRINTED = 300  # [characters]
+_PRINTED = reprlib.Repr()
+_PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
+_PRINTED.maxlevel = 2
+_PRINTED.maxlist = _PRINTED.maxtuple = _PRINTED.maxdict = _PRINTED.maxset = 4
 
 
 class ManipError(Exception):
@@ -119,9 +125,13 @@ def printable(text: str) -> str:
     return "".join(one if one.isprintable() or one in "\n\t" else repr(one)[1:-1] for one in text)
 
 
-def shorten(text: str) -> str:
-    """Return a text in quotes, cut where it is longer than a line."""
-    return repr(text if len(text) <= _LONGEST_NAME else f"{text[:_LONGEST_NAME]}...")
+def shorten(value: object) -> str:
+    """Return `repr(value)` in at most 300 characters, whatever the value is."""
+    try:
+        printed = _PRINTED.repr(value)
+    except ValueError:  # an int of more digits than Python prints
+        printed = f"a huge {type(value).__name__}"
+    return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
 
 
 def silence_ffmpeg_warning() -> None:

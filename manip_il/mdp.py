@@ -7,10 +7,10 @@ over joints have length `n` = arm joints + 1: arm [rad], gripper opening [m].
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from manip_il.errors import ManipError, NotFiniteError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
 KEYPOINTS = "privileged.keypoints."  # before a camera's name: a column that comes and goes with its pictures
 STATE_EXTRAS = 4  # numbers of a `sim_state` beside physics and variation
 LONGEST_EPISODE = 10_000  # control steps; eight minutes at 20 Hz
@@ -178,40 +179,3 @@ def require_finite(what: str, values: NDArray[np.generic]) -> None:
     place = np.argwhere(~np.isfinite(values))[0]
     where = f"frame {place[0]}" if values.ndim > 1 else f"index {place[0]}"
     raise NotFiniteError(f"{what}: {values[tuple(place)]} at {where} is not finite")
-
-
-Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
-
-
-@runtime_checkable
-class ReadsInstructions(Protocol):
-    """A policy that is told what each episode is about."""
-
-    def instruct(self, instructions: Mapping[int, str]) -> None:
-        """Take the texts of episodes that begin, by their numbers."""
-        ...
-
-
-class Policy(Protocol):
-    """Actions from joint states (B, n), environment states (B, k) and pictures, for many episodes at once."""
-
-    @property
-    def cameras(self) -> Sequence[str]:
-        """Names of the cameras whose pictures it takes."""
-        ...
-
-    def act(self, states: F32, environment_states: F32, images: Images, episodes: Sequence[int]) -> F64:
-        """Return one absolute action a row, (B, n). episodes: whose row each is."""
-        ...
-
-    def reset(self, episodes: Sequence[int]) -> None:
-        """Forget the past of episodes that begin."""
-        ...
-
-    def sample(self, states: F32, environment_states: F32, images: Images, rngs: Sequence[np.random.Generator]) -> F64:
-        """Draw one absolute action a row, (B, n), each from its own generator; `UsageError` without a distribution."""
-        ...
-
-    def log_prob(self, states: F32, environment_states: F32, images: Images, actions: F64) -> F64:
-        """Return how likely each row's action (B, n) is [nats], (B,); `UsageError` without a distribution."""
-        ...

@@ -18,7 +18,7 @@ from PIL import Image
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO
-from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
 
@@ -83,11 +83,8 @@ def store_pictures(root: Path, key: str, pictures: list[bytes], size: tuple[int,
 
 
 def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options: Any) -> Path:
-    """Write a dataset with options of `new_dataset`."""
-    with new_dataset(root, spec, **({"repo_id": "someone/lift", "fingerprint": {}} | options)) as writer:
-        for episode in episodes:
-            writer.add(episode)
-        writer.finish()
+    """Write a dataset with options of `write_dataset`."""
+    write_dataset(episodes, root, spec, **({"repo_id": "someone/lift", "fingerprint": {}} | options))
     return root
 
 

@@ -109,12 +109,13 @@ def test_a_child_process_is_bounded_and_its_refusal_comes_home(monkeypatch: pyte
     checks.in_child("a number", checks.whole, "n", 3, 0, 5)
     with pytest.raises(ManipError, match="n is 7; expected a whole number from 0 to 5"):
         checks.in_child("a number", checks.whole, "n", 7, 0, 5)
-    with pytest.raises(ManipError, match=r"x\.xml needs more than 4 GB of memory"):
+    limits = r"x\.xml cannot be opened in 4 GB of memory and 120 s: "
+    with pytest.raises(ManipError, match=f"{limits}out of memory"):
         checks.in_child("x.xml", bytearray, 2 * checks.MEMORY_IN_CHILD)
-    with pytest.raises(ManipError, match=r"x\.xml cannot be opened: the process that read it ended with code -6"):
+    with pytest.raises(ManipError, match=f"{limits}-6"):
         checks.in_child("x.xml", os.abort)
     monkeypatch.setattr(checks, "SECONDS_IN_CHILD", 0.5)
-    with pytest.raises(ManipError, match=r"x\.xml took more than 0\.5 s"):
+    with pytest.raises(ManipError, match=r"in 4 GB of memory and 0\.5 s: out of time"):
         checks.in_child("x.xml", time.sleep, 30)
 
 

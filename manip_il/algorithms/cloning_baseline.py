@@ -53,7 +53,7 @@ def _demonstrate(
     while True:
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, config.seed)
         found = list(collect_successes(engine, job, seeds, count, journals, progress.episode))
-        frames = sum(header.frames for header, _ in found if header.success)
+        frames = sum(len(episode) for _, episode in found if episode.success)
         if frames >= labels:
             break
         count = max(count + 1, math.ceil(count * labels / frames))

@@ -37,7 +37,7 @@ from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, dataset_sha256, merge_datasets
 from manip_il.data.dataset import Dataset, joined_columns
-from manip_il.data.journal import Header, list_episodes, read_header
+from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, LABEL_VALID, ROUND
 from manip_il.errors import NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
@@ -101,7 +101,7 @@ class ImitationRun(Run):
                 job = replace(self._job(0), cameras=None)
                 episodes = collect(self._engine, job, stream_seeds("held_out", count, self.config.seed), journals)
                 record(episodes, journals, root, job, Recording("local/held_out", provenance=provenance(job)))
-            self._held_out_steps = sum(read_header(path).frames for path in list_episodes(journals))
+            self._held_out_steps = sum(len(read_journal(path)[1]) for path in list_episodes(journals))
         return root
 
     def rollouts(self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0) -> Rollouts:
@@ -212,7 +212,7 @@ class ImitationRun(Run):
         had = sum(one.labels for one in self._made.values() if one.round < round_)
         return max(0, self.config.label_budget - had)
 
-    def _collect(self, job: RolloutJob, count: int, disturbed: int) -> Iterator[tuple[Header, Episode]]:
+    def _collect(self, job: RolloutJob, count: int, disturbed: int) -> Iterator[tuple[Journal, Episode]]:
         """A round's episodes, of which the first `disturbed` are."""
         seeds = stream_seeds(f"round/{job.round}", count, self.config.seed)
         journals, on_episode = self._folder(job.round) / JOURNALS, self._watch.on_episode
@@ -222,7 +222,7 @@ class ImitationRun(Run):
             collect(self._engine, job, seeds[disturbed:], journals, on_episode),
         )
 
-    def _record(self, job: RolloutJob, episodes: Iterator[tuple[Header, Episode]], recording: Recording) -> None:
+    def _record(self, job: RolloutJob, episodes: Iterator[tuple[Journal, Episode]], recording: Recording) -> None:
         """Run a round's episodes and write its dataset."""
         here = self._folder(job.round)
         for line in journal_of(here / JOURNALS, job).prepare():
@@ -235,13 +235,14 @@ class ImitationRun(Run):
     def _keep(self, round_: int, beta: float, queried_everywhere: bool) -> Rollouts:
         """Return what lies on disk of a round's rollouts."""
         here = self._folder(round_)
-        headers = [read_header(path) for path in list_episodes(here / JOURNALS)]
+        episodes = (read_journal(path)[1] for path in list_episodes(here / JOURNALS))
+        ends = [(len(episode), episode.success) for episode in episodes]
         dataset = here / DATASET if self._is_recorded(round_) else None
         labels = _count_labels(dataset) if dataset else 0
-        steps = sum(header.frames for header in headers)
+        steps = sum(length for length, _ in ends)
         queries = steps if queried_everywhere else labels
-        successes = sum(header.success for header in headers)
-        self._made[round_] = Rollouts(round_, dataset, beta, labels, queries, len(headers), successes, steps)
+        successes = sum(success for _, success in ends)
+        self._made[round_] = Rollouts(round_, dataset, beta, labels, queries, len(ends), successes, steps)
         return self._made[round_]
 
     def _given(self) -> Rollouts:

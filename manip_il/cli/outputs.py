@@ -159,7 +159,7 @@ def check_same_options(folder: Path, options: Any) -> None:
 
 
 def atomic_write(path: Path, content: str | bytes) -> None:
-    """Write a whole file or nothing, and its folder where that is missing. Raises `WriteError` as `write_file` does."""
+    """Write a whole file or nothing, and its folder where that is missing. Raises what `write_file` raises."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, content.encode() if isinstance(content, str) else content)
@@ -168,8 +168,8 @@ def atomic_write(path: Path, content: str | bytes) -> None:
 def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
     """Add one line of JSON and flush it. A torn last line, left by a kill, is removed first.
 
-    Raises `NotFiniteError` where the record holds NaN or infinity, which JSON has not, and `WriteError` where the disk
-    is full or read-only.
+    Raises `NotFiniteError` if the record holds NaN or infinity, which JSON has not, and `ManipError` if the disk is full
+    or read-only.
     """
     try:
         line = json.dumps(dict(record), allow_nan=False, default=_plain)

@@ -10,15 +10,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, override
+from typing import TYPE_CHECKING, Any, ClassVar, override
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.collect.rollout import Act, Turn
-from manip_il.mdp import Actor, Policy, ReadsInstructions
+from manip_il.mdp import Actor
 from manip_il.robots.action_space import ActionSpace
 from manip_il.seeding import rng_for
+
+if TYPE_CHECKING:
+    from manip_il.learn.policy import LearnedPolicy
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 
@@ -136,12 +139,11 @@ def expert_actions(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
     return [(turn.query().action, Actor.EXPERT) for turn in turns]
 
 
-def policy_actions(policy: Policy, turns: Sequence[Turn]) -> F64:
+def policy_actions(policy: LearnedPolicy, turns: Sequence[Turn]) -> F64:
     """Return a policy's action in every turn, (B, n); one with a memory begins anew where an episode does."""
     if started := [turn.seed for turn in turns if turn.step == 0]:
         policy.reset(started)
-        if isinstance(policy, ReadsInstructions):
-            policy.instruct({turn.seed: turn.observation.instruction for turn in turns if turn.step == 0})
+        policy.instruct({turn.seed: turn.observation.instruction for turn in turns if turn.step == 0})
     return policy.act(*observations(turns, policy.cameras), [turn.seed for turn in turns])
 
 

@@ -23,9 +23,9 @@ from manip_il.data.build import dataset_sha256, local_id, rewrite_columns
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.episodes import to_episode
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.info import DatasetInfo
+from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS
-from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
@@ -125,10 +125,10 @@ def relabel_dataset(source: Source, target: Target) -> int:
     return changed
 
 
-def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> DatasetInfo:
+def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> Info:
     """Write `source` anew with these cameras' pictures in place of its own; every other column stays as it is.
 
-    Raises `RenderError` if there is no OpenGL, and what reading and `new_dataset` raise.
+    Raises `RenderError` if there is no OpenGL, and what reading and `write_dataset` raise.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
     spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
@@ -141,7 +141,7 @@ def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> Dat
     return _write(target, spec, fingerprint, provenance, work, episodes)
 
 
-def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> DatasetInfo:
+def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> Info:
     """Write the dataset of other scenes of a dataset's states, each frame or branch an episode.
 
     The same seed gives the same scenes, and more frames begin with the same ones. Raises `NothingToLearnError` if no
@@ -166,22 +166,21 @@ def _write[T](
     provenance: Mapping[str, Any],
     work: Callable[[T], list[Episode]],
     pieces: Iterable[T],
-) -> DatasetInfo:
+) -> Info:
     """Write the episodes that workers make of each piece, in order."""
-    repo_id = local_id(target.root.name)
-    with (
-        new_dataset(target.root, spec, repo_id=repo_id, fingerprint=fingerprint, replace=target.replace) as writer,
-        closing(map_in_order(work, pieces, target.workers)) as made,
-    ):
+
+    def episodes() -> Iterator[Episode]:
         empty = True
-        for _, episodes in made:
-            for episode in episodes:
-                writer.add(episode)
-                empty = False
+        for _, found in made:
+            yield from found
+            empty = empty and not found
             target.on_piece()
         if empty:
             raise NothingToLearnError("no scene has a sound label of the expert: there is nothing to learn from")
-        return writer.finish(provenance)
+
+    about: dict[str, Any] = {"repo_id": local_id(target.root.name), "fingerprint": fingerprint}
+    with closing(map_in_order(work, pieces, target.workers)) as made:
+        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, **about)
 
 
 def label_episode(env: EnvConfig, episode: Episode) -> Columns:

@@ -13,8 +13,8 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording
-from manip_il.data.info import DatasetInfo
-from manip_il.data.journal import Header, Journal, list_seeds
+from manip_il.data.info import Info
+from manip_il.data.journal import Journal, list_seeds
 from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
@@ -33,7 +33,7 @@ def journal_of(journals: Path, job: RolloutJob) -> Journal:
 
 def collect(
     engine: Engine, job: RolloutJob, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
-) -> Iterator[tuple[Header, Episode]]:
+) -> Iterator[tuple[Journal, Episode]]:
     """Run the seeds that have no journal in `journals` yet; each finished episode becomes one file at once.
 
     Yields what `read_journal` gives of them in the order of the seeds, as soon as all before one are there. A journal
@@ -45,10 +45,10 @@ def collect(
     on_disk = set(list_seeds(journals))
     in_memory: dict[int, Episode] = {}
 
-    def ready() -> Iterator[tuple[Header, Episode]]:
+    def ready() -> Iterator[tuple[Journal, Episode]]:
         while waiting and waiting[0] in on_disk:
             episode = in_memory.pop(waiting[0], None)
-            entry = journal.read(waiting[0]) if episode is None else (journal.header(episode), episode)
+            entry = journal.read(waiting[0]) if episode is None else (journal, episode)
             if entry is None:
                 on_disk.remove(waiting[0])
                 return
@@ -77,7 +77,7 @@ def collect_successes(
     count: int,
     journals: Path,
     on_episode: OnEpisode | None = None,
-) -> Iterator[tuple[Header, Episode]]:
+) -> Iterator[tuple[Journal, Episode]]:
     """Run seeds in order until `count` episodes succeeded; yields all of them as `collect` does.
 
     Which episodes come out depends on the seeds alone. Raises `ManipError` where too few succeed.
@@ -88,29 +88,25 @@ def collect_successes(
         if tried + count - good > min(len(seeds), MAX_TRIES * count):
             raise ManipError(f"only {good} of {tried} demonstrations succeeded; {count} are needed")
         tried += len(more)
-        for header, episode in collect(engine, job, more, journals, on_episode):
-            good += header.success
-            yield header, episode
+        for journal, episode in collect(engine, job, more, journals, on_episode):
+            good += episode.success
+            yield journal, episode
 
 
 def record(
-    episodes: Iterable[tuple[Header, Episode]],
+    episodes: Iterable[tuple[Journal, Episode]],
     journals: Path,
     root: Path,
     job: RolloutJob,
     recording: Recording,
     replace: bool = False,
-) -> tuple[DatasetInfo, int]:
+) -> tuple[Info, int]:
     """Write the dataset as the episodes come; its counts, and how many failed episodes were left out.
 
     `build(journals, root)` gives the same bytes later. replace: as in `new_folder`.
     """
     recording.write(journals)
-    journal, selection = journal_of(journals, job), recording.selection()
-    with recording.open(root, journal.spec, journal.fingerprint, replace=replace) as writer:
-        for episode in selection.take(episodes):
-            writer.add(episode)
-        return writer.finish(recording.provenance | selection.provenance), selection.failed
+    return recording.make(episodes, root, replace=replace)
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:

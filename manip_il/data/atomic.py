@@ -7,7 +7,6 @@ import ctypes
 import errno
 import fcntl
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Generator
@@ -17,39 +16,18 @@ from manip_il import checks
 from manip_il.errors import FolderBusyError, FolderExistsError, ManipError
 
 PARTIAL = ".partial"  # suffix of what is not finished
-_ROOM = "free space there, or choose another disk"
-_REMEDIES = {  # errors that reading never gives
-    errno.ENOSPC: _ROOM,
-    errno.EDQUOT: _ROOM,
-    errno.EFBIG: _ROOM,
-    errno.EROFS: "choose a folder that may be written",
-}
-_IN_TEXT = re.compile(r"\(os error (\d+)\)|\[[Ee]rrno (\d+)\]")  # of Rust (safetensors), of Arrow and FFmpeg
-
-
-class WriteError(ManipError):
-    """A file or folder that cannot be written."""
-
-    def __init__(self, path: Path, number: int):
-        super().__init__(f"cannot write {path}: {os.strerror(number)}; {_REMEDIES[number]}")
+_REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # of a disk, which reading never gives
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Generator[None]:
-    """Raise `WriteError` for what the disk refuses inside (no space, read-only, a quota).
-
-    It names the file that the refusal names, else `path`.
-    """
+    """Raise `ManipError` that names the file, else `path`, if the disk has no space or is read-only."""
     try:
         yield
-    except ManipError:
-        raise
-    except Exception as error:  # libraries raise errors of their own types
-        number = _disk_errno(error)
-        if number is None:
+    except OSError as error:  # those of Arrow and FFmpeg are, too
+        if error.errno not in _REFUSALS:
             raise
-        named = getattr(error, "filename", None)
-        raise WriteError(Path(os.fsdecode(named)) if isinstance(named, str | bytes) else path, number) from error
+        raise ManipError(f"cannot write {error.filename or path}: {os.strerror(error.errno)}") from error
 
 
 @contextlib.contextmanager
@@ -58,7 +36,7 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
 
     An exception removes the sibling; what a killed writer left of one is removed by the next writer.
     Raises `FolderExistsError` if `root` holds something, before and after; with `replace` that stays until the
-    new folder is whole, and is removed then. Raises `WriteError` if the disk is full or read-only.
+    new folder is whole, and is removed then. Raises `ManipError` if the disk is full or read-only.
     """
     root = root.absolute()
     if not (replace and root.is_dir()):
@@ -75,7 +53,8 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
             yield partial
             _libc("syncfs", lock)  # in one call, however many files it has
         if replace and root.exists():
-            _exchange(partial, root)
+            here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: there is no moment without `root`
+            _libc("renameat2", here, os.fsencode(partial), here, os.fsencode(root), exchange)
             shutil.rmtree(partial, ignore_errors=True)
         else:
             _refuse_full(root)
@@ -144,9 +123,10 @@ def try_lock(handle: int) -> bool:
 def write_file(path: Path, data: bytes) -> None:
     """Write `data` to `path` so that `path` holds all of it or what it held before.
 
-    Raises `WriteError` where the disk is full or read-only.
+    Its folder is made. Raises `ManipError` if the disk is full or read-only.
     """
     with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.parent)
         partial = Path(name)
         try:
@@ -169,12 +149,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _exchange(left: Path, right: Path) -> None:
-    """Swap two names in one step (Linux's renameat2), so that there is no moment without `right`."""
-    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-    _libc("renameat2", here, os.fsencode(left), here, os.fsencode(right), exchange)
 
 
 def _libc(name: str, *arguments: int | bytes) -> None:
@@ -202,13 +176,3 @@ def umask() -> int:
     mask = os.umask(0o077)  # there is no way to only read it
     os.umask(mask)
     return mask
-
-
-def _disk_errno(error: BaseException) -> int | None:
-    """The errno of a disk's refusal that an error reports; None for any other error."""
-    if isinstance(error, OSError):
-        number = error.errno
-    else:
-        found = _IN_TEXT.search(str(error))
-        number = int(found[1] or found[2]) if found else None
-    return number if number in _REMEDIES else None

@@ -9,32 +9,34 @@ import json
 import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import write_file
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
-from manip_il.data.episodes import Selection
+from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.info import DatasetInfo
-from manip_il.data.journal import Header, list_episodes, read_journal
-from manip_il.data.lerobot_write import Columns, EpisodeWriter, new_dataset
-from manip_il.data.schema import RobotTaskSpec, check_same_spec
+from manip_il.data.info import Info, reading
+from manip_il.data.journal import Journal, list_episodes, read_journal
+from manip_il.data.lerobot_write import Columns, Films, write_dataset
+from manip_il.data.schema import LABEL_VALID, check_same_spec
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError
 from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
+Rollouts = Iterable[tuple[Journal, Episode]]
 
 
 @dataclass(frozen=True)
 class Recording:
-    """The dataset that a folder of journals becomes: its `recording.json`.
+    """The dataset that rollouts become: `recording.json` in the folder of their journals.
 
     A rollout becomes as many episodes as it has parts (see `parts`). only_successes: failed ones are left out.
     only_labelled: those without a valid label are. episodes: at most so many, the first in seed order; None: all.
@@ -52,32 +54,84 @@ class Recording:
     labels: int | None = None
     stills: bool = False
 
-    def selection(self) -> Selection:
-        """Return its rules, with nothing taken yet."""
-        return Selection(self.only_successes, self.only_labelled, self.episodes, self.labels)
-
-    def open(
-        self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
-    ) -> AbstractContextManager[EpisodeWriter]:
-        """Return the dataset's writer; raises what `new_dataset` raises."""
-        video, spec = VideoConfig.from_json(self.video), dataclasses.replace(spec, video=not self.stills)
-        return new_dataset(root, spec, repo_id=self.repo_id, fingerprint=fingerprint, video=video, replace=replace)
-
     def write(self, journals: Path) -> None:
         """Write `recording.json` beside the journals."""
-        journals.mkdir(parents=True, exist_ok=True)
         write_file(journals / RECORDING, (json.dumps(asdict(self), indent=1) + "\n").encode())
 
     @classmethod
     def read(cls, journals: Path) -> Recording:
-        """Return the folder's recording; where it has none, one that takes every episode."""
+        """Return the folder's recording; if it has none, one that takes every episode."""
         path = journals / RECORDING
         if not path.is_file():
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
-        data = checks.read_json(path, "what a recording's journals become")
-        known = {one.name: data[one.name] for one in fields(cls) if one.name in data}
-        checks.repo_id(f"{path}: repo_id", known.get("repo_id"))
-        return cls(**known)
+        with reading(path):
+            data = checks.read_json(path, "what a recording's journals become")
+            checks.repo_id("repo_id", data.get("repo_id"))
+            return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
+
+    def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
+        """Write the dataset of rollouts in seed order; its counts, and how many failed episodes were left out.
+
+        Every rollout is taken, also once the dataset is full. The first one's environment is the dataset's; another
+        fingerprint is logged as a warning. Which episodes come in depends on the rollouts alone, so that recording as
+        they come and building later give the same bytes. Raises what `write_dataset` raises, `MismatchError` for a
+        rollout of another robot, task or cameras, `NothingToLearnError` if there is no episode.
+        """
+        rollouts = iter(rollouts)
+        if (first := next(rollouts, None)) is None:
+            raise NothingToLearnError("no episode was recorded")
+        about, seeds, failed, found = first[0], list[int](), 0, 0
+        provenance = dict(self.provenance)
+
+        def selected() -> Iterator[Episode]:
+            nonlocal failed, found
+            labels = 0
+            for journal, rollout in itertools.chain([first], rollouts):
+                _check_source(journal, rollout.seed, about)
+                if self._is_full(found, labels):
+                    continue
+                seeds.append(rollout.seed)
+                for part in parts(rollout):
+                    if self._is_full(found, labels):
+                        break
+                    if self.only_successes and not part.success:
+                        failed += 1
+                        continue
+                    if self.labels is not None:
+                        part = _first_labels(part, self.labels - labels)
+                    own = int(part.columns[LABEL_VALID].sum()) if LABEL_VALID in part.columns else 0
+                    if own or not self.only_labelled:
+                        yield part
+                        found, labels = found + 1, labels + own
+            if not found:
+                raise NothingToLearnError(
+                    "no episode has labels to learn from: the expert was never queried, or gave no valid label"
+                )
+            provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
+
+        spec, video = dataclasses.replace(about.spec, video=not self.stills), VideoConfig(**self.video)
+        options: dict[str, Any] = {"repo_id": self.repo_id, "fingerprint": about.fingerprint, "video": video}
+        return write_dataset(selected(), root, spec, provenance, replace=replace, **options), failed
+
+    def _is_full(self, episodes: int, labels: int) -> bool:
+        """Whether every asked episode or label is in."""
+        asked = (self.episodes, episodes), (self.labels, labels)
+        return any(most is not None and found >= most for most, found in asked)
+
+
+def _check_source(journal: Journal, seed: int, first: Journal) -> None:
+    name = f"the journal of seed {seed}"
+    if journal.spec != first.spec:
+        raise MismatchError("robot, task or cameras", name, journal.spec, "the first", first.spec)
+    for line in compare_fingerprints(name, journal.fingerprint, "the first", first.fingerprint):
+        _LOG.warning("%s", line)
+
+
+def _first_labels(episode: Episode, most: int) -> Episode:
+    """Return the episode with `label_valid` 0 behind its first `most` sound labels."""
+    valid = episode.columns[LABEL_VALID].astype(np.int64)
+    kept = valid * (np.cumsum(valid).reshape(valid.shape) <= most)
+    return dataclasses.replace(episode, columns=episode.columns | {LABEL_VALID: kept})
 
 
 def local_id(folder: str) -> str:
@@ -90,7 +144,7 @@ def local_id(folder: str) -> str:
 class BuildResult:
     """A built dataset. failed: episodes left out as they failed. damaged: what is wrong with each unreadable file."""
 
-    info: DatasetInfo
+    info: Info
     failed: int
     damaged: tuple[str, ...]
 
@@ -98,36 +152,25 @@ class BuildResult:
 def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> BuildResult:
     """Build the LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
 
-    Files that cannot be read are left out and named in the result. Raises `ManipError` where no episode is left,
-    `FolderExistsError` where `root` holds something, unless `replace` is to swap it for the new one at the end.
+    Files that cannot be read are left out and named in the result. Raises `ManipError` if no episode is left,
+    `FolderExistsError` if `root` holds something, unless `replace` is to swap it for the new one at the end.
     """
-    recording = Recording.read(journals)
+    recording, damaged = Recording.read(journals), list[str]()
     if repo_id is not None:
         recording = dataclasses.replace(recording, repo_id=repo_id)
-    selection = recording.selection()
-    damaged: list[str] = []
-    readable = _read_until_full(journals, selection, damaged)
-    first = next(readable, None)
-    if first is None:
+
+    def readable() -> Iterator[tuple[Journal, Episode]]:
+        for path in list_episodes(journals):
+            try:
+                yield read_journal(path)
+            except ManipError as error:
+                damaged.append(str(error))
+
+    rollouts = readable()
+    if (first := next(rollouts, None)) is None:
         raise ManipError(f"{journals} holds no readable episode{f': {damaged[0]}' if damaged else ''}")
-    header = first[0]
-    with recording.open(root, header.spec, header.fingerprint, replace=replace) as writer:
-        for episode in selection.take(itertools.chain([first], readable)):
-            writer.add(episode)
-        info = writer.finish(recording.provenance | selection.provenance)
-    return BuildResult(info, selection.failed, tuple(damaged))
-
-
-def _read_until_full(journals: Path, selection: Selection, damaged: list[str]) -> Iterator[tuple[Header, Episode]]:
-    for path in list_episodes(journals):
-        try:
-            entry = read_journal(path)
-        except ManipError as error:
-            damaged.append(str(error))
-            continue
-        yield entry
-        if selection.is_full:
-            return
+    info, failed = recording.make(itertools.chain([first], rollouts), root, replace=replace)
+    return BuildResult(info, failed, tuple(damaged))
 
 
 def merge_datasets(
@@ -137,7 +180,7 @@ def merge_datasets(
     repo_id: str,
     fingerprint: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
-) -> DatasetInfo:
+) -> Info:
     """Merge the episodes of several datasets, in order, into one: equal to `write_dataset` of them.
 
     The fingerprint is the first one's unless given; if theirs differ, a warning is logged. The provenance names the
@@ -149,35 +192,44 @@ def merge_datasets(
     opened = [Dataset.open(source) for source in roots]
     specs, first = [one.spec for one in opened], opened[0].fingerprint
     for one in opened:
-        _check_mergeable(str(roots[0]), specs[0], str(one.root), one.spec)
+        check_same_spec(str(roots[0]), specs[0], str(one.root), one.spec)
+        for what in ("sim_state_size", "task"):
+            left, right = getattr(specs[0], what), getattr(one.spec, what)
+            if left != right and UNKNOWN_TASK not in (left, right):
+                raise MismatchError(what, str(roots[0]), left, str(one.root), right)
         for warning in compare_fingerprints(str(roots[0]), first, str(one.root), one.fingerprint):
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
     spec = next((spec for spec in specs if spec.task != UNKNOWN_TASK), specs[0])
-    films = bool(spec.cameras and spec.video)
-    with new_dataset(root, spec, repo_id=repo_id, fingerprint=first if fingerprint is None else fingerprint) as writer:
-        for one in opened:
-            for number, episode in enumerate(one.read_episodes(pictures=not films)):
-                writer.add(episode, (one, number) if films else None)
-        return writer.finish({**(provenance or {}), "merged": sources})
+    about: dict[str, Any] = {"repo_id": repo_id, "fingerprint": first if fingerprint is None else fingerprint}
+    episodes = itertools.chain.from_iterable(map(_with_films, opened))
+    return write_dataset(episodes, root, spec, {**(provenance or {}), "merged": sources}, **about)
 
 
 def rewrite_columns(
     dataset: Dataset, target: Path, columns: Iterable[Columns], provenance: Mapping[str, Any], **options: Any
-) -> DatasetInfo:
+) -> Info:
     """Write a dataset to `target` with these columns in place of its own; films are copied.
 
-    columns: of every episode in stored order, name -> (T,) or (T, d). options: those of `new_dataset`. Raises what
-    `new_dataset` and `EpisodeWriter` raise, `ManipError` for columns of other lengths than the episodes.
+    columns: of every episode in stored order, name -> (T,) or (T, d). options: those of `write_dataset`. Raises what
+    it raises, `ManipError` for columns of other lengths than the episodes.
     """
-    spec = dataset.spec
-    episodes = dataset.read_episodes(pictures=not spec.video)
-    with new_dataset(target, spec, **options) as writer:
-        for number, (episode, fresh) in enumerate(zip(episodes, columns, strict=True)):
+
+    def changed() -> Iterator[Episode | tuple[Episode, Films]]:
+        for item, fresh in zip(_with_films(dataset), columns, strict=True):
+            episode, films = (item, None) if isinstance(item, Episode) else item
             own = episode.columns | {key: values.reshape(len(values), -1) for key, values in fresh.items()}
-            changed = dataclasses.replace(episode, columns=own)
-            writer.add(changed, (dataset, number) if spec.video and spec.cameras else None)
-        return writer.finish(provenance)
+            anew = dataclasses.replace(episode, columns=own)
+            yield (anew, films) if films else anew
+
+    return write_dataset(changed(), target, dataset.spec, provenance, **options)
+
+
+def _with_films(dataset: Dataset) -> Iterator[Episode | tuple[Episode, Films]]:
+    """Yield the episodes of a dataset; pictures in films are not decoded, and come as these."""
+    films = bool(dataset.spec.cameras and dataset.spec.video)
+    for number, episode in enumerate(dataset.read_episodes(pictures=not films)):
+        yield (episode, (dataset, number)) if films else episode
 
 
 def dataset_sha256(root: Path) -> str:
@@ -187,12 +239,3 @@ def dataset_sha256(root: Path) -> str:
         with open(checks.open_regular(path), "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
-
-
-def _check_mergeable(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:
-    """Compare what must be the same for a policy, and what a dataset has only one of."""
-    check_same_spec(left_name, left, right_name, right)
-    for what in ("sim_state_size", "task"):
-        left_value, right_value = getattr(left, what), getattr(right, what)
-        if left_value != right_value and UNKNOWN_TASK not in (left_value, right_value):
-            raise MismatchError(what, left_name, left_value, right_name, right_value)

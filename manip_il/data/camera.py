@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -17,11 +18,10 @@ import pyarrow.parquet as pq
 from av.container import InputContainer
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.data.episode_table import EpisodeTable
-from manip_il.data.info import Info
+from manip_il.data.info import PICTURES, Info, reading
 from manip_il.data.parquet_files import read_file
-from manip_il.data.pictures import UNREADABLE, Pictures, decode_cell, open_video, read_frames, unreadable
+from manip_il.data.pictures import Pictures, decode_picture, open_video, read_frames
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
 I64 = NDArray[np.int64]
@@ -29,7 +29,6 @@ I64 = NDArray[np.int64]
 _PIECE_BYTES = 32 * 1024 * 1024  # of pictures that a thread decodes at once
 _PIECE = 32  # frames that are, however large: decoding starts at the last key frame before them
 _OPEN_FILMS, _OPEN_TABLES = 32, 4  # files that one process holds open
-_SEE_CHECK = "run `manip-il data check` to see what is wrong"
 
 
 @dataclass(frozen=True)
@@ -61,42 +60,21 @@ class Camera:
     def of(cls, root: Path, info: Info, episodes: EpisodeTable, data_files: Sequence[Path], key: str) -> Camera:
         """Find a camera's pictures without decoding any.
 
-        Raises `UnknownName` for a column that is no camera, `ManipError` for a dataset without frames or whose files do
-        not hold each frame once, and for depth maps.
+        Raises `UnknownName` for a column that is no camera, `ManipError` for depth maps, and for a dataset whose files
+        do not hold each frame once.
         """
-        cameras = {feature.key: feature for feature in info.of_dtype("video", "image")}
+        cameras = {feature.key: feature for feature in info.of_dtype(*PICTURES)}
         if key not in cameras:
             raise UnknownName(f"camera in {root}", key, cameras)
         feature = cameras[key]
         if not feature.is_rgb:
-            raise ManipError(f"{key} of {root} holds depth or has {feature.channels} channels; expected RGB pictures")
-        if not info.frames:
-            raise ManipError(f"{root} has no frames")
+            raise ManipError(f"{key} of {root}, of shape {feature.shape}, holds no RGB pictures")
         films = feature.dtype == "video"
         parts = _film_parts(episodes, info, key) if films else _table_parts(root, data_files)
         ends = [part.row + part.count for part in parts]
         if [0, *ends[:-1]] != [part.row for part in parts] or ends[-1:] != [info.frames]:
-            raise ManipError(f"{root}: its files do not hold each of {info.frames} frames once; {_SEE_CHECK}")
+            raise ManipError(f"{root}: its files of {key} do not hold each of {info.frames} frames once")
         return cls(root, key, info.fps, info.frames, feature.picture_size, films, tuple(parts))
-
-    @property
-    def shape(self) -> tuple[int, int, int, int]:
-        """Shape of all its pictures, channels before pixels: (N, 3, height, width)."""
-        return (self.frames, 3, *self.size)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of all its pictures as uint8 [bytes]."""
-        return self.frames * 3 * self.size[0] * self.size[1]
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return self.frames
-
-    def __getitem__(self, rows: I64) -> NDArray[np.uint8]:
-        """Return the pictures of these rows (...), in any order, channels before pixels: (..., 3, height, width)."""
-        read = np.ascontiguousarray(self.rows(rows.reshape(-1)).transpose(0, 3, 1, 2))
-        return read.reshape(*rows.shape, *read.shape[1:])
 
     def rows(self, rows: I64) -> Pictures:
         """Return the pictures of these rows (B,), decoded, (B, height, width, 3).
@@ -116,48 +94,44 @@ class Camera:
         They are in a nameless file of the temporary folder, mapped into memory, and go with the array. on_frames: is
         called with the number of frames decoded since the last call. Raises `ManipError` if there is no room.
         """
+        shape = self.frames, 3, *self.size
         with tempfile.TemporaryFile() as file:
+            size, folder = math.prod(shape), tempfile.gettempdir()
             try:
-                os.posix_fallocate(file.fileno(), 0, self.nbytes)  # else a full disk ends the process
+                os.posix_fallocate(file.fileno(), 0, size)  # else a full disk ends the process
             except OSError as error:
-                raise ManipError(
-                    f"cannot keep {self.nbytes / 1e9:.1f} GB of decoded pictures in {tempfile.gettempdir()}: "
-                    f"{error.strerror}; make room, or set TMPDIR to another disk"
-                ) from error
-            decoded = np.memmap(file, np.uint8, "r+", shape=self.shape)
+                what = f"cannot keep {size / 1e9:.1f} GB of decoded pictures in {folder}: {error.strerror}"
+                raise ManipError(f"{what}; make room, or set TMPDIR to another disk") from error
+            decoded = np.memmap(file, np.uint8, "r+", shape=shape)
 
         def fill(rows: I64) -> int:
-            decoded[rows[0] : rows[-1] + 1] = self[rows]
+            decoded[rows[0] : rows[-1] + 1] = self.rows(rows).transpose(0, 3, 1, 2)
             return len(rows)
 
+        # consecutive rows of one part each
+        step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
+        pieces = (
+            np.arange(start, min(start + step, part.row + part.count))
+            for part in self.parts
+            for start in range(part.row, part.row + part.count, step)
+        )
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
-            for count in threads.map(fill, self._pieces()):
+            for count in threads.map(fill, pieces):
                 if on_frames is not None:
                     on_frames(count)
         return decoded
 
-    def _pieces(self) -> Iterator[I64]:
-        """Consecutive rows of one part each."""
-        step = max(_PIECE, _PIECE_BYTES * self.frames // self.nbytes)
-        for part in self.parts:
-            for start in range(part.row, part.row + part.count, step):
-                yield np.arange(start, min(start + step, part.row + part.count))
-
     def _read(self, part: Part, rows: I64) -> Pictures:
         """Consecutive rows of one part."""
         path, first = self.root / part.path, part.first + int(rows[0]) - part.row
-        changed = path.stat().st_mtime_ns if path.exists() else 0
-        if self.films:
-            pictures = read_frames(path, _film(path, changed, threading.get_ident()), first, len(rows), self.fps)
-        else:
-            try:
+        with reading(path):
+            changed = path.stat().st_mtime_ns
+            if self.films:
+                pictures = read_frames(_film(path, changed, threading.get_ident()), first, len(rows), self.fps)
+            else:
                 cells = _table(path, changed, self.key)[first : first + len(rows)]
-                pictures = np.stack([decode_cell(cell) for cell in cells.to_pylist()])
-            except ValueError as error:
-                place = f"frames {rows[0]} to {rows[-1]} of {path}"
-                raise ManipError(
-                    f"cannot read the pictures {self.key} in {place}: {checks.one_line(error)}; {_SEE_CHECK}"
-                ) from error
+                # where a cell has no bytes, its `path` is not followed
+                pictures = np.stack([decode_picture((cell or {}).get("bytes")) for cell in cells.to_pylist()])
         if pictures.shape[1:] != (*self.size, 3):
             what, found = f"shape of {self.key}", pictures.shape[1:]
             raise MismatchError(what, f"frame {rows[0]}", found, f"info.json of {self.root}", (*self.size, 3))
@@ -167,10 +141,7 @@ class Camera:
 @lru_cache(_OPEN_FILMS)
 def _film(path: Path, changed: int, thread: int) -> InputContainer:
     """Open a file, as it is since `changed`, for one thread: opening takes longer than decoding an episode."""
-    try:
-        return open_video(path)
-    except UNREADABLE as error:
-        raise unreadable(path, error) from error
+    return open_video(path)
 
 
 @lru_cache(_OPEN_TABLES)

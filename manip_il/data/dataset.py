@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -22,14 +21,13 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.camera import Camera
 from manip_il.data.episode_table import EpisodeTable, read_episode_table, read_picture_statistics
-from manip_il.data.info import NUMBERS, DatasetInfo, Feature, Info, read_info
-from manip_il.data.parquet_files import UNREADABLE, BadColumn, read_file, read_tasks, to_numpy
+from manip_il.data.info import NUMBERS, PICTURES, DatasetInfo, Feature, Info, read_info, reading
+from manip_il.data.parquet_files import read_file, read_tasks, to_numpy
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
-_SEE_CHECK = "run `manip-il data check` to see what is wrong"
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Dataset:
     @property
     def cameras(self) -> list[str]:
         """Names of the columns that are pictures, `observation.images.<camera>`."""
-        return [feature.key for feature in self.info.of_dtype("video", "image")]
+        return [feature.key for feature in self.info.of_dtype(*PICTURES)]
 
     @cached_property
     def own(self) -> Own | None:
@@ -83,14 +81,10 @@ class Dataset:
         path = self.root / layout.OURS
         if not path.exists():
             return None
-        ours = checks.read_json(path, "what this program says of its datasets")
-        if missing := {"spec", "fingerprint", "provenance"} - ours.keys():
-            raise ManipError(f"{path} lacks {', '.join(sorted(missing))}")
-        about = {key: checks.mapping(f"{path}: {key}", ours[key]) for key in ("spec", "fingerprint", "provenance")}
-        try:
-            return Own(s.RobotTaskSpec.from_json(about["spec"]), about["fingerprint"], about["provenance"])
-        except ManipError as error:
-            raise ManipError(f"{path}: {checks.one_line(error)}") from error
+        with reading(path):
+            ours = checks.read_json(path, "what this program says of its datasets")
+            spec = s.RobotTaskSpec.from_json(ours["spec"])
+            return Own(spec, dict(ours["fingerprint"]), dict(ours["provenance"]))
 
     @property
     def fingerprint(self) -> Mapping[str, Any]:
@@ -117,15 +111,22 @@ class Dataset:
         if s.ACTION not in features:
             raise ManipError(f"{self.root} has no column {s.ACTION}: there is nothing to learn from it")
         around = features.get(s.ENVIRONMENT_STATE)
+        cameras = [features[key] for key in self.cameras if key.startswith(s.IMAGES) and features[key].is_rgb]
+        sizes = {one.picture_size for one in cameras}
+        if len(sizes) > 1:  # a spec has one for all
+            cameras = []
+        robot: dict[str, Any] = {**s.robot_of(self.info.robot or UNKNOWN_ROBOT)}
         return s.RobotTaskSpec(
-            **s.robot_of(self.info.robot or UNKNOWN_ROBOT),
+            **robot,
             task=UNKNOWN_TASK,
             fps=round(self.fps),
             joint_names=features[s.ACTION].labels,
             environment_state_names=around.labels if around else (),
             sim_state_size=features[s.SIM_STATE].size if s.SIM_STATE in features else 0,
             instruction=self.instruction,
-            **self._picture_spec(),
+            cameras=tuple(one.key.removeprefix(s.IMAGES) for one in cameras),
+            image_size=sizes.pop() if cameras else (0, 0),
+            video=not any(one.dtype == "image" for one in cameras),
         )
 
     @cached_property
@@ -140,7 +141,7 @@ class Dataset:
 
     @cached_property
     def episodes(self) -> EpisodeTable:
-        """The rows of `meta/episodes`."""
+        """One entry an episode: where its frames are, what it is about, what it drew."""
         return read_episode_table(self.root, self.info)
 
     @cached_property
@@ -156,24 +157,37 @@ class Dataset:
         paths = sorted(self.root.glob(layout.DATA_FILES))
         if not paths:
             raise ManipError(f"{self.root} has no data: no file matches {layout.DATA_FILES}")
-        self._check_rows(paths)
+        rows = 0
+        for path in paths:
+            with reading(path):
+                rows += pq.read_metadata(path).num_rows
+        if rows != len(self):
+            raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
         return paths
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; read-only views of Arrow's memory.
+        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; of one file they are read-only.
 
         names: all numbers by default. Raises `UnknownName` for a column that is not there.
         """
-        wanted = self._known(names)
-        table = pa.concat_tables(read_file(path, wanted) for path in self.data_files)
-        return {name: self._numpy(table, name) for name in wanted}
+        if names is None:
+            names = [feature.key for feature in self.info.of_dtype(*NUMBERS)]
+        pieces = list(self.pieces(names))
+        if len(pieces) == 1:
+            return pieces[0]
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     def pieces(self, names: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the columns, (T,) or (T, d), of one data file after the other. Raises what `columns` raises."""
-        wanted = self._known(names)
+        known = [key for key, feature in self.features.items() if feature.dtype not in PICTURES]
+        for name in names:
+            if name not in known:
+                raise UnknownName(f"column in {self.root}", name, known)
         for path in self.data_files:
-            table = read_file(path, wanted)
-            yield {name: self._numpy(table, name) for name in wanted}
+            with reading(path):
+                table = read_file(path, names)
+                piece = {name: to_numpy(table.column(name), self.features[name]) for name in names}
+            yield piece
 
     def camera(self, key: str) -> Camera:
         """Return a camera's pictures, none of them decoded. Raises what `Camera.of` raises."""
@@ -211,7 +225,7 @@ class Dataset:
         left_out = {} if pictures else self.spec.image_keys
         shapes = {key: one["shape"] for key, one in s.features(self.spec).items() if key not in left_out}
         stored = [key for key in shapes if key not in cameras]
-        row = 0
+        texts, drawn, row = self.tasks, self.episodes.drawn, 0
         for piece in self.pieces([*stored, layout.EPISODE_INDEX, layout.TASK_INDEX]):
             index, task = (piece[name].reshape(-1) for name in (layout.EPISODE_INDEX, layout.TASK_INDEX))
             starts = np.flatnonzero(np.diff(index, prepend=-1))
@@ -220,8 +234,11 @@ class Dataset:
                     key: camera.rows(np.arange(row + start, row + stop)) for key, camera in cameras.items()
                 }
                 own |= {key: piece[key][start:stop].reshape(-1, *shapes[key]) for key in stored}
-                text, drawn = self._text(int(task[start])), self.episodes.drawn.get(int(index[start]), {})
-                yield _episode({key: own[key] for key in shapes}, text, drawn)
+                if (text := texts.get(int(task[start]))) is None:
+                    raise ManipError(f"{self.root}: rows have the task {task[start]}, which {layout.TASKS} lacks")
+                columns, solved = {key: own[key] for key in shapes}, own[s.SUCCESS]
+                ends = bool(solved.any()), bool(solved[-1])
+                yield Episode(int(own[s.SEED].flat[0]), columns, *ends, text, drawn.get(int(index[start]), {}))
             row += len(index)
 
     @cached_property
@@ -245,49 +262,6 @@ class Dataset:
             success_at_end=at_end,
         )
 
-    def _known(self, names: Sequence[str] | None) -> list[str]:
-        known = [key for key, feature in self.features.items() if feature.dtype not in ("video", "image")]
-        if names is None:
-            return [key for key in known if self.features[key].dtype in NUMBERS]
-        for name in names:
-            if name not in known:
-                raise UnknownName(f"column in {self.root}", name, known)
-        return list(names)
-
-    def _numpy(self, table: pa.Table, name: str) -> NDArray[Any]:
-        feature = self.features[name]
-        try:
-            return to_numpy(table.column(name), feature.dtype, feature.shape)
-        except BadColumn as error:
-            raise ManipError(f"{self.root}: column {name!r} {error}") from error
-
-    def _check_rows(self, paths: Sequence[Path]) -> None:
-        """Raise `ManipError` unless the data files hold as many rows as `info.json` counts; no column is read."""
-        found = 0
-        for path in paths:
-            try:
-                found += pq.read_metadata(path).num_rows
-            except UNREADABLE as error:
-                raise ManipError(f"cannot read {path}: {checks.one_line(error)}; {_SEE_CHECK}") from error
-        if found != len(self):
-            raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {found}")
-
-    def _text(self, number: int) -> str:
-        if not isinstance(text := self.tasks.get(number), str):
-            raise ManipError(f"{self.root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
-        return text
-
-    def _picture_spec(self) -> dict[str, Any]:
-        """Cameras and their size for a spec, which has one for all: none if they differ."""
-        features = [
-            self.features[key] for key in self.cameras if key.startswith(s.IMAGES) and self.features[key].is_rgb
-        ]
-        sizes = {one.key.removeprefix(s.IMAGES): one.picture_size for one in features}
-        if len(set(sizes.values())) > 1:
-            return {}
-        video = not any(one.dtype == "image" for one in features)
-        return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0)), "video": video}
-
 
 def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
@@ -303,7 +277,7 @@ def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDA
         for piece in dataset.pieces(names):
             for name, values in piece.items():
                 if name not in joined:
-                    joined[name] = np.empty((total, *values.shape[1:]), _dtype(dataset.features[name], values))
+                    joined[name] = np.empty((total, *values.shape[1:]), values.dtype)
                 part = joined[name][row : row + len(values)]
                 part[:] = values.reshape(part.shape)
                 if before.get(name):
@@ -320,13 +294,3 @@ def refuse_irregular(root: Path) -> None:
             raise ManipError(
                 f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
             )
-
-
-def _dtype(feature: Feature, values: NDArray[Any]) -> np.dtype[Any]:
-    """The type of numbers that the dataset declares; its files may hold them narrower."""
-    return values.dtype if values.dtype.kind == "O" else np.dtype(feature.dtype)
-
-
-def _episode(columns: dict[str, NDArray[Any]], text: str, drawn: Mapping[str, Any]) -> Episode:
-    seed, solved = int(columns[s.SEED].flat[0]), columns[s.SUCCESS]
-    return Episode(seed, columns, bool(solved.any()), bool(solved[-1]), text, drawn)

@@ -18,7 +18,6 @@ from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[re
 from threadpoolctl import threadpool_info
 
 from manip_il.checks import shorten
-from manip_il.errors import ManipError
 
 _LONGEST = 80  # characters of a value in a warning
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
@@ -32,8 +31,7 @@ _MEANING = {
 def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> dict[str, str]:
     """Return versions of what computes, the processor, and SHA-256 of the compiled model and of the config.
 
-    Two equal fingerprints promise equal bytes. No package is imported for it: a missing one is `absent`. Raises
-    `ManipError` for a config that JSON cannot hold.
+    Two equal fingerprints promise equal bytes. No package is imported for it: a missing one is `absent`.
     """
     versions = {name: _version(name) for name in _PACKAGES}
     return {
@@ -76,12 +74,9 @@ def compare_fingerprints(
 def canonical_json(value: Any) -> str:
     """Return JSON with sorted keys and no spaces: equal configs give equal text, whatever their order.
 
-    Takes dataclasses, enums, paths and numpy numbers and arrays as well. Raises `ManipError` for anything else.
+    Takes dataclasses, enums, paths and numpy numbers and arrays as well. Raises `TypeError` for anything else.
     """
-    try:
-        return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=_plain)
-    except (TypeError, ValueError) as error:
-        raise ManipError(f"config cannot be written as JSON: {error}") from error
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=_plain)
 
 
 def _plain(value: Any) -> Any:

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from manip_il.data import schema as s
-from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 F64 = NDArray[np.float64]
@@ -62,14 +61,9 @@ class Channel:
     messages: Iterator[bytes]
 
 
-def log_time(frame: int, fps: int) -> int:
-    """Return the time of a frame since its episode's start [ns]."""
-    return frame * NANOSECONDS // fps
-
-
 def frame_times(episode: Episode, spec: s.RobotTaskSpec) -> list[int]:
     """Return every frame's log time [ns]."""
-    return [log_time(frame, spec.fps) for frame in range(len(episode))]
+    return [frame * NANOSECONDS // spec.fps for frame in range(len(episode))]
 
 
 def joint_states(topic: str, names: Sequence[str], values: NDArray[Any], times: Times) -> Channel:
@@ -130,27 +124,20 @@ def texts(topic: str, name: str, lines: Iterable[str], times: Times) -> Channel:
 
 
 def episode_channels(episode: Episode, spec: s.RobotTaskSpec) -> Iterator[Channel]:
-    """Yield every channel that the columns of an episode can fill.
-
-    Raises `ManipError` for pictures that are not uint8 (T, height, width, 3).
-    """
-    times = frame_times(episode, spec)
+    """Yield every channel that the columns of an episode, which fit the spec, can fill."""
+    times, columns = frame_times(episode, spec), episode.columns
     for topic, key in _JOINT_TOPICS.items():
-        if (values := _matrix(episode, key, len(spec.joint_names))) is not None:
-            yield joint_states(topic, spec.joint_names, values, times)
-    if (values := _matrix(episode, s.ENVIRONMENT_STATE, len(spec.environment_state_names))) is not None:
-        states = dict(zip(spec.environment_state_names, values.T.astype(np.float64), strict=True))
-        if poses := _poses(states):
+        if key in columns:
+            yield joint_states(topic, spec.joint_names, columns[key], times)
+    if s.ENVIRONMENT_STATE in columns:
+        values = columns[s.ENVIRONMENT_STATE].T.astype(np.float64)
+        if poses := _poses(dict(zip(spec.environment_state_names, values, strict=True))):
             yield frame_transforms("/tf", poses, times)
-    if numbers := {key: episode.columns[key] for key in _SCALARS if _is_scalar(episode, key)}:
-        columns = [(one.astype(np.int64) if one.dtype.kind == "b" else one).reshape(-1) for one in numbers.values()]
-        yield scalars("/scalars", list(numbers), zip(*(one.tolist() for one in columns), strict=True))
-    for key, pictures in episode.columns.items():
+    if numbers := {key: columns[key].reshape(-1) for key in _SCALARS if key in columns}:
+        lists = [(one.astype(np.int64) if one.dtype.kind == "b" else one).tolist() for one in numbers.values()]
+        yield scalars("/scalars", list(numbers), zip(*lists, strict=True))
+    for key, pictures in columns.items():
         if key.startswith(s.IMAGES):
-            if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[3] != 3:
-                found = f"column {key!r} is {pictures.dtype} of shape {pictures.shape}"
-                expected = "expected pictures: uint8 of shape (T, height, width, 3)"
-                raise ManipError(f"episode with seed {episode.seed}, {found}; {expected}")
             camera = key.removeprefix(s.IMAGES)
             yield images(IMAGE_TOPICS + camera, camera, pictures, times)
 
@@ -243,15 +230,3 @@ def _rotations(frame: str, states: dict[str, F64]) -> F64:
 
 def _stack(states: dict[str, F64], frame: str, names: str | list[str]) -> F64:
     return np.stack([states[f"{frame}.{name}"] for name in names], axis=1)
-
-
-def _matrix(episode: Episode, key: str, width: int) -> NDArray[Any] | None:
-    values = episode.columns.get(key)
-    if values is None or values.shape != (len(episode), width) or values.dtype.kind != "f":
-        return None
-    return values
-
-
-def _is_scalar(episode: Episode, key: str) -> bool:
-    values = episode.columns.get(key)
-    return values is not None and values.size == len(episode) and values.dtype.kind in "biuf"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -21,6 +23,7 @@ INDEX_FEATURES = (layout.TIMESTAMP, layout.FRAME_INDEX, layout.EPISODE_INDEX, la
 
 # LeRobot's placeholders alone (`str.format` would also read attributes), and no way out of the dataset
 _TEMPLATE = re.compile(r"(?!/)(?!.*\.\.)(?:[^{}]|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
+_MOST = 2**53  # frames
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class Feature:
     def is_rgb(self) -> bool:
         """Whether it is a camera whose pictures are red, green and blue, and no depth."""
         depth = self.details.get("is_depth_map") or self.details.get("video.is_depth_map")
-        return self.dtype in PICTURES and self.channels == 3 and not depth
+        return self.dtype in PICTURES and 3 * math.prod(self.picture_size) == self.size > 0 and not depth
 
     @property
     def picture_size(self) -> tuple[int, int]:
@@ -59,12 +62,6 @@ class Feature:
         if "height" in names and "width" in names and len(names) == len(self.shape):
             return self.shape[names.index("height")], self.shape[names.index("width")]
         return (self.shape[0], self.shape[1]) if len(self.shape) > 1 else (0, 0)
-
-    @property
-    def channels(self) -> int:
-        """Channels of a picture."""
-        height, width = self.picture_size
-        return self.size // (height * width) if height and width else 0
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,6 @@ class Info:
     frames: int
     tasks: int | None
     robot: str
-    data_path: str
     video_path: str
 
     def of_dtype(self, *dtypes: str) -> list[Feature]:
@@ -100,11 +96,23 @@ class DatasetInfo:
     success_at_end: int | None
 
 
+@contextmanager
+def reading(path: Path) -> Generator[None]:
+    """Raise `ManipError` that names a file, in one line, for whatever is raised while it is read."""
+    try:
+        yield
+    except Exception as error:  # what is in the file decides what a library raises
+        if isinstance(error, ManipError) and str(path) in str(error):
+            raise
+        reason = getattr(error, "strerror", None) or checks.one_line(error) or type(error).__name__
+        raise ManipError(f"cannot read {path}: {reason}; run `manip-il data check` to see what is wrong") from error
+
+
 def read_info(root: Path) -> Info:
     """Read `meta/info.json` of a dataset.
 
-    Raises `ManipError` for a folder that has none, for another version, and for a value of the wrong type or a path
-    that leads out of the dataset.
+    Raises `ManipError` for a folder that has none, for another version, and for a name or path that leads out of the
+    dataset.
     """
     path = root / layout.INFO
     if not path.exists():
@@ -114,34 +122,24 @@ def read_info(root: Path) -> Info:
     if version != layout.VERSION:
         older = "; LeRobot converts datasets of v2.1" if version == "v2.1" else ""
         raise ManipError(f"{path}: codebase_version is {checks.shorten(version)}; expected {layout.VERSION!r}{older}")
-    features = checks.mapping(f"{path}: features", raw.get("features"))
-    return Info(
-        fps=checks.number(f"{path}: fps", raw.get("fps"), 1, 1e6),
-        features={key: _feature(path, key, value) for key, value in features.items()},
-        episodes=_count(f"{path}: total_episodes", raw.get("total_episodes")),
-        frames=_count(f"{path}: total_frames", raw.get("total_frames")),
-        tasks=None if raw.get("total_tasks") is None else _count(f"{path}: total_tasks", raw["total_tasks"]),
-        robot=checks.text(f"{path}: robot_type", raw.get("robot_type") or "", checks.LONGEST_NAME),
-        data_path=_template(f"{path}: data_path", raw.get("data_path") or layout.DATA_PATH),
-        video_path=_template(f"{path}: video_path", raw.get("video_path") or layout.VIDEO_PATH),
-    )
+    with reading(path):
+        video_path = raw.get("video_path") or layout.VIDEO_PATH
+        if not _TEMPLATE.fullmatch(video_path):
+            raise ManipError(f"video_path is {video_path!r}; expected a path with {{chunk_index}} and {{file_index}}")
+        tasks = raw.get("total_tasks")
+        return Info(
+            fps=checks.number("fps", raw["fps"], 1, 1e6),
+            features={key: _feature(key, table) for key, table in raw["features"].items()},
+            episodes=checks.whole("total_episodes", raw["total_episodes"], 0, _MOST),
+            frames=checks.whole("total_frames", raw["total_frames"], 0, _MOST),
+            tasks=None if tasks is None else checks.whole("total_tasks", tasks, 0, _MOST),
+            robot=checks.text("robot_type", raw.get("robot_type") or "", checks.LONGEST_NAME),
+            video_path=video_path,
+        )
 
 
-def _feature(path: Path, key: str, value: Any) -> Feature:
-    checks.name(f"{path}: a feature", key)  # folders and files are named by it
-    table = checks.mapping(f"{path}: feature {key}", value)
-    dtype = checks.text(f"{path}: dtype of {key}", table.get("dtype"), checks.LONGEST_NAME)
-    what = f"{path}: a size in the shape of {key}"
-    shape = tuple(_count(what, size) for size in checks.array(f"{path}: shape of {key}", table.get("shape")))
+def _feature(key: str, table: dict[str, Any]) -> Feature:
+    checks.name("a feature", key)  # folders and files are named by it
     details = table.get("info") or table.get("video_info") or {}
-    return Feature(key, dtype, shape, table.get("names"), checks.mapping(f"{path}: info of {key}", details))
-
-
-def _count(what: str, value: Any) -> int:
-    return checks.whole(what, value, 0, 2**53)
-
-
-def _template(what: str, value: Any) -> str:
-    if not isinstance(value, str) or not _TEMPLATE.fullmatch(value):
-        raise ManipError(f"{what} is {checks.shorten(value)}; expected a path with {{chunk_index}} and {{file_index}}")
-    return value
+    shape = tuple(checks.whole("a size in a shape", size, 0, _MOST) for size in table["shape"])
+    return Feature(key, table["dtype"], shape, table.get("names"), dict(details))

@@ -45,22 +45,20 @@ class JoinedDatasets:
         self.camera_keys = [key for key, one in self.features.items() if one["dtype"] in PICTURES]
         self.total_frames = sum(map(len, self.datasets))
         self.stats = self._statistics()
-        texts = [_texts(dataset) for dataset in self.datasets]
-        self.tasks = list(dict.fromkeys(text for own in texts for text in own))
-        places = {text: place for place, text in enumerate(self.tasks)}
-        self._numbers = [np.array([places[text] for text in own], np.int64) for own in texts]
+        self.tasks = list(dict.fromkeys(text for one in self.datasets for text in one.tasks.values()))
 
     def joint_tasks(self, own: I64) -> I64:
         """Return the place in `tasks` of every frame's text, (N,), from the number that its dataset has for it, (N,).
 
         Raises `ManipError` for a number without a text.
         """
-        found: list[I64] = []
+        places, found = {text: place for place, text in enumerate(self.tasks)}, list[I64]()
         pieces = np.split(own, np.cumsum([*map(len, self.datasets)])[:-1])
-        for root, numbers, piece in zip(self.roots, self._numbers, pieces, strict=True):
-            if len(unknown := piece[(piece < 0) | (piece >= len(numbers))]):
-                raise ManipError(f"{root}: rows have the task {unknown[0]}, which {TASKS} does not hold")
-            found.append(numbers[piece])
+        for dataset, piece in zip(self.datasets, pieces, strict=True):
+            numbers, which = np.unique(piece, return_inverse=True)
+            if missing := set(numbers.tolist()) - dataset.tasks.keys():
+                raise ManipError(f"{dataset.root}: rows have the task {min(missing)}, which {TASKS} lacks")
+            found.append(np.array([places[dataset.tasks[one]] for one in numbers.tolist()], np.int64)[which])
         return np.concatenate(found)
 
     def _statistics(self) -> Statistics:
@@ -87,11 +85,3 @@ def _check_same_nature(left: Dataset, right: Dataset) -> None:
 def _shape(dataset: Dataset, key: str) -> tuple[int, ...]:
     """A column's shape; () if there is none."""
     return dataset.features[key].shape if key in dataset.features else ()
-
-
-def _texts(dataset: Dataset) -> list[str]:
-    texts = dataset.tasks
-    if sorted(texts) != list(range(len(texts))):
-        found = f"{dataset.root / TASKS}: task_index holds {sorted(texts)[:9]}"
-        raise ManipError(f"{found}; expected 0 to {len(texts) - 1}, each once")
-    return [texts[number] for number in range(len(texts))]

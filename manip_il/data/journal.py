@@ -10,10 +10,10 @@ import json
 import logging
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.records import Attachment, Chunk, DataEnd, Metadata
@@ -36,21 +36,6 @@ _NPY = ".npy"
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
 _FINAL = "final/"  # what journals of before had of the observation after the last frame
-_LARGEST = 4 * 1024**3  # [bytes]
-
-
-@dataclass(frozen=True)
-class Header:
-    """An episode without its columns: how it ended, what it drew, and the environment that it comes from."""
-
-    seed: int
-    success: bool
-    success_at_end: bool
-    frames: int
-    spec: RobotTaskSpec
-    fingerprint: dict[str, Any]
-    instruction: str = ""  # of the episode, where it is not that of the spec
-    drawn: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -61,48 +46,36 @@ class Journal:
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
 
-    def header(self, episode: Episode) -> Header:
-        """Return the header that an episode has here."""
-        ends = bool(episode.success), bool(episode.success_at_end)
-        about = self.spec, self.fingerprint, episode.instruction, episode.drawn
-        return Header(episode.seed, *ends, len(episode), *about)
-
     def encode(self, episode: Episode) -> bytes:
         """Return the content of an episode's journal; the same episode gives the same bytes.
 
-        Raises `ManipError` for a column that numpy can only pickle.
+        Raises `ValueError` for a column that numpy can only pickle.
         """
         stream = BytesIO()
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=_RECORD)
-        writer.add_metadata(_RECORD, {"format": _FORMAT} | _to_texts(self.header(episode)))
+        writer.add_metadata(_RECORD, _to_texts(self, episode))
         channels, times = foxglove.episode_channels(episode, self.spec), foxglove.frame_times(episode, self.spec)
         foxglove.add_channels(writer, list(channels), times)
         for key, column in episode.columns.items():
-            if key.startswith(IMAGES):
-                continue  # pictures travel as messages, without loss as well
-            writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
+            if not key.startswith(IMAGES):  # pictures travel as messages, without loss as well
+                numbers = BytesIO()
+                np.save(numbers, column, allow_pickle=False)
+                writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", numbers.getvalue())
         writer.finish()
         return stream.getvalue()
 
-    def store(self, seed: int, content: bytes) -> None:
-        """Write what `encode` gave to disk, in place of an earlier file of the seed.
-
-        Raises `ManipError` where the disk is full or may not be written.
-        """
+    def store(self, seed: int, content: bytes) -> Path:
+        """Write what `encode` gave to disk, in place of an earlier file of the seed; return its path."""
         path = episode_path(self.folder, seed)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_file(path, content)
-        except OSError as error:
-            raise ManipError(f"cannot write {path}: {error.strerror}") from error
+        write_file(path, content)
+        return path
 
     def write(self, episode: Episode) -> Path:
         """Encode and store one episode; return its path."""
-        self.store(episode.seed, self.encode(episode))
-        return episode_path(self.folder, episode.seed)
+        return self.store(episode.seed, self.encode(episode))
 
-    def read(self, seed: int) -> tuple[Header, Episode] | None:
+    def read(self, seed: int) -> tuple[Journal, Episode] | None:
         """Return what `read_journal` gives for a seed.
 
         None for a damaged file, which is renamed to `<name>.damaged` with a warning, so that its seed is free. Raises
@@ -126,16 +99,23 @@ class Journal:
         """
         for leftover in self.folder.glob(f".episode-*{PARTIAL}"):
             leftover.unlink(missing_ok=True)
-        header = next(filter(None, map(_header_or_none, list_episodes(self.folder))), None)
-        if header is None:
+        for path in list_episodes(self.folder):
+            try:
+                there, _ = read_journal(path)
+                break
+            except OlderSchemaError:
+                raise
+            except ManipError:  # set aside when its turn comes
+                continue
+        else:
             return []
         here = f"{self.spec.robot} {self.spec.task}"
-        check_same_spec(str(self.folder), header.spec, here, self.spec)
+        check_same_spec(str(self.folder), there.spec, here, self.spec)
         for what in ("task", "cameras", "image_size"):
-            left, right = getattr(header.spec, what), getattr(self.spec, what)
+            left, right = getattr(there.spec, what), getattr(self.spec, what)
             if left != right:
                 raise MismatchError(what, str(self.folder), left, here, right)
-        return compare_fingerprints(str(self.folder), header.fingerprint, "this machine", self.fingerprint)
+        return compare_fingerprints(str(self.folder), there.fingerprint, "this machine", self.fingerprint)
 
 
 def episode_path(folder: Path, seed: int) -> Path:
@@ -153,91 +133,64 @@ def list_episodes(folder: Path) -> list[Path]:
     return [episode_path(folder, seed) for seed in list_seeds(folder)]
 
 
-def read_journal(path: Path) -> tuple[Header, Episode]:
-    """Return the header and the episode as they were written, bit for bit.
+def read_journal(path: Path) -> tuple[Journal, Episode]:
+    """Return an episode as it was written, bit for bit, and the environment that it comes from.
 
-    Raises `ManipError` naming the file if it is cut short, changed, or none of ours.
+    Raises `ManipError` naming the file if it is cut short, changed, or none of ours, `OlderSchemaError` for another
+    version of ours.
     """
-    return _read_file(path)
-
-
-def read_header(path: Path) -> Header:
-    """Return the header of a whole journal. Raises what `read_journal` raises."""
-    return _read_file(path)[0]
-
-
-def _read_file(path: Path) -> tuple[Header, Episode]:
-    """What `read_journal` gives; every error names the file."""
     try:
-        return _read(checks.read_bytes(path, "an episode's journal", _LARGEST))
+        with path.open("rb") as stream:
+            return _read(path.parent, stream)
     except OlderSchemaError as error:
         error.args = (f"{path}: {error}",)
         raise
     except Exception as error:  # what has right checksums and is none of ours can make a parser raise anything
-        if str(path) in str(error):
-            raise
-        why = str(error) or type(error).__name__
+        why = checks.one_line(error) or type(error).__name__
         raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error
 
 
-def _read(content: bytes) -> tuple[Header, Episode]:
-    """Take a file apart whose checksum is right."""
-    header: Header | None = None
+def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
+    """Take a file apart, whose checksums are compared."""
+    texts: Mapping[str, str] = {}
     columns: dict[str, NDArray[Any]] = {}
     chunks: list[Chunk] = []
-    for record in StreamReader(BytesIO(content), emit_chunks=True, validate_crcs=True).records:
+    for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
         if isinstance(record, Metadata) and record.name == _RECORD:
-            header = _from_texts(record.metadata)
+            texts = record.metadata
         elif isinstance(record, Attachment) and not record.name.startswith(_FINAL):
             columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
         elif isinstance(record, Chunk):
             chunks.append(record)
         elif isinstance(record, DataEnd):  # the checksum that it holds was right
             break
-    if header is None:
-        raise ValueError(f"it has no record called {_RECORD}")
-    if header.spec.cameras:  # else nothing in the messages is needed
-        shape = (header.frames, *header.spec.image_size, 3)
-        pictures = foxglove.read_images(chunks, shape)
-        columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
-    ends = header.success, header.success_at_end
-    return header, Episode(header.seed, columns, *ends, instruction=header.instruction, drawn=header.drawn)
-
-
-def _header_or_none(path: Path) -> Header | None:
-    try:
-        return read_header(path)
-    except OlderSchemaError:
-        raise
-    except ManipError:
-        return None
-
-
-def _to_texts(header: Header) -> dict[str, str]:
-    """Return a header as JSON by name."""
-    values = {name: getattr(header, name) for name in ("seed", "success", "success_at_end", "frames")}
-    values |= {"spec": header.spec.to_json(), "fingerprint": header.fingerprint, "instruction": header.instruction}
-    values |= {"drawn": dict(header.drawn)} if header.drawn else {}
-    return {name: json.dumps(value) for name, value in values.items()}
-
-
-def _from_texts(texts: Mapping[str, str]) -> Header:
-    """Return the inverse of `_to_texts`; journals of older versions have neither instruction nor draws."""
     if (found := texts.get("format")) == "1":
         raise OlderSchemaError("1", schema.VERSION)
     if found != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
+    values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
+    spec, fingerprint, frames = (
+        RobotTaskSpec.from_json(values.pop("spec")),
+        values.pop("fingerprint"),
+        values.pop("frames"),
+    )
+    if spec.cameras:  # else nothing in the messages is needed
+        pictures = foxglove.read_images(chunks, (frames, *spec.image_size, 3))
+        columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
+    # journals of older versions have neither instruction nor draws
+    return Journal(folder, spec, fingerprint), Episode(columns=columns, **values)
+
+
+def _to_texts(journal: Journal, episode: Episode) -> dict[str, str]:
+    """Return all but the columns as JSON by name."""
     values: dict[str, Any] = {
-        name: checks.parse_json(f"its {name}", text) for name, text in texts.items() if name != "format"
+        "seed": episode.seed,
+        "success": bool(episode.success),
+        "success_at_end": bool(episode.success_at_end),
+        "frames": len(episode),
+        "spec": journal.spec.to_json(),
+        "fingerprint": journal.fingerprint,
+        "instruction": episode.instruction,
     }
-    values["spec"] = RobotTaskSpec.from_json(values["spec"])
-    return Header(**values)
-
-
-def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
-    stream = BytesIO()
-    try:
-        np.save(stream, column, allow_pickle=False)
-    except ValueError as error:
-        raise ManipError(f"episode with seed {seed}, column {key!r} of dtype {column.dtype}: {error}") from error
-    return stream.getvalue()
+    values |= {"drawn": dict(episode.drawn)} if episode.drawn else {}
+    return {"format": _FORMAT} | {name: json.dumps(value) for name, value in values.items()}

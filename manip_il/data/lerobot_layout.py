@@ -51,39 +51,6 @@ def all_features(own: Features) -> Features:
     return {**own, **{key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _INDEX_DTYPES.items()}}
 
 
-def info_json(
-    features: Features,
-    fps: float,
-    robot_type: str | None,
-    counts: tuple[int, int, int],
-    file_sizes: tuple[float, float],
-    videos: dict[str, dict[str, Any]],
-) -> dict[str, Any]:
-    """Return content of `meta/info.json`, keys in LeRobot's order.
-
-    features: all of them. counts: of episodes, frames, and texts. file_sizes: of data and video files [MB]. videos:
-    camera column -> the `info` of its video files.
-    """
-    table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in features.items()}
-    for key, info in videos.items():
-        table[key]["info"] = info
-    return {
-        "codebase_version": VERSION,
-        "fps": fps,
-        "features": table,
-        "total_episodes": counts[0],
-        "total_frames": counts[1],
-        "total_tasks": counts[2],
-        "chunks_size": CHUNKS_SIZE,
-        "data_files_size_in_mb": file_sizes[0],
-        "video_files_size_in_mb": file_sizes[1],
-        "data_path": DATA_PATH,
-        "video_path": VIDEO_PATH if videos else None,
-        "robot_type": robot_type,
-        "splits": {"train": f"0:{counts[0]}"},
-    }
-
-
 def data_schema(features: Features) -> pa.Schema:
     """Return Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
 

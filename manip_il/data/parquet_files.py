@@ -1,9 +1,8 @@
-"""Parquet files of datasets: write numbered ones a row group at a time, read checked columns as numpy arrays."""
+"""Parquet files of datasets: write numbered ones a row group at a time, read columns as numpy arrays."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.info import NUMBERS
+from manip_il.data.info import NUMBERS, Feature, reading
 from manip_il.data.pictures import to_png
 from manip_il.errors import ManipError, UnknownName
 
-UNREADABLE = (OSError, pa.ArrowException, ValueError, MemoryError)  # ArrowInvalid and its like are ValueErrors too
-_SEE_CHECK = "run `manip-il data check` to see what is wrong"
 _MIB = 1024 * 1024
 
 
@@ -70,15 +66,14 @@ class ParquetFiles:
         if self._writer is None:
             self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = open_writer(self._path, self.schema)
+            repeating: Any = [field.name for field in self.schema if not pa.types.is_nested(field.type)]
+            self._writer = pq.ParquetWriter(
+                *(self._path, self.schema),
+                compression="snappy",
+                use_dictionary=repeating,  # the numbers of a vector seldom do
+                write_page_checksum=True,  # else a changed bit is read as another number
+            )
         self._writer.write_table(table)
-
-
-def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
-    """Return a writer with the settings that all our files have."""
-    repeating: Any = [field.name for field in schema if not pa.types.is_nested(field.type)]  # a vector's seldom do
-    checksums = True  # else a changed bit is read as another number
-    return pq.ParquetWriter(path, schema, compression="snappy", use_dictionary=repeating, write_page_checksum=checksums)
 
 
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:
@@ -99,16 +94,10 @@ def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table
 
 
 def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return columns of a file.
-
-    Raises `ManipError` for one that is damaged, `UnknownName` for a missing column.
-    """
-    try:
-        with open(checks.open_regular(path), "rb") as stream:
-            # one thread: handing out pieces of one episode costs more than reading them
-            table = pq.ParquetFile(stream, page_checksum_verification=True).read(list(columns), use_threads=False)
-    except UNREADABLE as error:
-        raise ManipError(f"cannot read {path}: {checks.one_line(error)}; {_SEE_CHECK}") from error
+    """Return columns of a file. Raises `ManipError` if it is damaged, `UnknownName` for a missing column."""
+    with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
+        # one thread: handing out pieces of one episode costs more than reading them
+        table = file.read(list(columns), use_threads=False)
     for name in columns:
         if name not in table.column_names:
             raise UnknownName(f"column in {path}", name, table.column_names)
@@ -121,30 +110,20 @@ def read_tasks(root: Path) -> dict[int, str]:
     Raises `ManipError` for a file that cannot be read or holds no texts.
     """
     path = root / layout.TASKS
-    try:
-        schema = pq.read_schema(path)
-    except UNREADABLE as error:
-        raise ManipError(f"cannot read {path}: {checks.one_line(error)}; {_SEE_CHECK}") from error
-    texts = [one.name for one in schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
-    names = [name for name in texts if name in ("task", "__index_level_0__")] or texts
-    if len(names) != 1:
-        raise ManipError(f"{path} has {len(texts)} columns of text; expected the tasks' texts in one called task")
-    table = read_file(path, [layout.TASK_INDEX, names[0]])
-    try:
-        numbers = integers(table, layout.TASK_INDEX).tolist()
-    except BadColumn as error:
-        raise ManipError(f"{path}: {error}") from error
-    return dict(zip(numbers, table.column(names[0]).to_pylist(), strict=True))
+    with reading(path), pq.ParquetFile(path) as file:
+        table = file.read()
+        texts = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
+        names = [name for name in texts if name in ("task", "__index_level_0__")] or texts
+        if len(names) != 1:
+            raise ManipError(f"it has {len(texts)} columns of text; expected the tasks' texts in one called task")
+        numbers = table.column(layout.TASK_INDEX).cast(pa.int64()).to_pylist()
+        return dict(zip(numbers, table.column(names[0]).to_pylist(), strict=True))
 
 
-class BadColumn(ValueError):
-    """A column that is not what its dataset says; the message says how."""
-
-
-def to_numpy(column: pa.ChunkedArray, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
+def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
     """Return a column, (T,) or (T, *shape), as its feature says; text as objects.
 
-    Raises `BadColumn` if values have another kind or shape, or some are missing.
+    Raises `ValueError` if values have another kind or shape, or some are missing.
     """
     array: Any = column.combine_chunks()
     rows, nested = len(array), False
@@ -152,33 +131,16 @@ def to_numpy(column: pa.ChunkedArray, dtype: str, shape: Sequence[int]) -> NDArr
         if isinstance(array.type, pa.BaseExtensionType):
             array = array.storage
         if array.null_count:
-            raise BadColumn(f"holds {array.null_count:,} missing values")
+            raise ValueError(f"{feature.key!r} holds {array.null_count:,} missing values")
         if not (pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type)):
             break
         array, nested = array.flatten(), True
     values = array.to_numpy(zero_copy_only=False)
-    if values.dtype.kind != np.dtype(object if dtype not in NUMBERS else dtype).kind:
-        raise BadColumn(f"is {array.type} in the file; info.json says {dtype}")
-    if len(values) != rows * math.prod(shape):
-        raise BadColumn(f"holds {len(values):,} numbers in {rows:,} rows; info.json says shape {list(shape)}")
-    return values.reshape(rows, *shape) if nested or math.prod(shape) > 1 else values
-
-
-def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
-    """Return a column of whole numbers, (T,). Raises `BadColumn` for a missing one, missing values or another type."""
-    return _numbers(table, name, "integers", pa.types.is_integer).astype(np.int64)
-
-
-def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
-    """Return a column of numbers, (T,). Raises `BadColumn` as `integers` does."""
-    return _numbers(table, name, "numbers", pa.types.is_floating, pa.types.is_integer).astype(np.float64)
-
-
-def _numbers(table: pa.Table, name: str, expected: str, *types: Callable[[pa.DataType], bool]) -> NDArray[Any]:
-    if name not in table.column_names:
-        raise BadColumn(f"has no column {name!r}")
-    column = table.column(name)
-    if column.null_count or not any(is_type(column.type) for is_type in types):
-        found = f"{column.type} with {column.null_count} missing values"
-        raise BadColumn(f"column {name!r} is {found}; expected {expected}")
-    return column.to_numpy()
+    dtype = np.dtype(feature.dtype if feature.dtype in NUMBERS else object)
+    if values.dtype.kind != dtype.kind or len(values) != rows * feature.size:
+        shape = f"{feature.dtype} of shape {list(feature.shape)}"
+        raise ValueError(
+            f"{feature.key!r} has {len(values):,} of {array.type} in {rows:,} rows; info.json says {shape}"
+        )
+    values = values.astype(dtype, copy=False)  # files may hold numbers narrower
+    return values.reshape(rows, *feature.shape) if nested or feature.size > 1 else values

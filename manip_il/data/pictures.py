@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from io import BytesIO
 from pathlib import Path
-from typing import Any, cast
 
 import av
 import numpy as np
@@ -18,25 +17,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from manip_il import checks
-from manip_il.errors import ManipError
 
 _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # tracks that are in other files
 }
-UNREADABLE = (av.FFmpegError, OSError, ValueError, OverflowError, IndexError)  # the last: there is no video stream
 _FORMATS = ("PNG", "JPEG")
 _LEVEL = 1  # of compression: the next ones save a tenth and take twice as long
 
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
-
-
-def open_picture(content: bytes) -> Image.Image:
-    """Open a PNG or JPEG, whose pixels are not decoded yet. Raises `ValueError` for another format."""
-    try:
-        return Image.open(BytesIO(content), formats=_FORMATS)
-    except (Image.UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise ValueError(f"it is not a {' or '.join(_FORMATS)} of ordinary size") from error
 
 
 def to_png(picture: NDArray[np.uint8]) -> bytes:
@@ -46,23 +35,20 @@ def to_png(picture: NDArray[np.uint8]) -> bytes:
     return stream.getvalue()
 
 
-def decode_cell(cell: Any) -> Pictures:
-    """Return the picture (height, width, 3) in a cell of a data file, whose `path` is not followed.
-
-    Raises `ValueError` as `decode_picture` does.
-    """
-    content = cast(dict[str, Any], cell).get("bytes") if isinstance(cell, dict) else None
-    return decode_picture(content if isinstance(content, bytes) else None)
-
-
 def decode_picture(content: bytes | None) -> Pictures:
-    """Return the picture (height, width, 3) in the content of a file. Raises `ValueError` for none, or one not RGB."""
+    """Return the picture (height, width, 3) in the content of a PNG or JPEG file.
+
+    Raises `ValueError` for another format, one that is not RGB, or None.
+    """
     if content is None:
         raise ValueError("a picture is not in the file")
-    with open_picture(content) as picture:
-        if picture.mode != "RGB":
-            raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
-        return np.asarray(picture)
+    try:
+        with Image.open(BytesIO(content), formats=_FORMATS) as picture:
+            if picture.mode != "RGB":
+                raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
+            return np.asarray(picture)
+    except (Image.UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise ValueError(f"it is not a {' or '.join(_FORMATS)} of ordinary size") from error
 
 
 def open_video(path: Path) -> InputContainer:
@@ -81,22 +67,13 @@ def open_video(path: Path) -> InputContainer:
     return container
 
 
-def read_frames(path: Path, container: InputContainer, first: int, count: int, fps: float) -> Pictures:
+def read_frames(container: InputContainer, first: int, count: int, fps: float) -> Pictures:
     """Decode frames `first` to `first + count - 1` of an open video, (count, height, width, 3).
 
-    Raises `ManipError` for a file that cannot be read or does not hold each of them.
+    Raises `ValueError` if it does not hold each of them, and what the decoder raises.
     """
-    try:
-        pictures = _decode(container, first, count, fps)
-    except UNREADABLE as error:
-        raise unreadable(path, error) from error
-    if len(pictures) != count:
-        raise ManipError(f"{path} has no frame {first + len(pictures)}; its dataset counts {count} from {first} on")
-    return np.stack(pictures)
-
-
-def _decode(container: InputContainer, first: int, count: int, fps: float) -> list[NDArray[np.uint8]]:
-    """The frames as far as there is no gap."""
+    if not container.streams.video:
+        raise ValueError("it holds no video")
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]
     container.seek(round(first / fps / tick), stream=stream)  # to the key frame there or before
@@ -105,14 +82,8 @@ def _decode(container: InputContainer, first: int, count: int, fps: float) -> li
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
             pictures.append(frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False))
-            if pictures[-1].shape != pictures[0].shape:
-                raise ValueError(f"its pictures change their size at frame {first + len(pictures) - 1}")
         if ahead > 0 or len(pictures) == count:
             break
-    return pictures
-
-
-def unreadable(path: Path, error: Exception) -> ManipError:
-    """Return the error of a video that cannot be read."""
-    reason = "it holds no video" if isinstance(error, IndexError) else getattr(error, "strerror", None) or str(error)
-    return ManipError(f"cannot read {path}: {reason}")
+    if len(pictures) != count:
+        raise ValueError(f"it has no frame {first + len(pictures)}; its dataset counts {count} from {first} on")
+    return np.stack(pictures)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from manip_il import checks
+from manip_il.data.info import reading
 from manip_il.data.lerobot_layout import QUANTILES, STAT_NAMES, STATS
-from manip_il.errors import ManipError
 
 Statistics = dict[str, dict[str, NDArray[Any]]]  # column -> name -> one value a dimension
 F64 = NDArray[np.float64]
@@ -120,11 +120,9 @@ def to_lists(statistics: Statistics) -> dict[str, dict[str, list[Any]]]:
 def read_statistics(root: Path) -> Statistics:
     """Read `meta/stats.json`; statistics of pictures are (channels, 1, 1). Raises `ManipError` for what is none."""
     path = root / STATS
-    found = checks.read_json(path, "a dataset's statistics", nan_is_none=True)
-    try:
+    with reading(path):
+        found = checks.read_json(path, "a dataset's statistics", nan_is_none=True)
         return {
             key: {name: np.atleast_1d(np.asarray(values, np.float64)) for name, values in table.items()}
             for key, table in found.items()
         }
-    except (AttributeError, TypeError, ValueError) as error:
-        raise ManipError(f"{path}: {checks.one_line(error)}; `manip-il data repair` computes statistics") from error

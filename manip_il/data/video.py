@@ -6,10 +6,9 @@ here, and held against the library by the tests, because importing `lerobot.conf
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
-from collections.abc import Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -27,10 +26,9 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.pictures import Pictures, open_video
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import UsageError
 
 _MIB = 1024 * 1024
-_THREADS = Path("/proc/self/task")  # of this process, by number
 
 
 @dataclass(frozen=True)
@@ -68,40 +66,45 @@ class CameraFiles:
         return Clip(*self._copied[source], first, frames)
 
     def write(self, frames: Pictures) -> Clip:
-        """Append the frames of an episode. Raises `ManipError` if they cannot be encoded or written."""
+        """Append the frames of an episode. Raises `av.FFmpegError` if they cannot be encoded or written."""
         if self._bytes >= self._limit:
             self.close()
         name, chunk, number = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
         size = frames.shape[1], frames.shape[2]
-        try:
-            if self._stream is None:
-                encoder = self._open(self._folder / name, size)
-            else:  # a stream of its own, so that its bytes depend on no other episode
-                encoder = _new_encoder(self._config, size, self._fps)
-            clip = Clip(chunk, number, self._frames, len(frames))
-            for picture in frames:
-                self._mux(_encode(encoder, _video_frame(picture, self._frames, self._fps)))
-                self._frames += 1
-            self._mux(_encode(encoder, None))
-        except (av.FFmpegError, OSError) as error:
-            raise ManipError(f"cannot write {name}: {error.strerror}") from error
+        if self._stream is None:
+            encoder = self._open(self._folder / name, size)
+        else:  # a stream of its own, so that its bytes depend on no other episode
+            encoder = _new_encoder(self._config, size, self._fps)
+        clip = Clip(chunk, number, self._frames, len(frames))
+        for picture in frames:
+            self._mux(_encode(encoder, _video_frame(picture, self._frames, self._fps)))
+            self._frames += 1
+        self._mux(_encode(encoder, None))
         return clip
 
     def close(self) -> None:
-        """Finish the open file, if any. Raises `ManipError` if it cannot be written."""
+        """Finish the open file, if any. Raises `OSError` if it cannot be written."""
         container, self._container, self._stream = self._container, None, None  # a full disk lets none be closed twice
-        if container is None:
-            return
-        name, _, _ = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
-        self._number, self._frames, self._bytes = self._number + 1, 0, 0
-        try:
+        if container is not None:
+            self._number, self._frames, self._bytes = self._number + 1, 0, 0
             container.close()
-        except (av.FFmpegError, OSError) as error:
-            raise ManipError(f"cannot write {name}: {error.strerror}") from error
 
     def info(self) -> dict[str, Any]:
-        """Return `video_info` of the first file, which must be closed."""
-        return video_info(self._config, self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0])
+        """Return the entry of LeRobot's `info.json` for this camera; its first file must be closed."""
+        path, config = self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0], self._config
+        with closing(open_video(path)) as container:
+            stream = container.streams.video[0]
+            found = {
+                "video.height": stream.height,
+                "video.width": stream.width,
+                "video.codec": stream.codec.canonical_name,
+                "video.pix_fmt": stream.pix_fmt,
+                "video.fps": int(stream.base_rate or 0),
+                "video.channels": len(stream.format.components),
+                "has_audio": False,
+            }
+        settings = {"video.g": config.g, "video.crf": config.crf, "video.preset": config.preset, "video.fast_decode": 0}
+        return {**found, **settings, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}
 
     def _open(self, path: Path, size: tuple[int, int]) -> VideoCodecContext:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,28 +123,18 @@ class CameraFiles:
 
 
 def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Packet]:
-    """Encode a frame, or what is left; the first one opens the encoder."""
-    with contextlib.nullcontext() if encoder.is_open else scheduling_kept():
-        return encoder.encode(frame)
+    """Encode a frame, or what is left; the first one opens the encoder.
 
-
-@contextlib.contextmanager
-def scheduling_kept() -> Iterator[None]:
-    """Give this thread, and all that start inside, the scheduling that this thread had.
-
-    SVT-AV1, if root runs it, makes the thread that opens an encoder, and its own, real-time ones (SCHED_FIFO, 99) for
-    good: these, and every process that they start, would starve all others.
+    SVT-AV1, if root runs it, makes the thread that opens it, and its own, real-time ones (SCHED_FIFO) for good: these,
+    and every process that they start, would starve all others.
     """
-    if not _THREADS.is_dir() or os.geteuid() != 0:
-        yield
-        return
-    before, running = (os.sched_getscheduler(0), os.sched_getparam(0)), set(os.listdir(_THREADS))
-    try:
-        yield
-    finally:
-        for thread in {"0"} | (set(os.listdir(_THREADS)) - running):  # 0 is this one
-            with contextlib.suppress(OSError):  # it has ended
-                os.sched_setscheduler(int(thread), *before)
+    opens = not encoder.is_open
+    packets = encoder.encode(frame)
+    if opens and os.geteuid() == 0 and encoder.name == "libsvtav1":
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with suppress(OSError):  # it has ended
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+    return packets
 
 
 def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoCodecContext:
@@ -180,20 +173,3 @@ def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
             raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {reason}") from error
         finally:
             av.logging.set_level(level)
-
-
-def video_info(config: VideoConfig, path: Path) -> dict[str, Any]:
-    """Return the entry of LeRobot's `info.json` for a camera whose video files are like `path`."""
-    with contextlib.closing(open_video(path)) as container:
-        stream = container.streams.video[0]
-        found = {
-            "video.height": stream.height,
-            "video.width": stream.width,
-            "video.codec": stream.codec.canonical_name,
-            "video.pix_fmt": stream.pix_fmt,
-            "video.fps": int(stream.base_rate or 0),
-            "video.channels": len(stream.format.components),
-            "has_audio": False,
-        }
-    settings = {"video.g": config.g, "video.crf": config.crf, "video.preset": config.preset, "video.fast_decode": 0}
-    return {**found, **settings, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}

@@ -45,7 +45,7 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
     checks.in_child(str(paths[0]), _read_all, paths, mapping)
     fps: Any = mapping.fps if mapping.fps % 1 else int(mapping.fps)
     features = _features(next(read_frames(paths[0], mapping)), mapping)
-    with new_folder(root) as folder, closing(TableWriter(folder, root, features, fps, mapping.robot_type)) as writer:
+    with new_folder(root) as folder, closing(TableWriter(folder, features, fps, mapping.robot_type)) as writer:
         for path in paths:
             frames = list(read_frames(path, mapping))
             columns = {key: np.stack([frame[key] for frame in frames]) for key in features}

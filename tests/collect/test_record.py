@@ -14,7 +14,7 @@ from manip_il.collect.record import collect, collect_successes, journal_of, reco
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, build
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import Journal, list_episodes, read_header
+from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
@@ -46,7 +46,7 @@ class Recorded(Engine):
 
 
 def names(folder: Path) -> list[int]:
-    return [read_header(path).seed for path in list_episodes(folder)]
+    return [read_journal(path)[1].seed for path in list_episodes(folder)]
 
 
 def contents(folder: Path) -> list[bytes]:
@@ -73,7 +73,7 @@ def test_an_episode_is_on_disk_before_anybody_hears_of_it(tmp_path):
 def test_a_failed_demonstration_is_replaced_by_the_next_seeds(tmp_path):
     failing = [SEEDS[0], SEEDS[2], SEEDS[4]]
     found = collect_successes(Recorded(failing), JOB, SEEDS, 4, tmp_path)
-    assert [header.seed for header, _ in found] == list(SEEDS[:7])
+    assert [episode.seed for _, episode in found] == list(SEEDS[:7])
 
 
 def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
@@ -90,7 +90,7 @@ class Shuffled(Recorded):
 
 def test_journals_come_in_the_order_of_the_seeds_and_a_lost_one_is_named(tmp_path, caplog):
     found = list(collect(Shuffled(), JOB, SEEDS[:5], tmp_path))
-    assert [header.seed for header, _ in found] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
+    assert [episode.seed for _, episode in found] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
     assert [record.getMessage() for record in caplog.records] == [
         f"seed {SEEDS[2]} is left out: it repeatedly killed its worker"
     ]
@@ -115,7 +115,7 @@ def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog
     damaged.write_bytes(whole[1][:5000])
     assert journal_of(tmp_path, JOB).prepare() == []
     engine = Recorded()
-    assert [header.seed for header, _ in collect(engine, JOB, SEEDS[:4], tmp_path)] == list(SEEDS[:4])
+    assert [episode.seed for _, episode in collect(engine, JOB, SEEDS[:4], tmp_path)] == list(SEEDS[:4])
     assert contents(tmp_path)[:3] == whole
     assert engine.asked == [SEEDS[3], SEEDS[1]]
     [record] = caplog.records

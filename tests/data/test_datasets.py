@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,8 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
-from manip_il.data.lerobot_write import new_dataset, write_dataset
-from manip_il.errors import ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 from ..damage import DATA, cut, digests, edit_json
@@ -60,15 +61,6 @@ def test_a_table_can_be_of_some_columns_and_an_episode_is_rows_of_it(root, episo
     np.testing.assert_array_equal(table[s.ACTION][dataset.rows_of(2)], episodes[2].columns[s.ACTION])
 
 
-def test_scalars_may_be_columns_without_width(root, tmp_path, episodes, spec):
-    flat = [
-        dataclasses.replace(one, columns={key: v[:, 0] if v.shape[1] == 1 else v for key, v in one.columns.items()})
-        for one in episodes
-    ]
-    write_dataset(flat, tmp_path / "flat", spec, provenance=ORIGIN, **OPTIONS)
-    assert digests(tmp_path / "flat") == digests(root)
-
-
 def test_what_a_dataset_says_of_itself(root, spec):
     assert Dataset.open(root).spec == spec
     assert Dataset.open(root).fingerprint == FINGERPRINT
@@ -78,41 +70,29 @@ def test_what_a_dataset_says_of_itself(root, spec):
     assert (info.success, info.success_at_end) == (2, 2)
 
 
-def test_success_at_some_time_and_at_the_end_are_told_apart(tmp_path, make_episode, spec):
-    lost = make_episode(3, success=False)
-    lost.columns[s.SUCCESS][4] = True
-    lost = dataclasses.replace(lost, success=True)
-    info = write_dataset([lost, make_episode(4)], tmp_path / "lift", spec, **OPTIONS)
-    assert (info.success, info.success_at_end) == (2, 1)
-    assert [episode.success_at_end for episode in Dataset.open(tmp_path / "lift").read_episodes()] == [False, True]
-
-
 def test_episodes_come_one_by_one_nothing_is_there_before_the_last_and_the_bytes_are_the_same(
     root, tmp_path, episodes, spec
 ):
-    again = tmp_path / "elsewhere" / "again"
-    with new_dataset(again, spec, **OPTIONS) as writer:
+    again, origin = tmp_path / "elsewhere" / "again", dict[str, Any]()
+
+    def one_by_one() -> Iterator[Episode]:
         for episode in episodes:
-            writer.add(episode)
+            yield episode
             assert not again.exists()
-        info = writer.finish(ORIGIN)
-        assert not again.exists()
-        with pytest.raises(ManipError, match="is finished"):
-            writer.add(episodes[0])
-    assert info == Dataset.open(again).summary
+        origin.update(ORIGIN)
+
+    info = write_dataset(one_by_one(), again, spec, origin, **OPTIONS)
+    assert info == Dataset.open(again).info
     assert digests(again) == digests(root)
 
 
-@pytest.mark.parametrize(("end", "error"), [(None, ManipError), (KeyboardInterrupt(), KeyboardInterrupt)])
-def test_a_writer_that_was_not_finished_leaves_nothing(tmp_path, episodes, spec, end, error):
-    def leave_early() -> None:
-        with new_dataset(tmp_path / "lift", spec, **OPTIONS) as writer:
-            writer.add(episodes[0])
-            if end is not None:
-                raise end
+def test_a_writer_that_is_stopped_leaves_nothing(tmp_path, episodes, spec):
+    def stopped() -> Iterator[Episode]:
+        yield episodes[0]
+        raise KeyboardInterrupt
 
-    with pytest.raises(error, match="was not finished" if end is None else None):
-        leave_early()
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(stopped(), tmp_path / "lift", spec, **OPTIONS)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -172,14 +152,6 @@ def test_a_new_file_starts_where_one_is_full_and_a_missing_one_is_noticed(tmp_pa
         Dataset.open(tmp_path / "small").columns()
 
 
-def test_nan_is_refused_with_episode_and_frame(tmp_path, make_episode, spec):
-    bad = make_episode(41)
-    bad.columns[s.ACTION][3, 1] = np.nan  # after the episode looked at itself
-    with pytest.raises(NotFiniteError, match=r"seed 41, action: .* at frame 3"):
-        write_dataset([make_episode(40), bad], tmp_path / "lift", spec, **OPTIONS)
-    assert list(tmp_path.iterdir()) == []
-
-
 def with_column(episode: Episode, key: str, values: np.ndarray | None) -> Episode:
     """None: without it."""
     columns = episode.columns | {key: values}
@@ -221,20 +193,16 @@ def test_what_is_not_there_is_named(root, tmp_path):
         Dataset.open(root).rows_of(3)
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
-def test_a_truncated_data_file_is_named(root, keep):
-    cut(root / DATA, keep)
+def test_a_truncated_file_broken_json_and_another_version_are_named(root):
+    cut(root / DATA, 0.5)
     with pytest.raises(ManipError, match=Path(DATA).name):
         Dataset.open(root).columns()
-
-
-def test_broken_json_and_other_versions_are_named(root):
     edit_json(root / layout.INFO, lambda info: info.update(codebase_version="v2.1"))
     with pytest.raises(ManipError, match=r"codebase_version is .v2\.1."):
-        Dataset.open(root).columns()
+        Dataset.open(root)
     (root / layout.INFO).write_text("{")
     with pytest.raises(ManipError, match=r"info\.json is not valid JSON"):
-        Dataset.open(root).columns()
+        Dataset.open(root)
 
 
 def test_importing_costs_no_torch():
@@ -256,15 +224,12 @@ sys.exit(", ".join(heavy & set(sys.modules)))
         (s.ACTION, [[1.0, 2.0], [1.0]] * 10),
         (s.ACTION, [[1.0, 2.0, 3.0], None] * 10),
         (s.ACTION, ["text"] * 20),
-        (s.ACTION, [1.0] * 20),
-        (layout.EPISODE_INDEX, [0, None] * 10),
         (layout.EPISODE_INDEX, [float("nan")] * 20),
-        (s.SUCCESS, [True, None] * 10),
         (s.SUCCESS, [{"a": 1}] * 20),
     ],
 )
 def test_a_column_of_another_kind_or_with_gaps_is_named(root, key, column):
     table = pq.read_table(root / DATA)
     pq.write_table(table.set_column(table.column_names.index(key), key, pa.array(column)), root / DATA)
-    with pytest.raises(ManipError, match=f"column '{key}' "):
+    with pytest.raises(ManipError, match=f"'{key}' h"):
         Dataset.open(root).columns([key])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -54,11 +53,6 @@ def test_each_text_is_one_task_and_every_frame_has_its_own(root, spec):
     assert Dataset.open(root).summary.instruction == spec.instruction
 
 
-def test_an_episode_without_a_text_has_the_specs(tmp_path, episodes, spec):
-    write_dataset(episodes, tmp_path / "data", spec, repo_id="local/data", fingerprint={})
-    assert texts(tmp_path / "data") == [spec.instruction] * 3
-
-
 def test_journals_keep_the_text_and_build_the_same_dataset(tmp_path, told, spec, root):
     paths = [Journal(tmp_path / "journals", spec, {}).write(episode) for episode in told]
     assert [read_journal(path)[1].instruction for path in paths] == TEXTS
@@ -85,13 +79,5 @@ def test_the_doctor_finds_nothing_amiss_and_mcap_and_the_card_have_every_text(tm
 
 def test_a_number_without_a_text_is_an_error(root):
     pq.write_table(layout.tasks_table([RED]), root / layout.TASKS)
-    with pytest.raises(ManipError, match=r"rows have the task 1, which meta/tasks\.parquet does not hold"):
+    with pytest.raises(ManipError, match=r"rows have the task 1, which meta/tasks\.parquet lacks"):
         texts(root)
-
-
-def test_lerobot_loads_every_frame_with_its_text(root):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    dataset = LeRobotDataset("local/data", root=root)
-    rows: list[Any] = [dataset[row] for row in (0, 7, 8, 19)]
-    assert [row["task"] for row in rows] == [RED, BLUE, RED, RED]

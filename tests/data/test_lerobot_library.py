@@ -19,7 +19,6 @@ from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
-from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..damage import DATA, EPISODES
@@ -159,14 +158,6 @@ def test_parquet_schemas_equal_those_of_lerobots_writer(pair, name):
     assert pa.schema([field for field in left if field.name not in ours]).equals(right)
 
 
-def test_data_equal_those_of_lerobots_writer(pair):
-    left, right = (pq.ParquetFile(root / DATA) for root in pair)
-    assert left.read().equals(right.read())
-    assert (left.num_row_groups, right.num_row_groups) == (1, 3)  # LeRobot's holds one an episode, ours 1,000 frames
-    codec = left.metadata.row_group(0).column(0).compression
-    assert codec == right.metadata.row_group(0).column(0).compression
-
-
 def test_episodes_and_statistics_equal_those_of_lerobots_writer_to_their_precision(pair):
     left, right = (pq.read_table(root / EPISODES).to_pylist() for root in pair)
     for mine, yours in zip(left, right, strict=True):
@@ -216,32 +207,6 @@ def test_lerobot_decodes_the_right_pictures(tmp_path, make_episode, two, backend
             expected = numbers_of(episode.columns[key][[max(t - 1, 0), t]])
             seen = (item[key].permute(0, 2, 3, 1).numpy() * 255).round()
             assert numbers_of(seen) == expected, (item["index"], key)
-
-
-def test_many_small_files_load(tmp_path, episodes, spec):
-    root = write(episodes * 4, tmp_path / "small", spec, data_files_size_in_mb=0.01)
-    assert len(list(root.glob(layout.DATA_FILES))) > 1
-    dataset = load(root)
-    assert [int(dataset[i]["index"]) for i in range(len(dataset))] == list(range(80))
-    for number in range(12):
-        path = root / dataset.meta.get_data_file_path(number)
-        assert number in pq.read_table(path)["episode_index"].to_pylist()
-
-
-def test_lerobots_own_dataset_reads_as_ours(pair):
-    left, right = (Dataset.open(root).columns() for root in pair)
-    assert left.keys() == right.keys()
-    for key, values in left.items():
-        np.testing.assert_array_equal(values, right[key])
-
-
-def test_a_dataset_that_lerobot_left_unfinished_is_refused(tmp_path, spec):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    root = tmp_path / "unfinished"
-    LeRobotDataset.create(REPO, fps=spec.fps, features=s.features(spec), root=root, use_videos=False)
-    with pytest.raises(ManipError, match="no data"):
-        Dataset.open(root).columns()
 
 
 @pytest.fixture(params=[(), ("front",)], ids=["state", "camera"])

@@ -186,7 +186,7 @@ def test_episodes_deleted_and_merged_by_lerobots_tools(recorded, tmp_path):
     fewer: Any = delete_episodes(whole, [1], output_dir=tmp_path / "fewer", repo_id="a/fewer")
     merge_datasets([whole, fewer], "a/merged", output_dir=tmp_path / "merged")
     pictures = Dataset.open(recorded).camera(TOP)
-    row = np.arange(len(pictures))
+    row = np.arange(pictures.frames)
     kept = np.concatenate([row, row[:12], row[25:]])
     merged = Dataset.open(tmp_path / "merged")
     assert len({part.path for part in merged.camera(TOP).parts}) == 1  # a video of several episodes

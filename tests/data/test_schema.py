@@ -66,17 +66,9 @@ def test_a_fingerprint_names_versions_and_hashes_what_it_is_given():
     assert "policy has " in warning
 
 
-def test_what_one_side_lacks_is_a_difference():
-    warnings = compare_fingerprints("dataset", {"mujoco": "3.11.0"}, "environment", {"mink": "1.3.0"})
-    assert warnings == [
-        "mujoco differs: dataset has 3.11.0, environment has nothing",
-        "mink differs: dataset has nothing, environment has 1.3.0",
-    ]
-
-
 def test_configs_of_many_kinds_have_one_canonical_text():
     config = {"config": Config(), "actor": Actor.LEARNER, "gains": np.array([1.0, 2.0]), "n": np.int64(3)}
     expected = '{"actor":1,"config":{"rate":0.5,"where":"a/b"},"gains":[1.0,2.0],"n":3}'
     assert canonical_json(config) == expected
-    with pytest.raises(ManipError, match="object"):
+    with pytest.raises(TypeError, match="object"):
         canonical_json({"x": object()})

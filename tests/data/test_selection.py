@@ -11,7 +11,7 @@ import pytest
 from manip_il.data import schema as s
 from manip_il.data.build import Recording, build
 from manip_il.data.dataset import Dataset
-from manip_il.data.episodes import count_labels, first_labels, parts
+from manip_il.data.episodes import parts
 from manip_il.data.journal import Journal
 from manip_il.errors import NothingToLearnError
 from manip_il.mdp import Episode
@@ -41,11 +41,7 @@ def recorded(rollouts: list[Episode], spec, folder: Path, recording: Recording) 
     journal = Journal(journals, spec, {})
     for episode in rollouts:
         journal.write(episode)
-    selection = recording.selection()
-    with recording.open(root, spec, {}) as writer:
-        for episode in selection.take((journal.header(episode), episode) for episode in rollouts):
-            writer.add(episode)
-        writer.finish(recording.provenance | selection.provenance)
+    recording.make(((journal, episode) for episode in rollouts), root)
     return root
 
 
@@ -64,17 +60,6 @@ def test_parts_are_the_rollout_cut_behind_every_done(rollout):
         np.testing.assert_array_equal(np.concatenate([piece.columns[key] for piece in pieces]), column)
 
 
-def test_an_episode_with_one_end_is_its_only_part(make_episode):
-    episode = make_episode(7)
-    assert parts(episode) == [episode]
-
-
-def test_only_the_first_labels_stay_sound(rollout):
-    cut = first_labels(rollout(7), 2)
-    assert count_labels(cut) == 2
-    assert cut.columns[s.LABEL_VALID].ravel().tolist() == [0, 0, 0, 0, 1, 1, 0, 0, 0, 0]
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
@@ -91,6 +76,9 @@ def test_a_dataset_has_what_the_recording_says_and_is_built_again_to_the_byte(
     recording = replace(Recording("local/d"), **changes)
     root = recorded([rollout(7), rollout(8)], spec, tmp_path, recording)
     assert labels(root) == expected
+    sound = Dataset.open(root).columns([s.LABEL_VALID])[s.LABEL_VALID]
+    if expected[-1] == 1:
+        assert sound.tolist()[-3:] == [1, 0, 0]
     build(tmp_path / "d.journals", tmp_path / "again")
     assert digests(tmp_path / "again") == digests(root)
 

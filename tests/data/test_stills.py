@@ -15,7 +15,6 @@ from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.pictures import decode_picture, to_png
-from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..pictures import episode_frames
@@ -72,31 +71,14 @@ def test_lerobots_own_description_is_enough(root, pictured):
     assert (spec.cameras, spec.image_size, spec.video) == (pictured.cameras, pictured.image_size, False)
 
 
-def test_a_spec_says_video_only_where_there_is_none(pictured):
-    assert "video" not in replace(pictured, video=True).to_json()
-    assert s.RobotTaskSpec.from_json(pictured.to_json()) == pictured
-
-
-@pytest.mark.parametrize(("content", "words"), [(None, "not in the file"), (b"GIF89a", "not a PNG or JPEG")])
-def test_a_picture_that_is_none_is_refused(content: bytes | None, words: str):
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "not in the file"),
+        (b"GIF89a", "not a PNG or JPEG"),
+        (to_png(np.zeros((4, 4), np.uint8)), "a picture of mode L; expected RGB"),
+    ],
+)
+def test_a_picture_that_is_none_or_grey_is_refused(content: bytes | None, words: str):
     with pytest.raises(ValueError, match=words):
         decode_picture(content)
-
-
-def test_a_grey_picture_is_refused_and_one_in_colour_comes_back():
-    grey = to_png(np.zeros((4, 4), np.uint8))
-    with pytest.raises(ValueError, match="a picture of mode L; expected RGB"):
-        decode_picture(grey)
-    picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-    np.testing.assert_array_equal(decode_picture(to_png(picture)), picture)
-
-
-def test_damage_is_one_line(root, monkeypatch):
-    def damaged(_: Any) -> np.ndarray:
-        raise ValueError("it is not a PNG or JPEG")
-
-    monkeypatch.setattr("manip_il.data.camera.decode_cell", damaged)
-    with pytest.raises(
-        ManipError, match=r"cannot read the pictures observation\.images\.front in frames 0 to 6 of .*: it is not"
-    ):
-        next(Dataset.open(root).read_episodes())

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import resource
-import sys
+import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from fractions import Fraction
@@ -18,9 +18,9 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data import video
-from manip_il.data.build import dataset_sha256, merge_datasets
+from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
+from manip_il.data.video import try_encoder
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
@@ -106,7 +106,6 @@ AV1 = {"vcodec": "libsvtav1"}
         ({**AV1, "preset": "slow"}, UsageError, "preset='slow'"),
         ({**AV1, "pix_fmt": "yuv444p"}, UsageError, "Specified pixel format yuv444p is not supported"),
         ({"pix_fmt": "gray"}, UsageError, "gray has no colour"),
-        ({"pix_fmt": "colourful"}, UsageError, "not a pixel format: 'colourful'"),
     ],
 )
 def test_settings_that_cannot_be_are_refused_before_anything_is_written(tmp_path, two, settings, error, message):
@@ -115,9 +114,8 @@ def test_settings_that_cannot_be_are_refused_before_anything_is_written(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such call")
 def test_an_encoder_makes_no_thread_a_real_time_one():
-    video.try_encoder(VideoConfig(vcodec="libsvtav1"), (64, 64), 10)
+    try_encoder(VideoConfig(vcodec="libsvtav1"), (64, 64), 10)
     assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {os.SCHED_OTHER}
 
 
@@ -150,34 +148,16 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path, make_episod
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_encoder_that_fails_is_one_clear_error(tmp_path, filmed, two, monkeypatch):
-    def fail(self: object, frames: object) -> None:
-        raise ManipError("the encoder died")
-
-    monkeypatch.setattr(video.CameraFiles, "write", fail)
-    with pytest.raises(ManipError, match="the encoder died"):
-        write(filmed, tmp_path / "lift", two)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_video_cut_short_is_named(tmp_path, filmed, two):
     write(filmed, tmp_path / "lift", two)
     path = next(iter(video_rows(tmp_path / "lift")))
     content = path.read_bytes()
-    for size in (0, 100, len(content) // 2, len(content) - 200):
-        path.write_bytes(content[:size])
-        with pytest.raises(ManipError, match=r"file-000\.mp4"):
-            list(Dataset.open(tmp_path / "lift").read_episodes())
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(ManipError, match=r"file-000\.mp4"):
+        list(Dataset.open(tmp_path / "lift").read_episodes())
     path.unlink()
     with pytest.raises(ManipError, match=r"cannot read .*file-000\.mp4: No such file"):
         episode_frames(tmp_path / "lift", FRONT, 0)
-
-
-def test_names_and_numbers_that_are_not_there_are_refused(root):
-    with pytest.raises(UnknownName, match=r"did you mean 'observation\.images\.front'"):
-        episode_frames(root, "observation.images.fron", 0)
-    with pytest.raises(UsageError, match="has no episode 3; it has 0 to 2"):
-        episode_frames(root, FRONT, 3)
 
 
 def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root):
@@ -195,18 +175,11 @@ def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root)
             np.testing.assert_array_equal(here, there)
 
 
-def test_one_dataset_with_cameras_alone_is_copied_as_it_is(tmp_path, root):
-    merge_datasets([root], tmp_path / "copied", repo_id="x/y", provenance={"made": "here"})
-    assert Dataset.open(tmp_path / "copied").provenance["made"] == "here"
-    assert dataset_sha256(tmp_path / "copied") == dataset_sha256(root)
-
-
-def test_a_dataset_with_cameras_tells_of_itself(tmp_path, root, filmed, two):
-    assert Dataset.open(root).cameras == [FRONT, WRIST]
-    assert (Dataset.open(root).summary.episodes, Dataset.open(root).summary.frames) == (3, 21)
-    assert FRONT not in Dataset.open(root).columns()
-    assert Dataset.open(root).spec == two
-    write(filmed, tmp_path / "lift", two)
+def test_a_dataset_with_cameras_tells_of_itself_also_by_lerobots_own_description(root, two, tmp_path):
+    assert (Dataset.open(root).cameras, Dataset.open(root).spec) == ([FRONT, WRIST], two)
+    with pytest.raises(UnknownName, match=r"did you mean 'observation\.images\.front'"):
+        episode_frames(root, "observation.images.fron", 0)
+    shutil.copytree(root, tmp_path / "lift")
     (tmp_path / "lift" / layout.OURS).unlink()  # as LeRobot's tools do
     theirs = Dataset.open(tmp_path / "lift").spec
     assert (theirs.cameras, theirs.image_size) == (two.cameras, two.image_size)

@@ -155,7 +155,7 @@ def test_a_file_that_would_fill_the_memory_is_refused_in_one_line(tmp_path: Path
         record.write(builder)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(MCAP0_MAGIC + builder.end() + MCAP0_MAGIC)
-    with pytest.raises(ManipError, match=r"^.*bomb\.mcap needs more than 4 GB of memory to open$"):
+    with pytest.raises(ManipError, match=r"bomb\.mcap cannot be opened in 4 GB of memory and 120 s"):
         list(import_files([path], tmp_path / "new", load(tmp_path, {"f": feature()})))
     assert not (tmp_path / "new").exists()
 

@@ -39,7 +39,7 @@ MODELS = {
     ),
     "a field of gigabytes": (
         MODEL.replace("</asset>", '<hfield name="hills" nrow="30000" ncol="30000" size="1 1 1 1"/></asset>'),
-        ["the model of robot own needs more than 4 GB of memory"],
+        ["the model of robot own cannot be opened in 4 GB of memory"],
     ),
     "an arena of gigabytes": (MODEL.replace("<size ", '<size memory="100G" '), ["robot own", "allocate memory"]),
     "a mesh without end": (
