@@ -13,7 +13,7 @@ from manip_il.data import atomic
 from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.examine import examine_folder
-from manip_il.doctor.finding import NotWhole, Severity
+from manip_il.doctor.finding import NotWhole, Severity, journals_of
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.store.errors import RemoteError
 from manip_il.store.hub import Hub
@@ -26,7 +26,6 @@ from manip_il.store.manifest import (
     Manifest,
     Plan,
     datasets_in,
-    journals_of,
     list_files,
     newest,
 )
