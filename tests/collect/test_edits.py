@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,11 +12,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from kept import label_all
 
+from manip_il.child_processes import map_in_order
 from manip_il.collect.edits import (
     Source,
     Target,
-    label_episode,
     open_source,
     redraw_dataset,
     relabel_dataset,
@@ -42,7 +44,7 @@ from manip_il.sim.world import World
 from manip_il.stock.table import ROBOT as STOCK
 
 from ..damage import digests, edit_json
-from ..tables import every_scene, one_arm_per_task
+from ..tables import SCENES, one_arm_per_task
 
 ENV, REACH = EnvConfig("panda", "pick_place"), EnvConfig("fetch", "reach")
 CAMERAS, SMALL = CameraConfig(("front", "wrist"), 64, 96), CameraConfig(("front", "wrist"), 32, 32)
@@ -76,12 +78,14 @@ def visited(tmp_path_factory) -> Source:
     return open_source(write(episodes, tmp_path_factory.mktemp("visited") / "visited", ENV))
 
 
-@every_scene
-def test_labels_given_afterwards_are_those_given_while_recording(robot: str, task: str):
-    env = EnvConfig(robot, task)
-    for episode in recorded(env, 1, conditions=(NOISE,)):
-        for key, labels in label_episode(env, episode).items():
-            np.testing.assert_array_equal(labels.reshape(episode.columns[key].shape), episode.columns[key])
+@pytest.mark.slow
+def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_while_recording():
+    envs = [EnvConfig(*scene) for scene in SCENES]
+    pieces = [(env, episode) for env in envs for episode in recorded(env, 1, conditions=(NOISE,))]
+    with closing(map_in_order(label_all, pieces, 2)) as labelled:
+        for (_, episode), found in labelled:
+            for key, labels in found.items():
+                np.testing.assert_array_equal(labels.reshape(episode.columns[key].shape), episode.columns[key])
 
 
 @pytest.mark.parametrize("env", [REACH, EnvConfig(STOCK, "FetchReach-v4")], ids=lambda env: env.robot)
