@@ -1,7 +1,7 @@
 """What users of LeRobot report of their datasets, tried here: each works, or is refused in one line that helps.
 
-Others are shown beside what they concern: fps 29.97 and exchanged messages in `tests/mcap`, depth in TIFF pictures in
-`tests/data/test_other_peoples.py`, another program's dataset and its card in `tests/store/test_cards.py`.
+Others are shown beside what they concern: fps 29.97 and exchanged messages in `tests/mcap`, another program's dataset
+and its card in `tests/store/test_cards.py`, datasets of every shape that is trained on in `tests/data`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from manip_il.data.dataset import Dataset
 from manip_il.doctor.examine import examine_folder
 from manip_il.store.cards import write_cards
 
-from ..damage import edit_json
+from ..damage import digests, edit_json
+from ..data.test_other_peoples import DEPTH, NAMES, SIZE, record
 from .teaching import make
 
 pytestmark = pytest.mark.slow
@@ -90,6 +91,15 @@ def test_a_camera_on_which_lerobot_does_not_train_is_named(tmp_path: Path, names
     [finding] = [one for one in examine_folder(root) if "LeRobot does not train" in one.text]
     name(json.loads(finding.remedy[finding.remedy.index('["height') :].removesuffix(" there")))
     assert examine_folder(root) == []
+
+
+@pytest.mark.parametrize("kind", ["image", "video"])
+def test_depth_in_lerobots_formats_is_whole_and_comes_back(tmp_path: Path, kind: str):
+    depth = {"dtype": kind, "shape": (*SIZE, 1), "names": NAMES, "info": {"is_depth_map": True}}
+    root, url = record(tmp_path / "depth", ["fold"] * 3, **{DEPTH: depth}), f"file://{tmp_path}/store"
+    for words in (("data", "check", root), ("push", root, url), ("pull", url, tmp_path / "got")):
+        assert main([*map(str, words)]) == 0
+    assert digests(tmp_path / "got") == digests(root)
 
 
 def test_a_command_that_a_remedy_names_is_there():

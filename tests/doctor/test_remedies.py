@@ -12,11 +12,9 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.atomic import exclusive
 from manip_il.data.journal import list_episodes
 from manip_il.doctor.examine import examine_folder, repair
 from manip_il.doctor.finding import Finding
-from manip_il.errors import FolderBusyError
 
 from ..damage import DATA, cut, damage_at_random, digests, edit_json, edit_table, lines
 from ..warm import Warm
@@ -79,11 +77,6 @@ def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     np.testing.assert_allclose(stats[FRONT]["mean"], whole[FRONT]["mean"], atol=0.05)
     kept = theirs.with_name("theirs.before-repair")
     assert sorted(path.name for path in kept.iterdir()) == ["images", "info.json", "stats.json"]
-
-
-def test_a_dataset_that_is_being_written_is_left_alone(ours):
-    with exclusive(ours), pytest.raises(FolderBusyError):
-        mend(ours)
 
 
 def test_lerobots_tool_deletes_the_episodes_that_a_remedy_names(theirs, warm_lerobot: Warm):
