@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -41,28 +40,6 @@ def edit_table(path: Path, change: Callable[[dict[str, list[Any]]], None]) -> No
 def cut(path: Path, keep: float) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * keep)])
-
-
-def damage_at_random(root: Path, rng: np.random.Generator) -> tuple[str, Path]:
-    """Cut, flip, fill or delete one file; which way and which file."""
-    files = sorted(path for path in root.rglob("*") if path.is_file())
-    path = files[rng.integers(len(files))]
-    data = bytearray(path.read_bytes())
-    way = ["cut", "flip", "fill", "delete", "swap"][rng.integers(5)]
-    if way == "delete":
-        path.unlink()
-        return way, path
-    if way == "cut":
-        data = data[: rng.integers(len(data))]
-    elif way == "swap":
-        data = bytearray(files[rng.integers(len(files))].read_bytes())
-    else:
-        start = int(rng.integers(len(data)))
-        stop = start + 1 if way == "flip" else start + int(rng.integers(1, 200))
-        for place in range(start, min(stop, len(data))):
-            data[place] ^= int(rng.integers(1, 256))
-    path.write_bytes(data)
-    return way, path
 
 
 def digests(root: Path) -> dict[str, str]:

@@ -168,8 +168,8 @@ def atomic_write(path: Path, content: str | bytes) -> None:
 def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
     """Add one line of JSON and flush it. A torn last line, left by a kill, is removed first.
 
-    Raises `NotFiniteError` if the record holds NaN or infinity, which JSON has not, and `ManipError` if the disk is full
-    or read-only.
+    Raises `NotFiniteError` if the record holds NaN or infinity, which JSON has not, and `ManipError` if the disk is
+    full or read-only.
     """
     try:
         line = json.dumps(dict(record), allow_nan=False, default=_plain)

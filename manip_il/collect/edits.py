@@ -63,7 +63,7 @@ def open_source(root: Path, robot: str | None = None) -> Source:
     spec = dataset.spec
     if spec.task == UNKNOWN_TASK:
         raise ManipError(
-            f"{root} does not name its task: {OURS} is missing; LeRobot's tools drop it: render or relabel first"
+            f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
     if not (spec.task in TASKS if robot else is_known(spec.robot, spec.task)):
         raise ManipError(

@@ -18,7 +18,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
 from manip_il.data.info import NUMBERS
 from manip_il.data.lerobot_layout import DATA_FILES, EPISODE_INDEX, INFO, STATS, write_json
-from manip_il.data.statistics import column_statistics
+from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, to_lists
 from manip_il.doctor import files, learning
 from manip_il.doctor.finding import Finding, Severity, by_journals, by_repair, journals_of
 from manip_il.errors import ManipError
@@ -128,15 +128,14 @@ def _recompute(root: Path) -> dict[str, Any]:
     """Return statistics of finite columns and, from some pictures, of cameras; empty if the stored ones are right."""
     if not any(finding.place.startswith(STATS) for finding in examine_folder(root)):
         return {}
-    dataset, stats = Dataset.open(root), dict[str, Any]()
+    dataset, stats = Dataset.open(root), Statistics()
+    rows = np.unique(np.linspace(0, len(dataset) - 1, _PICTURES).astype(np.int64))
     for key, feature in dataset.features.items():
         if feature.is_rgb:
-            rows = np.unique(np.linspace(0, len(dataset) - 1, _PICTURES).astype(np.int64))
-            values, shape = dataset.frames(key, rows).reshape(-1, 3) / 255, (3, 1, 1)
+            table = picture_statistics(dataset.frames(key, rows))
         elif feature.dtype in NUMBERS and np.isfinite(values := dataset.columns([key])[key]).all():
-            values, shape = values.reshape(-1, *feature.shape[-1:]), (-1,)
+            table = column_statistics({key: values.reshape(-1, feature.shape[-1])})[key]
         else:
             continue
-        table = {**column_statistics({key: values})[key], "count": np.array([len(dataset)])}
-        stats[key] = {name: one.reshape(shape if one.size > 1 else -1).tolist() for name, one in table.items()}
-    return stats
+        stats[key] = {**table, "count": np.array([len(dataset)])}
+    return to_lists(stats)

@@ -19,9 +19,10 @@ from manip_il import checks
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
+from manip_il.doctor.finding import journals_of
 from manip_il.errors import ManipError
 from manip_il.store.errors import redact
-from manip_il.store.manifest import CARD, CONFIG, Kind, journals_of, policy_folder
+from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
 
 PICTURE = "assets/episodes.png"
 _FRAMES, _EPISODES = 6, 50  # of each camera, whose paths are drawn

@@ -10,7 +10,6 @@ import glob
 import re
 import shutil
 from collections.abc import Collection, Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +41,9 @@ class Hub:
         self._place, self._revision, self._private = found[2], revision or found[3], private
         self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
         self.name = f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
+        self._api = HfApi(library_name="manip_il")
         if quiet:
             disable_progress_bars()
-
-    @cached_property
-    def _api(self) -> HfApi:
-        return HfApi(library_name="manip_il")
 
     def read(self) -> Manifest | None:
         """Return what readers see now; None without such a repository, or without the revision in it."""

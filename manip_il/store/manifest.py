@@ -13,6 +13,7 @@ from typing import Literal
 
 from manip_il import checks
 from manip_il.data.lerobot_layout import INFO
+from manip_il.doctor.finding import journals_of
 from manip_il.store.errors import RemoteError
 
 MANIFEST_FILE = "manip_il_manifest.json"
@@ -137,11 +138,6 @@ def datasets_in(folder: Path) -> list[Path]:
     """Return the datasets in a folder: itself, or those of a run's rounds."""
     found = [path.parents[1] for path in folder.rglob(INFO)]
     return sorted(root for root in found if not any(map(_LEFT_OUT.fullmatch, root.relative_to(folder).parts)))
-
-
-def journals_of(root: Path) -> Path:
-    """Return the folder of a dataset's journals, beside it."""
-    return root.absolute().with_name(f"{root.absolute().name}.{JOURNALS}")
 
 
 def newest(checkpoints: Path) -> str | None:

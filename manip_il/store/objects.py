@@ -32,7 +32,8 @@ _FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # of object
 _S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
 _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, "sftp": {}}
 _SFTP = re.compile(r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:\d{1,4}|:[1-5]\d{4})?/[^@]+")
-_AT_ONCE = 4  # files; s3fs holds as many parts of each in memory [50 MB]
+_AT_ONCE, _SMALL_AT_ONCE = 4, 10  # files; s3fs holds as many parts of large ones in memory, and has ten connections
+_SMALL = 10_000_000  # bytes of the largest file
 
 
 class Sftp(SFTPFileSystem):
@@ -112,7 +113,8 @@ class Objects:
             files, before = plan.manifest.files, plan.before.files if plan.before else {}
             missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
             sources = [str(plan.local[path]) for path in missing.values()]
-            self._fs.put(sources, [self._object(key) for key in missing], **self._how("push"))
+            how = self._how("push", max([files[path].size for path in missing.values()], default=0))
+            self._fs.put(sources, [self._object(key) for key in missing], **how)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
                     raise RemoteError(f"{plan.local[path]} was written to while it was pushed; push again after that")
@@ -126,12 +128,14 @@ class Objects:
         """Write objects to where their files belong in a folder; their hashes are not looked at."""
         with explained(f"pull from {self.name}"):
             sources = [self._object(manifest.files[path].sha256) for path in paths]
-            self._fs.get(sources, [str(folder / path) for path in paths], **self._how("pull"))
+            how = self._how("pull", max(manifest.files[path].size for path in paths))
+            self._fs.get(sources, [str(folder / path) for path in paths], **how)
 
-    def _how(self, what: str) -> dict[str, Any]:
+    def _how(self, what: str, largest: int) -> dict[str, Any]:
         """Return options of a transfer: a bar on a terminal, and how many files travel at once."""
         bar = TqdmCallback({"desc": what, "unit": " files", "disable": True if self._quiet else None})
-        return {"callback": bar, **({"batch_size": _AT_ONCE} if self._fs.async_impl else {})}
+        at_once = _SMALL_AT_ONCE if largest <= _SMALL else _AT_ONCE
+        return {"callback": bar, **({"batch_size": at_once} if self._fs.async_impl else {})}
 
     def _switch(self, new: Manifest, before: Manifest | None) -> None:
         """Replace the manifest if it is still `before`: S3 sees to that itself; elsewhere it is read just before."""

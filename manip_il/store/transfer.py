@@ -13,7 +13,7 @@ from manip_il.data import atomic
 from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.examine import examine_folder
-from manip_il.doctor.finding import NotWhole, Severity
+from manip_il.doctor.finding import NotWhole, Severity, journals_of
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.store.errors import RemoteError
 from manip_il.store.hub import Hub
@@ -26,13 +26,13 @@ from manip_il.store.manifest import (
     Manifest,
     Plan,
     datasets_in,
-    journals_of,
     list_files,
     newest,
 )
 from manip_il.store.objects import Objects
 
 TRIES = 2  # to fetch a file with the right hash
+_LARGE = 50_000_000  # bytes of a file that is written to the disk by itself; smaller ones all together
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")
 _OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
 
@@ -125,6 +125,8 @@ def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
         remote.fetch(manifest, wrong, folder)
         with ThreadPoolExecutor() as pool:
+            # large ones go to the disk while they are hashed, which takes as long
+            pool.map(atomic.sync, [folder / path for path in wrong if manifest.files[path].size >= _LARGE])
             fits = pool.map(lambda path: manifest.files[path].fits(folder / path), wrong)
             wrong = [path for path, is_right in zip(wrong, fits, strict=True) if not is_right]
         if not wrong:

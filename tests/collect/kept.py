@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from manip_il.collect.edits import label_episode
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import journal_of
 from manip_il.data.journal import Journal, list_episodes
 from manip_il.mdp import Episode
+from manip_il.sim.config import EnvConfig
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -21,6 +24,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
     """Seed -> column -> bytes."""
     return {e.seed: {key: column.tobytes() for key, column in e.columns.items()} for e in episodes}
+
+
+def label_all(piece: tuple[EnvConfig, Episode]) -> dict[str, Any]:
+    """Labels of an episode's states, the last one first."""
+    env, episode = piece
+    backwards = replace(episode, columns={key: column[::-1] for key, column in episode.columns.items()})
+    return {key: column[::-1] for key, column in label_episode(env, backwards).items()}
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache, lru_cache
 
@@ -23,7 +21,7 @@ from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
 
 from ..scenes import sizes_of, started
-from ..tables import SCENES, every_robot, every_scene, every_scene_with_a_cube
+from ..tables import every_robot, every_scene, every_scene_with_a_cube
 
 DRIVERS = ("expert", "random", "varied")  # the last is the expert with cubes of many sizes
 STEEPEST = 50.0  # change of a joint target per change of the object's position [rad/m]
@@ -81,36 +79,6 @@ def test_a_label_read_off_a_running_world_is_that_of_its_state(robot: str, task:
     for step in run_steps(job, [ManipEnv.of(config, None, conditions)], stream_seeds("certificate", 2)):
         assert step.label is not None
         assert written(step.label) == written(expert.label(step.state))
-
-
-IN_ANOTHER_PROCESS = """
-import sys
-import numpy as np
-from manip_il.collect.expert import Expert
-from manip_il.mdp import State
-from manip_il.sim.scene import build_scene
-for pair in sys.argv[2:]:
-    expert = Expert(build_scene(*pair.split()))
-    labels = [expert.label(State.from_vector(row)) for row in np.load(f"{sys.argv[1]}/{pair} states.npy")][::-1]
-    answers = [[*label.action, label.residual, label.phase, label.valid] for label in labels]
-    np.save(f"{sys.argv[1]}/{pair} labels.npy", answers)
-"""
-
-
-@pytest.mark.slow
-def test_another_process_answers_the_same_bits_in_another_order(tmp_path):
-    here: dict[str, np.ndarray] = {}
-    for robot, task in SCENES:
-        expert = expert_of(robot, task)
-        states = [state for driver in DRIVERS for state in visited_states(robot, task, driver)]
-        labels = [expert.label(state) for state in states]
-        here[f"{robot} {task}"] = np.array(
-            [[*label.action, label.residual, label.phase, label.valid] for label in labels]
-        )
-        np.save(tmp_path / f"{robot} {task} states.npy", [state.to_vector() for state in states[::-1]])
-    subprocess.run([sys.executable, "-c", IN_ANOTHER_PROCESS, tmp_path, *here], check=True)
-    for pair, labels in here.items():
-        assert np.load(tmp_path / f"{pair} labels.npy").tobytes() == labels.tobytes()
 
 
 @pytest.mark.parametrize("driver", DRIVERS)

@@ -80,23 +80,12 @@ def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: Ro
         is_the_experts(episode)
         for part in parts(episode):
             columns = fitted_columns(part, env_spec(ENV))
-            assert [set(columns[key]) for key in ("seed", "round", "beta")] == [
-                {episode.seed},
-                {job.round},
-                {job.driver.beta},
-            ]
+            wanted = {"seed": episode.seed, "round": job.round, "beta": job.driver.beta}
+            assert {key: set(columns[key]) for key in wanted} == {key: {one} for key, one in wanted.items()}
     bits = written(together.values())
     assert len({columns["executed_action"] for columns in bits.values()}) == len(SEEDS)
     assert written(job.run(SEEDS[2:3])) == {SEEDS[2]: bits[SEEDS[2]]}
     assert written(replace(job, batch=1).run(SEEDS[::-1])) == bits
-
-
-def test_where_the_expert_was_not_queried_the_label_is_not_to_be_learnt_from(job: RolloutJob):
-    for episode in run(replace(job, query=Query("probability", 0.3))).values():
-        queried, columns = labelled(episode), episode.columns
-        assert 0 < queried.sum() < len(episode)
-        assert (columns["expert_phase"].ravel()[~queried] == 0).all()
-        np.testing.assert_array_equal(columns["action"][~queried], columns["executed_action"][~queried])
 
 
 def test_one_query_an_episode_is_one_label(job: RolloutJob):
@@ -105,14 +94,15 @@ def test_one_query_an_episode_is_one_label(job: RolloutJob):
     assert len({int(np.argmax(one)) for one in queried}) > 1
 
 
-def test_gates_do_not_change_what_the_learner_does(job: RolloutJob):
+@pytest.mark.parametrize("query", [Query("probability", 0.3), SAFETY])
+def test_a_rule_changes_nothing_but_where_there_are_labels(job: RolloutJob, query: Query):
     free = run(job)
-    for episode in run(replace(job, query=SAFETY)).values():
-        alone = free[episode.seed].columns
-        np.testing.assert_array_equal(episode.columns["executed_action"], alone["executed_action"])
-        gap = np.abs(np.subtract(alone["action"], alone["executed_action"])) / [*[0.25] * 7, 0.08]
-        assert (labelled(episode) <= labelled(free[episode.seed])).all()
-        assert gap[labelled(episode)].max(axis=1).min() > 0.1
+    for episode in run(replace(job, query=query)).values():
+        columns, alone, queried = episode.columns, free[episode.seed].columns, labelled(episode)
+        np.testing.assert_array_equal(columns["executed_action"], alone["executed_action"])
+        assert (queried <= labelled(free[episode.seed])).all()
+        assert (columns["expert_phase"].ravel()[~queried] == 0).all()
+        np.testing.assert_array_equal(columns["action"][~queried], columns["executed_action"][~queried])
 
 
 def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJob):
@@ -127,11 +117,6 @@ def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJo
         assert (columns["actor"] == Actor.EXPERT).all()
         np.testing.assert_array_equal(columns["executed_action"], columns["action"])
         assert len(recovery) >= ENV.horizon  # the expert has a horizon of its own
-
-
-def test_an_expert_that_takes_over_solves_what_it_took_over(job: RolloutJob):
-    episodes = run(replace(job, env=EnvConfig(), label="takeover", query=ONE, hold=3))
-    assert all(episode.success for episode in episodes.values())
 
 
 def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJob):
@@ -155,10 +140,7 @@ def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJo
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            {"driver": ExpertDriver(), "label": "takeover"},
-            "takes over from a policy; this .* driven by 'expert'",
-        ),
+        ({"driver": ExpertDriver(), "label": "takeover"}, "takes over from a policy; this .* driven by 'expert'"),
         ({"query": Query("ensemble", 0.1)}, "needs other policies to disagree with"),
         ({"query": Query("likelihood", 0.0)}, "needs a policy with a likelihood"),
     ],

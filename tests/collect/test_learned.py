@@ -16,9 +16,6 @@ from lerobot.policies.factory import make_pre_post_processors
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.workers import Engine
-from manip_il.data.journal import Journal, list_episodes, read_journal
-from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Origin
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, Look
@@ -61,34 +58,21 @@ def lerobots_rollout(checkpoint: Path, seed: int, cameras: CameraConfig | None =
     return np.array(actions)
 
 
-def test_a_rollout_is_lerobots_own_loop_to_the_bit(act):
-    job = RolloutJob(ENV, PolicyDriver((act,)), label="last")
-    for episode in job.run(SEEDS[:2]):
-        assert np.array_equal(episode.columns["executed_action"], lerobots_rollout(act, episode.seed))
+@pytest.mark.parametrize(("name", "cameras"), [("act", None), pytest.param("seeing", DIM, marks=pytest.mark.gl)])
+def test_a_rollout_is_lerobots_own_loop_to_the_bit(name, cameras, request):
+    policy = request.getfixturevalue(name)
+    for episode in RolloutJob(ENV, PolicyDriver((policy,)), label="last").run(SEEDS[:2]):
+        assert np.array_equal(episode.columns["executed_action"], lerobots_rollout(policy, episode.seed, cameras))
+        if cameras:
+            bright = lerobots_rollout(policy, episode.seed, replace(cameras, look=Look()))
+            assert not np.array_equal(episode.columns["executed_action"], bright)
 
 
 @pytest.mark.gl
-def test_a_policy_sees_the_pictures_that_lerobot_would_show_it(seeing):
-    [episode] = RolloutJob(ENV, PolicyDriver((seeing,)), label="last").run(SEEDS[:1])
-    assert np.array_equal(episode.columns["executed_action"], lerobots_rollout(seeing, SEEDS[0], DIM))
-    bright = lerobots_rollout(seeing, SEEDS[0], replace(DIM, look=Look()))
-    assert not np.array_equal(episode.columns["executed_action"], bright)
-
-
-@pytest.mark.gl
-def test_pictures_are_kept_where_they_are_recorded_and_only_there(seeing, tmp_path):
+def test_pictures_are_kept_where_they_are_recorded_and_only_there(seeing):
     job = RolloutJob(ENV, PolicyDriver((seeing,), 0.5))
-    keep = Journal(tmp_path, env_spec(ENV), env_fingerprint(ENV))
-    episodes = list(Engine(1).run(job, SEEDS[:2], keep))
+    episodes = list(job.run(SEEDS[:2]))
     assert not [key for episode in episodes for key in episode.columns if key.startswith("observation.images")]
-    assert [read_journal(path)[1].seed for path in list_episodes(tmp_path)] == list(SEEDS[:2])
-    both = replace(DIM, names=("wrist", "front"))
-    recorded = list(replace(job, cameras=both).run(SEEDS[:2]))
+    recorded = list(replace(job, cameras=replace(DIM, names=("wrist", "front"))).run(SEEDS[:2]))
     assert recorded[0].columns["observation.images.wrist"].shape == (8, 32, 32, 3)
     assert written(episode.without_pictures() for episode in recorded) == written(episodes)
-
-
-def test_a_policy_for_another_robot_is_refused_before_the_first_step(act, monkeypatch):
-    monkeypatch.setattr(ManipEnv, "advance", None)
-    with pytest.raises(MismatchError, match=r"width of observation\.environment_state"):
-        list(RolloutJob(EnvConfig("fetch", "lift"), PolicyDriver((act,))).run(SEEDS[:1]))

@@ -14,7 +14,7 @@ from manip_il.collect.record import collect, collect_successes, journal_of, reco
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, build
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import Journal, list_episodes, read_journal
+from manip_il.data.journal import Journal, list_episodes, list_seeds
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
@@ -45,35 +45,20 @@ class Recorded(Engine):
             yield episode
 
 
-def names(folder: Path) -> list[int]:
-    return [read_journal(path)[1].seed for path in list_episodes(folder)]
-
-
 def contents(folder: Path) -> list[bytes]:
     return [path.read_bytes() for path in list_episodes(folder)]
 
 
-def test_what_is_there_is_not_run_again(tmp_path):
-    list(collect(Recorded(), JOB, SEEDS[:2], tmp_path))
-    engine = Recorded()
-    assert len(list(collect(engine, JOB, SEEDS[:4], tmp_path))) == 4
-    assert engine.asked == list(SEEDS[2:4])
-
-
-def test_an_episode_is_on_disk_before_anybody_hears_of_it(tmp_path):
+def test_what_is_there_is_not_run_again_and_what_came_is_on_disk_before_anybody_hears_of_it(tmp_path):
     def stop(episode: Episode) -> None:
-        assert episode.seed in names(tmp_path)
+        assert list_seeds(tmp_path) == [episode.seed]
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         list(collect(Recorded(), JOB, SEEDS[:3], tmp_path, stop))
-    assert len(names(tmp_path)) == 1
-
-
-def test_a_failed_demonstration_is_replaced_by_the_next_seeds(tmp_path):
-    failing = [SEEDS[0], SEEDS[2], SEEDS[4]]
-    found = collect_successes(Recorded(failing), JOB, SEEDS, 4, tmp_path)
-    assert [episode.seed for _, episode in found] == list(SEEDS[:7])
+    engine = Recorded()
+    assert len(list(collect(engine, JOB, SEEDS[:4], tmp_path))) == 4
+    assert engine.asked == list(SEEDS[1:4])
 
 
 def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
@@ -91,21 +76,17 @@ class Shuffled(Recorded):
 def test_journals_come_in_the_order_of_the_seeds_and_a_lost_one_is_named(tmp_path, caplog):
     found = list(collect(Shuffled(), JOB, SEEDS[:5], tmp_path))
     assert [episode.seed for _, episode in found] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
-    assert [record.getMessage() for record in caplog.records] == [
-        f"seed {SEEDS[2]} is left out: it repeatedly killed its worker"
-    ]
+    assert f"seed {SEEDS[2]} is left out" in caplog.text
 
 
 def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
     assert journal_of(tmp_path, JOB).prepare() == []
     list(collect(Recorded(), JOB, SEEDS[:1], tmp_path))
     assert journal_of(tmp_path, JOB).prepare() == []
-    with pytest.raises(MismatchError, match=r"robot.*fetch.*panda"):
-        journal_of(tmp_path, RolloutJob(EnvConfig("panda", "reach"))).prepare()
-    with pytest.raises(MismatchError, match=r"cameras.*\(\).*front"):
-        journal_of(tmp_path, replace(JOB, cameras=CameraConfig(("front",)))).prepare()
-    warnings = journal_of(tmp_path, RolloutJob(EnvConfig("fetch", "reach", tolerance=0.05))).prepare()
-    assert len(warnings) == 1
+    for other in (replace(JOB, env=EnvConfig("panda", "reach")), replace(JOB, cameras=CameraConfig(("front",)))):
+        with pytest.raises(MismatchError):
+            journal_of(tmp_path, other).prepare()
+    assert len(journal_of(tmp_path, replace(JOB, env=EnvConfig("fetch", "reach", tolerance=0.05))).prepare()) == 1
 
 
 def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog):
@@ -118,8 +99,7 @@ def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog
     assert [episode.seed for _, episode in collect(engine, JOB, SEEDS[:4], tmp_path)] == list(SEEDS[:4])
     assert contents(tmp_path)[:3] == whole
     assert engine.asked == [SEEDS[3], SEEDS[1]]
-    [record] = caplog.records
-    assert f"{damaged} is not a complete episode" in record.getMessage()
+    assert f"{damaged} is not a complete episode" in caplog.text
     assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
 
 

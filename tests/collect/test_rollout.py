@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 
 import numpy as np
 import pytest
@@ -15,16 +14,20 @@ GOAL = 3.0
 
 
 class Counter:
-    """A number that actions add to; solved from `GOAL` on. It starts at minus the seed's last digit."""
+    """A number that actions add to; solved from `GOAL` on. Before step `kick` it is set back by 5.
 
-    def __init__(self) -> None:
-        self.x, self.steps = 0.0, 0
+    noise: added to every action. stuck: progress grows by a tenth a step up to this one, then by less than counts, and
+    nothing is solved.
+    """
+
+    world, task_description = None, ""
+
+    def __init__(self, kick: int = -1, noise: float = 0.0, stuck: int | None = None) -> None:
+        self.x, self.steps, self.kick, self.noise, self.stuck = 0.0, 0, kick, noise, stuck
 
     @property
     def solved(self) -> bool:
-        return self.x >= GOAL
-
-    world, task_description = None, ""
+        return self.x >= GOAL and self.stuck is None
 
     @property
     def reward(self) -> float:
@@ -32,58 +35,26 @@ class Counter:
 
     @property
     def progress(self) -> float:
+        if self.stuck is not None:
+            return 0.1 * min(self.steps, self.stuck) + 1e-6 * self.steps
         return min(1.0, max(0.0, self.x / GOAL))
 
     def start(self, seed: int) -> None:
-        self.x, self.steps = -float(seed % 10), 0
+        self.x, self.steps = 0.0, 0
 
     def begin_step(self) -> None:
-        """Nothing disturbs it."""
+        self.x -= 5.0 * (self.steps == self.kick)
 
     def advance(self, action: np.ndarray) -> np.ndarray:
-        self.x += float(action[0])
+        self.x += float(action[0]) + self.noise
         self.steps += 1
-        return action
+        return action + self.noise if self.noise else action
 
     def observe(self) -> Observation:
         return Observation(np.array([self.x], np.float32), np.array([self.steps], np.float32))
 
     def get_state(self) -> State:
-        return State(np.array([self.x]), np.empty(0), self.steps)
-
-    def set_state(self, state: State) -> None:
-        self.x, self.steps = float(state.physics[0]), state.step
-
-
-class Kicked(Counter):
-    """Its number is set back by 5 before one step, and every action is off by a tenth."""
-
-    def __init__(self, at: int):
-        super().__init__()
-        self._at = at
-
-    def begin_step(self) -> None:
-        if self.steps == self._at:
-            self.x -= 5.0
-
-    def advance(self, action: np.ndarray) -> np.ndarray:
-        return super().advance(action + 0.1)
-
-
-class Slowing(Counter):
-    """Its progress grows by a tenth a step, and from one step on by less than counts."""
-
-    def __init__(self, until: int):
-        super().__init__()
-        self._until = until
-
-    @property
-    def solved(self) -> bool:
-        return False
-
-    @property
-    def progress(self) -> float:
-        return 0.1 * min(self.steps, self._until) + 1e-6 * self.steps
+        return State(np.array([self.x]), np.zeros(0), step=self.steps)
 
 
 class Ones:
@@ -117,13 +88,8 @@ def always(turns: Sequence[Turn], actions: Sequence[np.ndarray]) -> list[bool]:
     return [True] * len(turns)
 
 
-def episodes(transitions) -> dict[int, list[Transition]]:
-    frames = sorted(transitions, key=lambda t: (t.seed, t.step))
-    return {seed: list(group) for seed, group in groupby(frames, key=lambda t: t.seed)}
-
-
-def one_episode(env: Counter, driver, rules: Rules, gate=always) -> list[Transition]:
-    return list(rollout([env], [0], driver, rules, Ones(), gate))
+def one_episode(env: Counter, driver, rules: Rules, gate=always, expert: Ones | None = None) -> list[Transition]:
+    return list(rollout([env], [0], driver, rules, expert or Ones(), gate))
 
 
 def test_a_frame_holds_what_was_before_the_step_and_what_came_of_it():
@@ -134,40 +100,37 @@ def test_a_frame_holds_what_was_before_the_step_and_what_came_of_it():
     assert [(frame.success, frame.reward) for frame in frames] == [(False, 0), (False, 0), (True, 1), (True, 1)]
 
 
-@pytest.mark.parametrize(("hold", "length"), [(0, 3), (2, 5), (None, 30)])
-def test_hold_ends_an_episode_that_long_after_success(hold: int | None, length: int):
-    frames = one_episode(Counter(), follow, Rules(30, hold))
+@pytest.mark.parametrize(
+    ("env", "rules", "length"),
+    [
+        (Counter(), Rules(30, hold=0), 3),
+        (Counter(), Rules(30, hold=2), 5),  # so long after success
+        (Counter(kick=4), Rules(30, hold=3), 6),  # also if it is lost again
+        (Counter(), Rules(30), 30),
+        (Counter(stuck=5), Rules(30, patience=3), 9),  # so long after its last progress
+        (Counter(stuck=5), Rules(30), 30),
+    ],
+)
+def test_an_episode_ends_by_its_rules(env: Counter, rules: Rules, length: int):
+    frames = one_episode(env, follow, rules)
     assert [frame.done for frame in frames] == [False] * (length - 1) + [True]
-
-
-@pytest.mark.parametrize(("patience", "length"), [(3, 9), (None, 30)])
-def test_an_episode_ends_that_long_after_its_last_progress(patience: int | None, length: int):
-    frames = one_episode(Slowing(5), Halves(), Rules(30, patience=patience))
-    assert [frame.done for frame in frames] == [False] * (length - 1) + [True]
-
-
-def test_an_episode_goes_on_to_its_end_where_success_is_lost_again():
-    frames = one_episode(Kicked(4), follow, Rules(30, hold=3))
-    assert [frame.success for frame in frames] == [False, False, True, True, False, False]
 
 
 @pytest.mark.parametrize("steps", [[0, 1, 2, 3], [3], []])
 def test_the_expert_is_queried_where_the_gate_says(steps: list[int]):
     expert = Ones()
-    chosen = rollout(
-        [Counter()], [0], Halves(), Rules(4), expert, lambda turns, _: [one.step in steps for one in turns]
-    )
-    assert expert.queried == [frame.step for frame in chosen if frame.label is not None] == steps
+    frames = one_episode(Counter(), Halves(), Rules(4), lambda turns, _: [one.step in steps for one in turns], expert)
+    assert expert.queried == [frame.step for frame in frames if frame.label is not None] == steps
 
 
 def test_an_expert_that_takes_over_drives_to_the_end_and_leaves_the_others_alone():
     def gate(turns, actions):
         return [(turn.seed, turn.step) == (1, 2) for turn in turns]
 
-    learner, rules = Halves(), Rules(5, takeover=True)
-    found = episodes(rollout([Counter(), Counter()], [0, 1], learner, rules, Ones(), gate))
-    assert [frame.actor for frame in found[0]] == [Actor.LEARNER] * 5
-    assert [frame.actor for frame in found[1]] == [Actor.LEARNER] * 2 + [Actor.EXPERT] * 3
+    learner = Halves()
+    frames = list(rollout([Counter(), Counter()], [0, 1], learner, Rules(5, takeover=True), Ones(), gate))
+    actors = {seed: [frame.actor for frame in frames if frame.seed == seed] for seed in (0, 1)}
+    assert actors == {0: [Actor.LEARNER] * 5, 1: [Actor.LEARNER] * 2 + [Actor.EXPERT] * 3}
     assert learner.rows == [2, 2, 2, 1, 1]
 
 
@@ -175,8 +138,8 @@ def test_an_expert_that_takes_over_drives_to_the_end_and_leaves_the_others_alone
     ("env", "driver", "executed", "actor"),
     [
         (Counter(), Halves(), 0.5, Actor.LEARNER),
-        (Kicked(99), Halves(), 0.6, Actor.LEARNER),
-        (Kicked(99), follow, 1.1, Actor.NOISY_EXPERT),  # as its action is changed on its way
+        (Counter(noise=0.1), Halves(), 0.6, Actor.LEARNER),
+        (Counter(noise=0.1), follow, 1.1, Actor.NOISY_EXPERT),  # as its action is changed on its way
     ],
 )
 def test_the_label_is_the_experts_whoever_drove(env, driver, executed: float, actor: Actor):

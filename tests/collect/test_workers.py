@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,18 +12,15 @@ import ray
 from kept import DeadlyJournal, contents, written
 from ray.cluster_utils import Cluster
 
-import manip_il
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
+from manip_il.collect.ray_pool import run_there
 from manip_il.collect.record import journal_of
 from manip_il.collect.workers import Engine, split
 from manip_il.data.journal import list_seeds
 from manip_il.errors import ManipError, UsageError
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
-
-from ..faults.child import living
-from ..test_child_processes import wait_for
 
 SEEDS = stream_seeds("certificate", 8)
 JOB = RolloutJob(EnvConfig("fetch", "reach"), hold=3)
@@ -139,35 +133,6 @@ def test_nodes_come_and_go(cluster, tmp_path, expected):
 
 
 @pytest.mark.slow
-def test_a_node_with_another_version_is_one_line(cluster, tmp_path, monkeypatch):
-    (tmp_path / "manip_il").mkdir()
-    stub = f'__version__ = "0.0.0"\n__path__ = {manip_il.__path__!r}\n'
-    (tmp_path / "manip_il" / "__init__.py").write_text(stub)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    node = cluster.add_node(num_cpus=4)
-    cluster.wait_for_nodes()
-    with Engine(6, "ray") as engine, pytest.raises(ManipError, match=r"has manip_il 0\.0\.0, not") as caught:
-        list(engine.run(JOB, stream_seeds("certificate", 40)))
-    cluster.remove_node(node)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-def test_workers_end_with_the_process_that_started_them():
-    code = (
-        "from multiprocessing import forkserver, resource_tracker\n"
-        "from manip_il.collect.workers import Engine\n"
-        "from manip_il.collect.job import RolloutJob\n"
-        "from manip_il.sim.env import EnvConfig\n"
-        "engine = Engine(2)\n"
-        "for episode in engine.run(RolloutJob(EnvConfig()), range(1000)):\n"
-        "    pids = list(engine._pool._pool._processes)\n"
-        "    pids += [forkserver._forkserver._forkserver_pid, resource_tracker._resource_tracker._pid]\n"
-        "    print(pids, flush=True)\n"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, start_new_session=True)
-    assert parent.stdout is not None
-    pids = [int(pid) for pid in parent.stdout.readline().strip("[]\n").split(",")]
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
-    wait_for(lambda: not set(pids) & set(living(parent.pid)))
+def test_a_node_with_another_version_is_one_line(cluster):
+    with pytest.raises(ManipError, match=r"has manip_il .*, not 0\.0\.0"):
+        run_there("0.0.0", JOB, SEEDS[:1], None)

@@ -10,19 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zstandard
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, DataEnd, Footer, Header
-from mcap.writer import MCAP0_MAGIC
 
 from manip_il.data.journal import Journal
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS, RobotTaskSpec
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS
 from manip_il.errors import ManipError
-from manip_il.mcap.importing import import_files, list_files, pick, read_frames
+from manip_il.mcap.importing import import_files, pick, read_frames
 from manip_il.mcap.mapping import Source
 
 from ..damage import digests
@@ -35,15 +31,15 @@ STEADY = range(0, 1000, 100)
 
 def test_topics_of_other_rates_meet_on_the_datasets_clock(tmp_path: Path) -> None:
     fast, slow, whole = range(0, 1001, 10), range(45, 900, 50), range(5, 990, 7)
-    topics = {"/fast": ramp(fast), "/slow": ramp(slow), "/whole": [(s, {"x": s}) for s in whole], "/rest": ramp([0])}
-    path = write(tmp_path / "a.mcap", topics)
+    path = write(
+        tmp_path / "a.mcap", {"/fast": ramp(fast), "/slow": ramp(slow), "/whole": [(s, {"x": s}) for s in whole]}
+    )
     held = feature("/whole", resample="previous", dtype="int64")
     rows = list(read_frames(path, load(tmp_path, {"near": feature("/fast"), "same": feature("/slow"), "held": held})))
     times = list(range(45, 896, 100))  # from the latest first message to the earliest last one
     assert [row["same"].item() for row in rows] == times
     assert [row["near"].item() for row in rows] == [time - 5 for time in times]  # the earlier of two
     assert [row["held"].item() for row in rows] == [max(s for s in whole if s <= time) for time in times]
-    assert {row["task"] for row in rows} == {"t"}
 
 
 def test_messages_out_of_order_are_sorted_and_the_last_one_of_a_stamp_counts(tmp_path: Path) -> None:
@@ -66,19 +62,16 @@ def png(number: int) -> CompressedImage:
     return CompressedImage(format="png", data=encoded(picture(number)))
 
 
-def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path) -> None:
-    stamps = [*range(0, 500, 33), 495]  # the last one twice
+def test_pictures_come_in_pixel_for_pixel(tmp_path: Path) -> None:
     kinds: dict[str, Any] = {"raw": raw, "bgr": lambda n: raw(n, "bgr8"), "png": png}
+    stamps = (0, 100, 100, 200)  # of equal ones the last one counts
     topics = {f"/{name}": [(stamp, make(n)) for n, stamp in enumerate(stamps)] for name, make in kinds.items()}
-    path = write(tmp_path / "a.mcap", {"/a": ramp(range(0, 500, 99)), **topics})
     camera = {"resample": "nearest", "tolerance": 0.02, "video": False}
-    features = {"a": feature(tolerance=0.05), **{name: {**camera, "topic": f"/{name}"} for name in kinds}}
-    rows = list(read_frames(path, load(tmp_path, features, fps=200 / 33)))
-    assert len(rows) == 4
-    for frame, row in enumerate(rows):
-        wanted = len(stamps) - 1 if frame == 3 else 5 * frame
+    mapping = load(tmp_path, {name: {**camera, "topic": f"/{name}"} for name in kinds})
+    rows = list(read_frames(write(tmp_path / "a.mcap", topics), mapping))
+    for row, number in zip(rows, (0, 2, 3), strict=True):
         for name in kinds:
-            np.testing.assert_array_equal(row[name], picture(wanted))
+            np.testing.assert_array_equal(row[name], picture(number))
 
 
 @pytest.mark.parametrize(
@@ -86,7 +79,6 @@ def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path) -> None:
     [
         (ramp([0, 100, 400, 500]), {}, r"topic /a, f: a gap at 0\.2 s .*nearest allows 0\.02 s: raise its tolerance"),
         ([(0, {"x": "1"})], {}, r"topic /a, f at 0 ns: \['1'\]; expected float64"),
-        ([(0, {"x": 1}), (100, {"x": float("nan")})], {}, r"f at 100000000 ns: \[nan\]; expected finite numbers"),
         ([(0, {"x": 1e39})], {"dtype": "float32"}, r"\[1e\+39\]; expected finite numbers of float32"),
         ([(0, {"x": 1.5})], {"dtype": "int64"}, r"\[1.5\]; expected finite numbers of int64"),
         ([(0, {"x": [1, 2]})], {"names": ["a"]}, "f at 0 ns: 2 values; expected 1"),
@@ -95,9 +87,7 @@ def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path) -> None:
         (ramp(STEADY), {"topic": "/late"}, r"/steady ends 4\.1 s before /late starts"),
     ],
 )
-def test_what_cannot_be_is_refused_by_file_topic_and_time(
-    tmp_path: Path, messages: Messages, changes: dict[str, Any], why: str
-) -> None:
+def test_what_cannot_be_is_refused_by_file_topic_and_time(tmp_path, messages: Messages, changes, why: str) -> None:
     path = write(tmp_path / "bad.mcap", {"/a": messages, "/steady": ramp(STEADY), "/late": ramp([5000, 5100])})
     steady = {"g": feature("/steady")} if "topic" in changes else {}
     with pytest.raises(ManipError, match=rf"bad\.mcap.*{why}"):
@@ -108,13 +98,10 @@ def test_what_cannot_be_is_refused_by_file_topic_and_time(
     ("message", "encoding", "why"),
     [
         (raw(0, "mono8"), "", "topic /a at 0 ns: a picture encoded as 'mono8'; expected rgb8 or bgr8"),
-        (CompressedImage(format="png", data=b"no"), "", "topic /a at 0 ns: it is not a PNG or JPEG"),
         ({"x": 1}, "cdr", r"messages are cdr .*expected protobuf, json or cdr .*ROS 2: pip install mcap-ros2-support"),
     ],
 )
-def test_what_is_no_picture_or_of_another_encoding_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Any, encoding: str, why: str
-) -> None:
+def test_what_is_no_picture_or_of_another_encoding_is_refused(tmp_path, monkeypatch, message, encoding, why) -> None:
     monkeypatch.setattr("manip_il.mcap.read.find_spec", lambda name: None)  # mcap-ros2-support may be installed
     path = write(tmp_path / "p.mcap", {"/a": [(0, message)]}, encoding)
     mapping = load(tmp_path, {"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
@@ -122,9 +109,7 @@ def test_what_is_no_picture_or_of_another_encoding_is_refused(
         list(read_frames(path, mapping))
 
 
-def test_our_journals_come_in_by_a_mapping_of_their_topics(
-    tmp_path: Path, make_episode: MakeEpisode, spec: RobotTaskSpec
-) -> None:
+def test_our_journals_come_in_by_a_mapping_of_their_topics(tmp_path, make_episode: MakeEpisode, spec) -> None:
     episode = make_episode(3, 6)
     path = Journal(tmp_path, spec, {}).write(episode)
     places = [f"transforms[child_frame_id=ee].translation.{axis}" for axis in "xyz"]
@@ -140,34 +125,12 @@ def test_our_journals_come_in_by_a_mapping_of_their_topics(
     np.testing.assert_array_equal([row["place"] for row in rows], episode.columns[ENVIRONMENT_STATE][:, :3])
 
 
-def test_files_are_taken_in_the_order_of_their_names(tmp_path: Path) -> None:
-    for name in ("b.mcap", "a.mcap", ".c.mcap", "d.txt"):
-        (tmp_path / name).touch()
-    assert [path.name for path in list_files(tmp_path)] == ["a.mcap", "b.mcap"]
-
-
-@pytest.mark.slow
-def test_a_file_that_would_fill_the_memory_is_refused_in_one_line(tmp_path: Path) -> None:
-    packer, size = zstandard.ZstdCompressor().compressobj(), 8 * 1024**3
-    packed = b"".join(packer.compress(bytes(2**26)) for _ in range(size // 2**26)) + packer.flush()
-    builder = RecordBuilder()
-    for record in (Header("", ""), Chunk("zstd", packed, 0, 0, 0, size), DataEnd(0), Footer(0, 0, 0)):
-        record.write(builder)
-    path = tmp_path / "bomb.mcap"
-    path.write_bytes(MCAP0_MAGIC + builder.end() + MCAP0_MAGIC)
-    with pytest.raises(ManipError, match=r"bomb\.mcap cannot be opened in 4 GB of memory and 120 s"):
-        list(import_files([path], tmp_path / "new", load(tmp_path, {"f": feature()})))
-    assert not (tmp_path / "new").exists()
-
-
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)
 
 
 @settings(max_examples=300)
 @given(st.sampled_from(["nearest", "previous"]), stamp_lists, stamp_lists, st.integers(0, 20))
-def test_every_frame_gets_what_a_full_search_finds(
-    method: Any, stamps: list[int], later: list[int], tolerance: int
-) -> None:
+def test_every_frame_gets_what_a_full_search_finds(method: Any, stamps, later, tolerance: int) -> None:
     times = [stamps[0] + time for time in later]
     near = [min(stamps, key=lambda stamp: (abs(stamp - time), stamp)) for time in times]
     before = [max(stamp for stamp in stamps if stamp <= time) for time in times]
@@ -183,26 +146,17 @@ def test_every_frame_gets_what_a_full_search_finds(
         assert [stamps[number] for number in pick("f", source, *arrays)] == wanted
 
 
-IMPORT = """
-import sys
-from pathlib import Path
-from manip_il.mcap.importing import import_files
-from manip_il.mcap.mapping import load_mapping
-source, target = map(Path, sys.argv[1:])
-list(import_files([source / "a.mcap"] * 2, target, load_mapping(source / "m.yaml")))
-"""
-
-
 @pytest.mark.slow
 def test_two_imports_give_the_same_bytes(tmp_path: Path) -> None:
     big = np.zeros((64, 64, 3), np.uint8)
     pictures = [(stamp, CompressedImage(format="png", data=encoded(big + stamp // 10))) for stamp in STEADY]
-    write(tmp_path / "a.mcap", {"/a": ramp(STEADY), "/c": pictures})
+    path = write(tmp_path / "a.mcap", {"/a": ramp(STEADY), "/c": pictures})
     camera = {"topic": "/c", "resample": "nearest", "tolerance": 0.02}
     stills, film = {**camera, "video": False}, {**camera, "video": True}
     load(tmp_path, {"action": feature(), "observation.images.a": stills, "observation.images.b": film})
     for seed in ("1", "2"):  # of the order of sets
-        command = [sys.executable, "-c", IMPORT, str(tmp_path), str(tmp_path / seed)]
+        words = ["data", "from-mcap", str(path), str(tmp_path / seed), f"--mapping={tmp_path}/m.yaml"]
+        command = [sys.executable, "-m", "manip_il.cli.main", *words]
         subprocess.run(command, check=True, env={**os.environ, "PYTHONHASHSEED": seed})
     assert digests(tmp_path / "1") == digests(tmp_path / "2")
 
@@ -212,9 +166,7 @@ def test_two_imports_give_the_same_bytes(tmp_path: Path) -> None:
     ("damage", "why"),
     [(False, r"shape of 'f' differs: .*b\.mcap has \(3,\), .*a\.mcap has \(2,\)"), (True, r"cannot read .*b\.mcap: .")],
 )
-def test_a_file_that_is_cut_or_does_not_fit_the_first_one_leaves_nothing(
-    tmp_path: Path, damage: bool, why: str
-) -> None:
+def test_a_file_that_is_cut_or_does_not_fit_the_first_one_leaves_nothing(tmp_path, damage: bool, why: str) -> None:
     first = write(tmp_path / "a.mcap", {"/a": [(0, {"x": [1, 2]})]})
     second = write(tmp_path / "b.mcap", {"/a": [(0, {"x": [1, 2, 3]})]})
     if damage:

@@ -48,19 +48,17 @@ class Refused(Exception):
 
 
 class Hub:
-    """Repositories by name (`datasets/user/name`), objects by sha256, and the requests so far."""
+    """Repositories by name (`datasets/user/name`), and objects by sha256."""
 
     def __init__(self) -> None:
         self.repos: dict[str, Repo] = {}
         self.objects: dict[str, bytes] = {}
-        self.requests: list[str] = []
         self.change: Callable[[str, bytes], bytes] = lambda line, body: body  # of what goes out
         self.lock = threading.Lock()
         self.url = ""
 
     def answer(self, method: str, target: str, token: str | None, body: bytes) -> tuple[int, Any, dict[str, str]]:
         """Return status, content and headers."""
-        self.requests.append(f"{method} {target}")
         for pattern, route in ROUTES.items():
             if found := re.fullmatch(pattern, f"{method} {unquote(urlsplit(target).path)}"):
                 try:
@@ -144,11 +142,10 @@ def commit(hub: Hub, body: bytes, repo: Repo, revision: str) -> Any:
 
 
 def refs(hub: Hub, body: bytes, repo: Repo) -> Any:
-    named = {"branches": ("heads", repo.heads), "tags": ("tags", repo.tags)}
-    return {
-        key: [{"name": name, "ref": f"refs/{kind}/{name}", "targetCommit": sha} for name, sha in known.items()]
-        for key, (kind, known) in named.items()
-    } | {"converts": []}
+    def listed(named: dict[str, str]) -> list[dict[str, str]]:
+        return [{"name": name, "ref": name, "targetCommit": sha} for name, sha in named.items()]
+
+    return {"branches": listed(repo.heads), "tags": listed(repo.tags), "converts": []}
 
 
 def info(hub: Hub, body: bytes, repo: Repo, revision: str | None) -> Any:

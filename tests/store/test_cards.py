@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from huggingface_hub import DatasetCard, ModelCard
-from PIL import Image
 
 from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
@@ -45,8 +42,6 @@ def test_a_datasets_card_says_what_the_hub_reads_and_shows(demos: Path, tmp_path
         assert fact in text
     assert 'LeRobotDataset("user/demos")' in text
     assert f"]({PICTURE})" in text
-    picture = np.asarray(Image.open(io.BytesIO(files[PICTURE])).convert("RGB"))
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
     assert cards(shutil.copytree(SAMPLE, tmp_path / "again")) == files
 
 
@@ -87,9 +82,7 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     meta = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
     write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
     write_checkpoint(run / "best" / "pretrained_model", "act", spec, origin=meta)
-    text = cards(run, "policy", "user/act")[CARD].decode()
-    assert "not measured" in text
-    assert "model-index" not in ModelCard(text).data.to_dict()
+    assert "not measured" in cards(run, "policy", "user/act")[CARD].decode()
     (run / "eval").mkdir()
     (run / "eval" / "eval.json").write_text(json.dumps(EVALUATION))
     text = cards(run, "policy", "user/act")[CARD].decode()
@@ -97,7 +90,6 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("apache-2.0", "lerobot", "robotics")
     assert data["model-index"][0]["results"][0]["metrics"][0]["value"] == pytest.approx(0.84)
     assert "**84.0%** [75.6%, 89.9%] (95% interval, 100 episodes), on unseen seeds" in text
-    assert "# act for panda pick_place\n" in text
     assert "--env.task=PandaPickPlace-v0" in text
     assert "manip-il eval --policy.path=runs/act --eval.n_episodes=200\n" in text
     shutil.rmtree(run / "best")

@@ -1,0 +1,108 @@
+"""What users of LeRobot report of their datasets, tried here: each works, or is refused in one line that helps.
+
+Others are shown beside what they concern: fps 29.97 and exchanged messages in `tests/mcap`, another program's dataset
+and its card in `tests/store/test_cards.py`, datasets of every shape that is trained on in `tests/data`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets.dataset_tools import merge_datasets, modify_tasks, split_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from manip_il.cli.main import COMMANDS, main
+from manip_il.data import lerobot_layout as layout
+from manip_il.data.dataset import Dataset
+from manip_il.doctor.examine import examine_folder
+from manip_il.store.cards import write_cards
+
+from ..damage import digests, edit_json
+from ..data.test_other_peoples import DEPTH, NAMES, SIZE, record
+from .teaching import make
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
+PACKAGE, SAMPLE = ROOT / "manip_il", ROOT / "datasets" / "sample"
+TEXT, FRONT = "Put the cube down.", "observation.images.front"
+
+
+def theirs(root: Path) -> Any:
+    return LeRobotDataset(f"local/{root.name}", root=root)
+
+
+def index_without_a_name(root: Path) -> Path:
+    pd.DataFrame({"task_index": [0]}, index=[TEXT]).to_parquet(root / layout.TASKS)
+    table = pq.read_table(next(root.glob(layout.EPISODES_FILES)))
+    texts = [[TEXT]] * len(table)
+    place = table.column_names.index("tasks")
+    pq.write_table(table.set_column(place, "tasks", [texts]), next(root.glob(layout.EPISODES_FILES)))
+    return root
+
+
+def modified(root: Path) -> Path:
+    modify_tasks(theirs(root), new_task=TEXT)
+    return root
+
+
+def merged(root: Path) -> Path:
+    merge_datasets([theirs(root), theirs(modified(root))], "local/new", output_dir=root.with_name("new"))
+    return root.with_name("new")
+
+
+def split(root: Path) -> Path:
+    split_dataset(theirs(modified(root)), {"new": [1, 2, 3]}, output_dir=root.parent)
+    return root.with_name("new")
+
+
+@pytest.mark.parametrize("change", [index_without_a_name, modified, merged, split])
+def test_a_dataset_that_lerobots_tools_changed_goes_through_every_command(change, tmp_path: Path, capsys):
+    original = shutil.copytree(SAMPLE, tmp_path / "demos")
+    root = change(original)
+    assert main(["data", "check", str(root)]) == 0
+    if not (root / layout.OURS).is_file():
+        capsys.readouterr()
+        assert main(["data", "relabel", str(root)]) == 1
+        assert "copy it from the dataset that this one was made from\n" in capsys.readouterr().err
+        shutil.copy(SAMPLE / layout.OURS, root / layout.OURS)
+    new = tmp_path / "relabelled"
+    assert main(["data", "relabel", str(root), str(new), "--workers=1"]) == 0
+    assert main(["data", "to-mcap", str(new), str(tmp_path / "mcap")]) == 0
+    assert main(["push", str(new), f"file://{tmp_path}/store"]) == 0
+    assert Dataset.open(new).instruction == TEXT
+    assert TEXT in write_cards(root, "dataset", "a/b", tmp_path)["README.md"].read_text()
+
+
+@pytest.mark.parametrize("names", [None, ["width", "height", "channels"], ["channels", "height", "width"]])
+def test_a_camera_on_which_lerobot_does_not_train_is_named(tmp_path: Path, names: Any):
+    root = make(tmp_path / "theirs", 2)
+
+    def name(names: Any) -> None:
+        edit_json(root / layout.INFO, lambda info: info["features"][FRONT].update(names=names))
+
+    name(names)
+    [finding] = [one for one in examine_folder(root) if "LeRobot does not train" in one.text]
+    name(json.loads(finding.remedy[finding.remedy.index('["height') :].removesuffix(" there")))
+    assert examine_folder(root) == []
+
+
+@pytest.mark.parametrize("kind", ["image", "video"])
+def test_depth_in_lerobots_formats_is_whole_and_comes_back(tmp_path: Path, kind: str):
+    depth = {"dtype": kind, "shape": (*SIZE, 1), "names": NAMES, "info": {"is_depth_map": True}}
+    root, url = record(tmp_path / "depth", ["fold"] * 3, **{DEPTH: depth}), f"file://{tmp_path}/store"
+    for words in (("data", "check", root), ("push", root, url), ("pull", url, tmp_path / "got")):
+        assert main([*map(str, words)]) == 0
+    assert digests(tmp_path / "got") == digests(root)
+
+
+def test_a_command_that_a_remedy_names_is_there():
+    rooms = [path for room in ("collect", "data", "doctor", "mcap", "store") for path in (PACKAGE / room).rglob("*.py")]
+    named = {word for path in rooms for word in re.findall(r"manip-il ((?:data )?[a-z][a-z-]+)", path.read_text())}
+    assert {"data check", "data repair"} <= named <= COMMANDS.keys()
