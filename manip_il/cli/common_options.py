@@ -82,7 +82,7 @@ def image_given(*, small: bool = False) -> Any:
 
 @dataclass
 class EngineOptions:
-    """Where episodes run."""
+    """Workers that run episodes."""
 
     engine: Literal["local", "ray"] = option(
         "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, or one started here)", free=True
@@ -96,6 +96,13 @@ class EngineOptions:
         from manip_il.collect.workers import Engine
 
         return Engine(self.workers, self.engine)
+
+
+@dataclass
+class TrialGroup:
+    """`--eval.*` of policies that are compared."""
+
+    n_episodes: int = option(500, "test episodes, the same for both sides", at_least=1)
 
 
 def seed_option() -> Any:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import check_policy
+from manip_il.cli.inputs import check_policies
 from manip_il.cli.options import Given, command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import UsageError
 from manip_il.evaluation.policy_folder import require_source
 from manip_il.option import option
 from manip_il.seeding import stream_seeds
@@ -29,13 +29,6 @@ AT_HELP = (
     "of collecting and fitting), or an amount, as in labels:5000"
 )
 _YAML = (".yaml", ".yml")
-
-
-@dataclass
-class TrialGroup:
-    """`--eval.*` of policies that are compared."""
-
-    n_episodes: int = option(500, "test episodes, the same for both sides", at_least=1)
 
 
 def _require_side(path: Path) -> None:
@@ -65,7 +58,7 @@ class CompareOptions:
     )
     checkpoint: Literal["best", "last"] = option("best", "of a run: best on validation, or the last round")
     at: str = option("end", AT_HELP)
-    eval: TrialGroup = field(default_factory=TrialGroup)
+    eval: common.TrialGroup = field(default_factory=common.TrialGroup)
     suite: str = common.suite_option()
     env: Given = common.env_given(of_policy=True)
     seed: int = option(0, "shifts the stream of test seeds, 0 to 1000", at_least=0, at_most=1000)
@@ -97,9 +90,9 @@ class CompareOptions:
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
         if self._is_study:
-            from manip_il.cli.study import run_study
+            from manip_il.cli.study import Study
 
-            run_study(self, self.sides[0])
+            Study(self.sides[0], self.engine, self.output, trust=self.trust).run(self, self.training_seeds)
         else:
             self._compare(*self.sides)
 
@@ -175,16 +168,3 @@ class CompareOptions:
             return command_line("compare", replace(self, suite="disturbed", output=output))
         words = [f"--policy.path={loser.members[0].policy}", "--eval.films=3", f"--output_dir={folder}_films"]
         return shlex.join(["manip-il", "eval", *words])
-
-
-def check_policies(policies: dict[str, Path], trial: Trial, folder: Path, engine: str) -> None:
-    """Raise, before any episode runs, if one of the policies (name -> folder) cannot take a test."""
-    from manip_il.learn.checkpoint import Checkpoint
-
-    for name, policy in policies.items():
-        if not trial.file(folder, policy).is_file():
-            checkpoint = Checkpoint.open(policy)
-            origin = checkpoint.origin
-            if origin is not None and origin.task != trial.env.task:
-                raise MismatchError("task", name, origin.task, "the comparison", trial.env.task)
-            check_policy(checkpoint, trial.env, draw=engine == "local", trust=trial.trust)

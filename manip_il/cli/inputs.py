@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.algorithms.config import RunConfig
     from manip_il.collect.drivers import Driver
     from manip_il.data.schema import RobotTaskSpec
+    from manip_il.evaluation.trial import Trial
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.learn.reward import LearnedReward
     from manip_il.mdp import Observation
@@ -204,6 +205,19 @@ def check_policy(
     images = {camera: picture[None] for camera, picture in observation.images.items()}
     policy.act(observation.state[None], observation.environment_state[None], images)
     return cameras
+
+
+def check_policies(policies: dict[str, Path], trial: Trial, folder: Path, engine: str) -> None:
+    """Raise, before any episode runs, if one of the policies (name -> folder) cannot take a test."""
+    from manip_il.learn.checkpoint import Checkpoint
+
+    for name, policy in policies.items():
+        if not trial.file(folder, policy).is_file():
+            checkpoint = Checkpoint.open(policy)
+            origin = checkpoint.origin
+            if origin is not None and origin.task != trial.env.task:
+                raise MismatchError("task", name, origin.task, "the comparison", trial.env.task)
+            check_policy(checkpoint, trial.env, draw=engine == "local", trust=trial.trust)
 
 
 def _differences(checkpoint: Checkpoint, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:

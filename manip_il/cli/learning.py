@@ -49,7 +49,7 @@ class GivenGroup:
 
 
 class Learning:
-    """What these commands do in the same way: a run of a method, its progress and its page."""
+    """Base of these commands: a run of a method, its progress and its page."""
 
     title: ClassVar[str]
     name: ClassVar[str]

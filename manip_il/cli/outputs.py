@@ -26,7 +26,7 @@ _MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a f
 
 @dataclass
 class Output:
-    """Where a command writes."""
+    """Folder that a command writes to."""
 
     output_dir: Path = option(MISSING, "folder of what is written", free=True)
     overwrite: bool = option(False, "replace what is there", free=True)
@@ -65,7 +65,7 @@ class Output:
 
 @dataclass
 class ResumableOutput(Output):
-    """Where a command writes that can be continued."""
+    """Folder of a command that can be continued."""
 
     resume: bool = option(False, "continue what was interrupted", free=True)
     _resumes: ClassVar[bool] = True

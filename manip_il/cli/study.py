@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.arms import ArmOptions, with_start_cost, with_start_policy
-from manip_il.cli.compare import CompareOptions, check_policies
+from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.inputs import check_policies
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, atomic_write
 from manip_il.cli.progress import Stages, say
@@ -21,39 +22,38 @@ if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.arm import Member
     from manip_il.evaluation.results import EvalResult
-    from manip_il.evaluation.study import Study
+    from manip_il.evaluation.study import Study as Tested
     from manip_il.evaluation.trial import Trial
     from manip_il.sim.config import EnvConfig
 
 
-def run_study(options: CompareOptions, file: Path) -> None:
-    """Run what is not there yet of a study, test it, print and write the answer. Raises `UsageError` for its file."""
-    _Study(options, file).run()
-
-
-class _Study:
+class Study:
     """One study: its runs, their tests, and what comes of them."""
 
-    def __init__(self, options: CompareOptions, file: Path) -> None:
-        self._asked, self._file, self._root = options, file, options.output.output_dir
+    def __init__(self, file: Path, engine: EngineOptions, output: ResumableOutput, *, trust: bool) -> None:
+        self._file, self._engine, self._output, self._trust = file, engine, output, trust
+        self._root = output.output_dir
 
-    def run(self) -> None:
-        """Run what is not there yet, test it, print and write the answer."""
+    def run(self, options: Any, training_seeds: int | None) -> None:
+        """Run what is not there yet, test it, print and write the answer. Raises `UsageError` for its file.
+
+        options: of the command, to be kept. training_seeds: in place of the file's.
+        """
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, table_markdown
         from manip_il.evaluation.tables import print_table
 
-        plan = read_plan(self._file, self._asked.training_seeds, self._asked.trust)
+        plan = read_plan(self._file, training_seeds, self._trust)
         experts = expert_trials(plan)
-        if self._asked.output.resume:
+        if self._output.resume:
             check_same_file(self._root, plan.file)
-        with self._asked.output.open(self._asked) as folder:
+        with self._output.open(options) as folder:
             keep_file(folder, plan.file)
             self._learn(plan)
             study = self._test(plan, experts)
             write_json(folder / FILE_NAME, study.to_json())
             atomic_write(folder / TABLE_FILE, table_markdown(study))
-            self._report(plan, study)
+            self._report(plan, study, options)
         for table in study.tables():
             print_table(table)
         for sentence in (study.verdict, *study.facts):
@@ -84,14 +84,14 @@ class _Study:
         own = with_start_policy(plan.arms[name], lambda arm: self._folder(arm, seed))
         output = ResumableOutput(self._folder(name, seed), resume=True)
         own = replace(own, settings=own.settings | {"seed": seed}, output=output)
-        engine = self._asked.engine
+        engine = self._engine
         if isinstance(own, DaggerOptions):
             return replace(own, engine=engine)
         return replace(own, workers=engine.workers)
 
-    def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Study:
+    def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Tested:
         from manip_il.evaluation.arm import Arm
-        from manip_il.evaluation.study import Study
+        from manip_il.evaluation.study import Study as Tested
 
         seeds = range(plan.file.training_seeds)
         runs = {name: [self._member(plan, name, seed) for seed in seeds] for name in plan.arms}
@@ -99,11 +99,11 @@ class _Study:
         chosen = {name: [member.select(plan.rule, limit) for member in arm] for name, arm in runs.items()}
         trials = {name: self._trial(plan, name, arm) for name, arm in chosen.items()}
         kept = f"every finished run and evaluation, in {self._root}"
-        with Stages(kept) as stages, self._asked.engine.open() as engine:
+        with Stages(kept) as stages, self._engine.open() as engine:
             last = (self._root, engine, stages)
             arms = [Arm(name, tuple(one.measure(trials[name], *last) for one in arm)) for name, arm in chosen.items()]
             solved = {name: self._test_expert(name, tests, engine, stages) for name, tests in experts.items()}
-        return Study(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved, plan.within)
+        return Tested(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved, plan.within)
 
     def _test_expert(
         self, arm: str, trials: Mapping[str, Trial], engine: Engine, stages: Stages
@@ -119,8 +119,8 @@ class _Study:
 
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
-        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self._asked.trust)
-        check_policies(policies, trial, self._root, self._asked.engine.engine)
+        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self._trust)
+        check_policies(policies, trial, self._root, self._engine.engine)
         return trial
 
     def _member(self, plan: Plan, name: str, seed: int) -> Member:
@@ -132,16 +132,16 @@ class _Study:
     def _folder(self, name: str, seed: int) -> Path:
         return self._root / name / f"seed_{seed}"
 
-    def _report(self, plan: Plan, study: Study) -> None:
+    def _report(self, plan: Plan, study: Tested, options: Any) -> None:
         from manip_il.evaluation.compare_report import study_report
 
         result = study.arms[0].members[0].test
         what = f"{result.robot} {result.task}" if plan.baseline else result.robot
-        command = command_line("compare", self._asked)
+        command = command_line("compare", options)
         page = study_report(study, f"Study: {what}, {self._file.stem}", command, to_plain(plan.file))
         page.write(self._root / REPORT_FILE)
 
-    def _next(self, study: Study) -> str:
+    def _next(self, study: Tested) -> str:
         best = max(study.arms, key=lambda arm: arm.test_rate)
         other = study.baseline if best.name != study.baseline else study.arms[-1].name
         if other in (None, best.name):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il import checks
 from manip_il.cli.arms import ArmOptions, first_arm, learning_env, read_arm
-from manip_il.cli.compare import TrialGroup
+from manip_il.cli.common_options import TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.options import Open, to_plain
 from manip_il.cli.outputs import atomic_write

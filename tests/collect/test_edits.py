@@ -92,7 +92,7 @@ def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_whil
 def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvConfig, tmp_path):
     [first, second] = recorded(env)
     older = {key: first.columns[key].copy() for key in (schema.ACTION, schema.EXPERT_PHASE)}
-    older[schema.ACTION][:2, 0] += 0.05, 1e-5  # the second is nothing to speak of
+    older[schema.ACTION][:2, 0] += np.array([0.05, 1e-5])  # the second is nothing to speak of
     older[schema.EXPERT_PHASE][1] += 1
     bare = {key: np.zeros_like(second.columns[key]) for key in (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)}
     root = write([changed(first, **older), changed(second, **bare)], tmp_path / "older", env)
