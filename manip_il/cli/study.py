@@ -14,7 +14,16 @@ from manip_il.cli.inputs import check_policies
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, atomic_write
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.study_file import ExpertTest, Plan, check_same_file, keep_file, read_plan
+from manip_il.cli.study_file import (
+    ArmOptions,
+    ExpertTest,
+    Plan,
+    check_same_file,
+    keep_file,
+    read_plan,
+    with_start_cost,
+    with_start_policy,
+)
 from manip_il.errors import NoEffect
 from manip_il.seeding import stream_seeds
 

@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from manip_il.cli.arms import with_start_cost, with_start_policy
 from manip_il.cli.learning import AirlOptions, GailOptions, PpoOptions
 from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
-from manip_il.cli.study_file import read_plan
+from manip_il.cli.study_file import read_plan, with_start_cost, with_start_policy
 from manip_il.evaluation.rounds import history
 
 from .made_runs import make_run
