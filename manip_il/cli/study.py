@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from manip_il.cli.arms import ArmOptions, with_start_cost, with_start_policy
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.inputs import check_policies
