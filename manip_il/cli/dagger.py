@@ -14,9 +14,10 @@ from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_given, require_dataset, round_policy
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import CONFIG_FILE, REPORT_FILE, ResumableOutput, append_jsonl, atomic_write, read_jsonl
+from manip_il.cli.outputs import CONFIG_FILE, REPORT_FILE, ResumableOutput, atomic_write
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say, say_policy
+from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import FitConfig, check_weights
 from manip_il.option import option
@@ -162,8 +163,8 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     for result in run_algorithm(config, folder, engine, stages.watch()):
         stages.close()
         # Unless it is there from before an interruption, with the seconds of then.
-        if all(record.get("round") != result.round for record in read_jsonl(folder / METRICS_FILE)):
-            append_jsonl(folder / METRICS_FILE, result.to_json())
+        if all(record.get("round") != result.round for record in read_lines(folder / METRICS_FILE)):
+            append_line(folder / METRICS_FILE, result.to_json())
         results.append(result)
         took = f"{sum(result.seconds.values()):.0f} s"
         success = f"validation success {result.validation.success}"
@@ -228,7 +229,7 @@ def learning_curve(folder: Path, name: str = "DAgger") -> Curve:
     from manip_il.evaluation.figures import Curve
     from manip_il.evaluation.rounds import history
 
-    return Curve(name, (history(read_jsonl(folder / METRICS_FILE), str(folder)),))
+    return Curve(name, (history(read_lines(folder / METRICS_FILE), str(folder)),))
 
 
 def run_curve(policy: Path | None) -> Curve | None:
@@ -247,6 +248,6 @@ def round_timings(folder: Path) -> dict[str, float]:
     path = folder / METRICS_FILE
     return {
         f"round {record.get('round')}, {stage}": checks.number(f"{path}: {stage}", seconds, 0)
-        for record in read_jsonl(path)
+        for record in read_lines(path)
         for stage, seconds in checks.mapping(f"{path}: seconds", record.get("seconds")).items()
     }

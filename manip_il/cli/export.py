@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from manip_il.cli.outputs import atomic_write, require_short_path
+from manip_il.cli.outputs import atomic_write
 from manip_il.cli.progress import say, warn
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
@@ -57,7 +57,6 @@ class ExportOptions:
 
     def _find(self, output: Path) -> Path:
         """Return the policy; raise, before anything heavy is imported, where it cannot be exported, or not to there."""
-        require_short_path(output)
         if output.is_dir():
             raise UsageError(f"--output is {output}, a folder; expected a file such as {output}/policy.onnx")
         if output.exists() and not self.overwrite:

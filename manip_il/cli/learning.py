@@ -12,8 +12,9 @@ from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import dataset_differences, load_reward, require_dataset, require_folder, reward_folder
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, append_jsonl, read_jsonl
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, say_policy, warn
+from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
@@ -91,10 +92,10 @@ class Learning:
         watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
         iterations = self.iterations(config, folder, engine, watch)
         stages.start(f"{self.title}, steps", config.steps)
-        written = {record["iteration"] for record in read_jsonl(folder / METRICS_FILE)}
+        written = {record["iteration"] for record in read_lines(folder / METRICS_FILE)}
         for result in iterations:
             if result.number not in written:
-                append_jsonl(folder / METRICS_FILE, result.to_json())
+                append_line(folder / METRICS_FILE, result.to_json())
             shown = {name: result.metrics[name] for name in ("success", "kl") if name in result.metrics}
             stages.reach(result.steps, **shown)
             if result.validation is not None:
@@ -105,7 +106,7 @@ class Learning:
         from manip_il.algorithms.learning_run import validations
 
         title = f"{self.title} on {config.env.robot} {config.env.task}"
-        records, command = read_jsonl(folder / METRICS_FILE), command_line(self.name, self)
+        records, command = read_lines(folder / METRICS_FILE), command_line(self.name, self)
         report = adversarial_report(title, validations(folder), records, command, to_plain(self))
         report.write(folder / REPORT_FILE)
 

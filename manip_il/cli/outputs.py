@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import MISSING, dataclass
 from pathlib import Path
@@ -16,11 +15,10 @@ from manip_il.cli.options import options_of
 from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
 from manip_il.cli.progress import say
 from manip_il.data.atomic import PARTIAL, exclusive, write_file, writing
-from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.errors import FolderExistsError, ManipError, MismatchError, UsageError
 from manip_il.option import option
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
-_LONGEST_NAME, _LONGEST_PATH = 220, 3_500  # of a folder that is written [bytes]; file systems take 255 and 4,096
 _MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a folder
 
 
@@ -96,7 +94,6 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     `FolderExistsError` where the folder holds something, and `UsageError` where `overwrite` would delete what this
     program did not make.
     """
-    require_short_path(folder)
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
     if folder.is_symlink() and not folder.exists():
@@ -108,14 +105,6 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     if not overwrite:
         raise FolderExistsError(folder)
     require_ours(folder)
-
-
-def require_short_path(path: Path) -> None:
-    """Raise `UsageError` for a path that leaves no room for the longer names that are written beside and inside it."""
-    longest, whole = max(len(os.fsencode(part)) for part in path.parts or ("",)), len(os.fsencode(path.absolute()))
-    for what, size, most in (("a name in", longest, _LONGEST_NAME), ("the absolute path of", whole, _LONGEST_PATH)):
-        if size > most:
-            raise UsageError(f"{what} {checks.shorten(str(path))} has {size:,} bytes; expected at most {most:,}")
 
 
 def require_output(folder: Path, *, resume: bool = False, overwrite: bool = False, resumable: bool = False) -> None:
@@ -165,40 +154,6 @@ def atomic_write(path: Path, content: str | bytes) -> None:
     write_file(path, content.encode() if isinstance(content, str) else content)
 
 
-def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
-    """Add one line of JSON and flush it. A torn last line, left by a kill, is removed first.
-
-    Raises `NotFiniteError` if the record holds NaN or infinity, which JSON has not, and `ManipError` if the disk is
-    full or read-only.
-    """
-    try:
-        line = json.dumps(dict(record), allow_nan=False, default=_plain)
-    except ValueError as error:
-        raise NotFiniteError(f"{path}: a record that is not finite: {dict(record)}") from error
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _mend_tail(path)
-        with open(checks.open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as file:
-            file.write(line.encode() + b"\n")
-
-
-def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """Return every record, without a torn last line; none where there is no file. A number that is not finite is None.
-
-    Raises `ManipError` for any other line that is not a JSON object.
-    """
-    if not path.exists():
-        return []
-    with open(checks.open_regular(path), "rb") as file:
-        *lines, tail = file.read().split(b"\n")
-    records = [_record(line) for line in lines]
-    if None in records:
-        number = records.index(None)
-        text = lines[number][:80].decode(errors="replace")
-        raise ManipError(f"{path}, line {number + 1}: expected a JSON object, got {text!r}")
-    return [record for record in (*records, _record(tail)) if record is not None]
-
-
 def require_ours(folder: Path) -> None:
     """Raise `UsageError` where replacing `folder` would delete what this program did not make."""
     real = folder.resolve()
@@ -239,34 +194,8 @@ def _delete(folder: Path) -> None:
     shutil.rmtree(doomed)
 
 
-def _mend_tail(path: Path) -> None:
-    if not path.exists():
-        return
-    with open(checks.open_regular(path, os.O_RDWR), "rb+") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - 1, 0))
-        if file.read(1) in (b"", b"\n"):
-            return
-        file.seek(0)
-        content = file.read()
-        whole = content.rfind(b"\n") + 1
-        if _record(content[whole:]) is not None:  # only its newline is missing
-            file.write(b"\n")
-        else:
-            file.truncate(whole)
-
-
 def _record(line: bytes) -> dict[str, Any] | None:
     try:
         return checks.mapping("a record", checks.parse_json("a record", line, nan_is_none=True))
     except ManipError:
         return None
-
-
-def _plain(value: Any) -> Any:
-    """Return numpy scalars and arrays, and paths, as JSON values."""
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be written as JSON")

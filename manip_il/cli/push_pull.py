@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from manip_il.cli.inputs import require_folder
-from manip_il.cli.outputs import require_ours, require_short_path
+from manip_il.cli.outputs import require_ours
 from manip_il.cli.progress import is_quiet, say
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.option import option
@@ -75,7 +75,6 @@ class PullOptions:
 
     def check(self) -> None:
         """Refuse a folder that may not be replaced."""
-        require_short_path(self.target)
         if self.overwrite and self.target.is_dir() and any(self.target.iterdir()):
             require_ours(self.target)
 

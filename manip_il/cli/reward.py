@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.inputs import load_reward, require_dataset, require_file, require_folder
 from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output, atomic_write, require_short_path
+from manip_il.cli.outputs import REPORT_FILE, Output, atomic_write
 from manip_il.cli.progress import progress, say, warn
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import option
@@ -345,7 +345,6 @@ class ScoreOptions:
 
 
 def _require_new_file(path: Path, suffix: str, overwrite: bool) -> None:
-    require_short_path(path)
     if path.suffix != suffix:
         raise UsageError(f"--output is {path}; expected a file, NAME{suffix}")
     if path.is_dir() or (path.exists() and not overwrite):

@@ -19,6 +19,7 @@ from manip_il.cli.learning import AirlOptions, GailOptions, GivenGroup, PpoOptio
 from manip_il.cli.options import Open, to_plain
 from manip_il.cli.outputs import atomic_write
 from manip_il.cli.parsing import check_values, dump_yaml, from_layers, from_yaml
+from manip_il.data.json_lines import read_lines
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.option import option
 from manip_il.seeding import MAX_SEED
@@ -272,11 +273,11 @@ def with_start_policy(options: ArmOptions, folder_of: Callable[[str], Path]) -> 
 
 def with_start_cost(options: ArmOptions, own: History, run: Path) -> History:
     """Return a learning arm's rounds with the costs of what it begins with: round 0 in `run`, its fit with `init`."""
-    from manip_il.evaluation.rounds import history, read_metrics
+    from manip_il.evaluation.rounds import METRICS_FILE, history
 
     if isinstance(options, DaggerOptions):
         return own
-    records = read_metrics(run)
+    records = read_lines(run / METRICS_FILE)
     start = history(records, str(run))[0]
     fitted = start.seconds if options.init is not None else float(records[0]["seconds"]["collect"])
     return tuple(one.after(start, fitted=fitted) for one in own)

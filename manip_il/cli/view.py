@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import open_driver, require_folder
 from manip_il.cli.options import Given
-from manip_il.cli.outputs import require_short_path
 from manip_il.cli.progress import say, warn
 from manip_il.errors import RenderError, UsageError
 from manip_il.option import option
@@ -67,7 +66,6 @@ class ViewOptions:
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random|sliders")
         self._seeds()
         if self.output is not None:
-            require_short_path(self.output)
             if self.output.suffix != SUFFIX or self.output.is_dir():
                 raise UsageError(f"--output is {self.output}; expected a file, NAME{SUFFIX}")
             require_folder(self.output.parent, f"the folder of --output={self.output}")

@@ -11,11 +11,12 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.collect.workers import Engine
+from manip_il.data.json_lines import read_lines
 from manip_il.data.schema import OWN_OBJECT
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.policy_folder import EXPECTED, find_policy, require_source
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import History, Round, Rule, history, read_metrics
+from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.trial import Progress, Trial
 from manip_il.sim.config import EnvConfig
 
@@ -141,7 +142,7 @@ def require_pair(left: Arm, right: Arm) -> None:
 
 def run_member(folder: Path, training_seed: int) -> Member:
     """Return a run as a member, without its environment."""
-    rounds = history(read_metrics(folder), str(folder))
+    rounds = history(read_lines(folder / METRICS_FILE), str(folder))
     return Member(folder, training_seed, history=rounds, finished=run_finished(folder))
 
 
@@ -179,7 +180,7 @@ def require_same_env(left: str, env: EnvConfig, right: str, other: EnvConfig) ->
 def _read_member(path: Path) -> Member:
     if path.is_file():
         return Member(path, result=EvalResult.read(path), file=path)
-    options, records = _run_options(path), read_metrics(path)
+    options, records = _run_options(path), read_lines(path / METRICS_FILE)
     if options is not None or any("round" in record for record in records):  # `manip-il train` counts steps there
         rounds = history(records, str(path))
         seed, env = options or (None, None)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
-from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.intervals import Proportion
 
@@ -66,14 +64,6 @@ class Round:
 
 
 History = tuple[Round, ...]
-
-
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a run's `metrics.jsonl`, without one that a kill cut short; none if there is no file."""
-    path = folder / METRICS_FILE
-    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
-    whole = [line for line in lines if line.endswith(b"\n")]
-    return [checks.mapping(str(path), checks.parse_json(str(path), line, nan_is_none=True)) for line in whole]
 
 
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import json
 import logging
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from manip_il import checks
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.atomic import writing
+from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.intervals import Proportion
@@ -127,21 +124,17 @@ class EpisodeJournal:
         `ManipError` for a line that is not an episode.
         """
         path, common = folder / EPISODES_FILE, _common(job, suite)
-        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-        if lines and not lines[-1].endswith(b"\n"):
-            lines.pop()
-            os.truncate(path, sum(map(len, lines)))
-        if not lines:
-            journal = cls(path)
-            journal._append(common)
-            return journal
         try:
-            head, *records = [checks.mapping("a line", checks.parse_json("a line", line)) for line in lines]
-            results = [EpisodeResult.from_json(record) for record in records]
+            records = read_lines(path)
+            results = [EpisodeResult.from_json(record) for record in records[1:]]
         except (KeyError, TypeError, ValueError, ManipError) as error:
             raise ManipError(
                 f"{path}: a line that is not an episode ({error}); start again with --overwrite=true"
             ) from error
+        if not records:
+            append_line(path, common)
+            return cls(path)
+        head = records[0]
         for key, now in common.items():
             if (before := head.get(key)) != now:
                 what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
@@ -152,14 +145,10 @@ class EpisodeJournal:
         """Return a callback that appends a result at once, and hands it on."""
 
         def add(result: EpisodeResult) -> None:
-            self._append(result.to_json())
+            append_line(self.path, result.to_json())
             on_result(result)
 
         return add
-
-    def _append(self, record: Mapping[str, Any]) -> None:
-        with writing(self.path), self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record, allow_nan=False) + "\n")
 
 
 def _common(job: RolloutJob, suite: str) -> dict[str, Any]:

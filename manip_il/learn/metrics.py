@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
-import math
-import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 from lerobot.configs.train import TrainPipelineConfig
 
-from manip_il import checks
-from manip_il.data.atomic import write_file, writing
+from manip_il.data.atomic import write_file
+from manip_il.data.json_lines import Record, append_line, read_lines
 from manip_il.errors import UsageError
 
 METRICS_FILE, TENSORBOARD_FOLDER = "metrics.jsonl", "tensorboard"
-Record = Mapping[str, Any]  # `step` and numbers
 Writer = Callable[[Record], None]
 
 
@@ -29,10 +26,9 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
     step: the fit goes on from there. curves: for TensorBoard. pipeline: with the options for Weights & Biases. Raises
     `UsageError` if one of them is not installed.
     """
-    with writing(output_dir):
-        output_dir.mkdir(parents=True, exist_ok=True)
+    output_dir.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        writers = [stack.enter_context(json_lines(output_dir / METRICS_FILE, step))]
+        writers = [json_lines(output_dir / METRICS_FILE, step)]
         if curves:
             writers.append(stack.enter_context(tensorboard(output_dir / TENSORBOARD_FOLDER, step)))
         if pipeline.wandb.enable:
@@ -41,18 +37,11 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
         yield writers
 
 
-@contextmanager
-def json_lines(path: Path, step: int) -> Iterator[Writer]:
-    """Give a function that adds a line, null if a number is not finite; lines after `step` are dropped first."""
-    lines = path.read_text(errors="replace").splitlines() if step > 0 and path.is_file() else []
-    write_file(path, "".join(f"{line}\n" for line in lines if _is_until(step, line)).encode())
-
-    def write(record: Record) -> None:
-        with writing(path), open(checks.open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as file:
-            finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
-            file.write((json.dumps(finite, allow_nan=False) + "\n").encode())
-
-    yield write
+def json_lines(path: Path, step: int) -> Writer:
+    """Return a function that adds a line, null if a number is not finite; lines after `step` are dropped first."""
+    kept = [record for record in read_lines(path) if record["step"] <= step] if step > 0 else []
+    write_file(path, "".join(f"{json.dumps(record)}\n" for record in kept).encode())
+    return functools.partial(append_line, path)
 
 
 @contextmanager
@@ -83,11 +72,3 @@ def weights_and_biases(config: TrainPipelineConfig) -> Iterator[Writer]:
         raise UsageError("--wandb.enable=true needs Weights & Biases: pip install wandb") from error
     logger = WandBLogger(config)
     yield lambda record: logger.log_dict({k: v for k, v in record.items() if k != "step"}, record["step"])
-
-
-def _is_until(step: int, line: str) -> bool:
-    """Whether a line is of a step up to this one; a line that a kill cut short is of none."""
-    try:
-        return json.loads(line)["step"] <= step
-    except (ValueError, KeyError, TypeError):
-        return False

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.outputs import ResumableOutput, append_jsonl, save_options
+from manip_il.cli.outputs import ResumableOutput, save_options
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import schema
+from manip_il.data.json_lines import append_line
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
@@ -70,7 +71,7 @@ def make_run(
         mark(made, f"{folder} {number}")
         record = {"round": number, "labels": labels * (number + 1), "episodes": 2 * (number + 1), "beta": 0.0}
         record |= {"validation_success": success, "validation_episodes": 10}
-        append_jsonl(
+        append_line(
             folder / "metrics.jsonl", record | {"seconds": {"collect": 1.0, "fit": labels / 100, "validate": 5.0}}
         )
     shutil.copytree(policy, folder / "best" / "pretrained_model")

@@ -10,8 +10,8 @@ import pytest
 
 from manip_il.cli.learning import AirlOptions, GailOptions, PpoOptions
 from manip_il.cli.main import main
-from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.study_file import read_plan, with_start_cost, with_start_policy
+from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.rounds import history
 
 from .made_runs import make_run
@@ -117,7 +117,7 @@ def test_iterations_that_were_validated_are_rounds_and_cost_what_all_before_them
 
 def test_a_run_is_charged_for_the_demonstrations_it_begins_with_and_for_the_fit_with_init(file, policy, tmp_path):
     run = make_run(tmp_path / "cloning", policy, 0, (0.2,))
-    start = history(read_jsonl(run / "metrics.jsonl"), "x")[0]
+    start = history(read_lines(run / "metrics.jsonl"), "x")[0]
     own, plan = history(lines(0.2, 0.5), "x"), read_plan(file, None)
     gail, scratch, dagger = (with_start_cost(plan.arms[name], own, run) for name in ("gail", "scratch", "dagger"))
     assert dagger == own

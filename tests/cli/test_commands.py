@@ -23,9 +23,10 @@ from manip_il.cli.dagger import DaggerOptions, best_verdict
 from manip_il.cli.demo import demo_verdict
 from manip_il.cli.main import load, main
 from manip_il.cli.options import command_line, options_of
-from manip_il.cli.outputs import ResumableOutput, read_jsonl
+from manip_il.cli.outputs import ResumableOutput
 from manip_il.cli.parsing import from_yaml, parse
 from manip_il.data.dataset import Dataset
+from manip_il.data.json_lines import read_lines
 from manip_il.evaluation import film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.tables import PolicyRow
@@ -160,7 +161,7 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
     assert main([*words, "--resume=true", "--beta=constant:0.5"]) == 1
     assert "--beta differs" in error()
     assert main([*words, "--resume=true", "--rounds=2"]) == 0
-    assert [record["round"] for record in read_jsonl(run / "metrics.jsonl")] == [0, 1, 2]
+    assert [record["round"] for record in read_lines(run / "metrics.jsonl")] == [0, 1, 2]
     assert Dataset.open(run / "dataset").summary.episodes == 3 + 2 * 2
 
 

@@ -6,17 +6,14 @@ import json
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from manip_il.cli.main import main
-from manip_il.cli.outputs import CONFIG_FILE, append_jsonl, atomic_write, check_same_options, prepare_output, read_jsonl
+from manip_il.cli.outputs import CONFIG_FILE, atomic_write, check_same_options, prepare_output
 from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
 from manip_il.data.atomic import exclusive
-from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
+from manip_il.errors import FolderExistsError, UsageError
 
 from .made_runs import make_eval
 
@@ -44,21 +41,6 @@ def test_a_new_or_empty_folder_is_fine_and_a_full_one_is_refused_with_the_ways_o
     (tmp_path / "x").touch()
     with pytest.raises(UsageError, match="is a file"):
         prepare_output(tmp_path / "x", resume=True, overwrite=False)
-
-
-@pytest.mark.parametrize("name", ["x" * 240, "é" * 120, "x" * 300, "x/" * 2_000 + "y"])
-def test_a_name_that_leaves_no_room_for_names_beside_and_inside_it_is_refused_first(
-    name, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    for words in (
-        f"record --dataset.root={name}",
-        f"eval --policy.type=expert --output_dir={name}",
-        f"view --output={name}.rrd",
-    ):
-        assert main([*words.split(), "--quiet"]) == 2
-        assert "bytes; expected at most" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
@@ -120,49 +102,6 @@ def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monk
     (inside / ".git").mkdir()
     refused(ours, "git checkout")
     assert (ours / "config.yaml").exists()
-
-
-def test_records_come_back_in_order(tmp_path):
-    path = tmp_path / "m" / "metrics.jsonl"
-    assert read_jsonl(path) == []
-    append_jsonl(path, {"round": 0, "loss": np.float32(0.5), "path": Path("x"), "rates": np.array([1, 2])})
-    append_jsonl(path, {"round": 1})
-    assert read_jsonl(path) == [{"round": 0, "loss": 0.5, "path": "x", "rates": [1, 2]}, {"round": 1}]
-
-
-@given(cut=st.integers(min_value=0))
-def test_a_kill_at_any_byte_costs_at_most_the_last_record(tmp_path_factory, cut):
-    path = tmp_path_factory.mktemp("torn") / "metrics.jsonl"
-    records = [{"round": i, "note": "é\n"} for i in range(3)]
-    for record in records:
-        append_jsonl(path, record)
-    content = path.read_bytes()
-    kept = content[: cut % (len(content) + 1)]
-    path.write_bytes(kept)
-    before = read_jsonl(path)
-    assert before == records[: len(before)]
-    assert len(before) >= kept.count(b"\n")
-    append_jsonl(path, {"round": 9})
-    assert read_jsonl(path) == [*before, {"round": 9}]
-
-
-def test_a_damaged_line_in_the_middle_is_an_error_that_names_it(tmp_path):
-    path = tmp_path / "m.jsonl"
-    path.write_text('{"a": 1}\nrubbish\n{"a": 2}\n')
-    with pytest.raises(ManipError, match="line 2"):
-        read_jsonl(path)
-
-
-def test_nan_is_not_written(tmp_path):
-    with pytest.raises(NotFiniteError, match="not finite"):
-        append_jsonl(tmp_path / "m.jsonl", {"loss": float("nan")})
-    assert not (tmp_path / "m.jsonl").exists()
-
-
-def test_numbers_that_are_not_finite_are_missing(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_text('{"step": 1, "grad_norm": NaN}\n{"step": 2, "grad_norm": null, "x": [Infinity, -Infinity]}\n')
-    assert read_jsonl(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None, "x": [None, None]}]
 
 
 SAMPLE = Path(__file__).resolve().parents[2] / "datasets" / "sample"

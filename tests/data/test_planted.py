@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.outputs import append_jsonl
 from manip_il.data.atomic import exclusive
+from manip_il.data.json_lines import append_line
 from manip_il.errors import ManipError
 from manip_il.learn.metrics import json_lines
 
@@ -22,15 +22,15 @@ def lock(folder: Path) -> None:
 
 
 def write_metrics(folder: Path) -> None:
-    with json_lines(folder / "metrics.jsonl", 0) as write:
-        (folder / "metrics.jsonl").unlink()
-        (folder / "planted").rename(folder / "metrics.jsonl")
-        write({"step": 1})
+    write = json_lines(folder / "metrics.jsonl", 0)
+    (folder / "metrics.jsonl").unlink()
+    (folder / "planted").rename(folder / "metrics.jsonl")
+    write({"step": 1})
 
 
 WRITERS: dict[str, Callable[[Path], None]] = {
     ".run.lock": lock,
-    "records.jsonl": lambda folder: append_jsonl(folder / "records.jsonl", {"a": 1}),
+    "records.jsonl": lambda folder: append_line(folder / "records.jsonl", {"a": 1}),
     "planted": write_metrics,
 }
 

@@ -1,13 +1,11 @@
 """Which round a comparison takes follows from the rule and the validation alone."""
 
-import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.rounds import Rule, history, largest_dip, read_metrics
+from manip_il.evaluation.rounds import Rule, history, largest_dip
 
 SUCCESS = (0.5, 0.9, 0.8, 0.9, 0.7)
 
@@ -102,10 +100,3 @@ def test_a_dip_is_measured_from_the_best_before():
     assert largest_dip(RUN) == pytest.approx(0.2)
     assert largest_dip(RUN[:2]) == 0
     assert largest_dip(history(records((0.9, 0.1, 0.95)), "x")) == pytest.approx(0.8)
-
-
-def test_a_line_that_a_kill_cut_short_is_dropped(tmp_path: Path):
-    lines = [json.dumps(record) for record in records()]
-    (tmp_path / "metrics.jsonl").write_text("\n".join(lines[:3]) + "\n" + lines[3][:20])
-    assert history(read_metrics(tmp_path), "x") == RUN[:3]
-    assert read_metrics(tmp_path / "nowhere") == []

@@ -16,8 +16,8 @@ import torch
 
 from manip_il import checks
 from manip_il.cli.main import main
-from manip_il.cli.outputs import read_jsonl
 from manip_il.data.dataset import Dataset
+from manip_il.data.json_lines import read_lines
 from manip_il.data.schema import features
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError
 from manip_il.learn import train
@@ -80,7 +80,7 @@ def test_a_resumed_fit_ends_with_the_same_bits(fit, tmp_path, settings):
     assert {"model.safetensors", "optimizer_state.safetensors"} <= straight.keys()
     assert straight == stopped
     one, other = (
-        [[record[key] for key in ("step", "loss", "val_loss")] for record in read_jsonl(tmp_path / name / METRICS_FILE)]
+        [[record[key] for key in ("step", "loss", "val_loss")] for record in read_lines(tmp_path / name / METRICS_FILE)]
         for name in ("straight", "stopped")
     )
     assert one == other
@@ -102,7 +102,7 @@ def test_two_steps_are_saved_resumed_and_act(fit, table, write, pictured, settin
     assert policy.checkpoint.observation == observation
     states, environments = observations(2)
     assert policy.act(states, environments, {"front": np.zeros((2, 32, 48, 3), np.uint8)}).shape == (2, 4)
-    assert [record["step"] for record in read_jsonl(tmp_path / "run" / METRICS_FILE)] == [1, 2, 3, 4]
+    assert [record["step"] for record in read_lines(tmp_path / "run" / METRICS_FILE)] == [1, 2, 3, 4]
 
 
 def test_the_seed_decides_and_metrics_and_checkpoints_change_nothing(fit, weights):
@@ -131,7 +131,7 @@ def test_every_loss_learns_to_act(loss, table, write, fit):
 def test_a_chunk_policy_learns_and_says_how(fit, tmp_path):
     plan = {**ACT, "use_vae": False, "chunk_size": 1, "n_action_steps": 1}
     fit(plan, steps=90, batch_size=32, log_freq=30, save_freq=90, lr=3e-3)
-    first, _, last = read_jsonl(tmp_path / "run" / METRICS_FILE)
+    first, _, last = read_lines(tmp_path / "run" / METRICS_FILE)
     assert last["loss"] < 0.7 * first["loss"]
     assert last["val_loss"] < first["val_loss"]
     assert {"grad_norm", "lr", "samples_per_s", "data_share", "l1_loss", "val_l1_loss"} <= first.keys()
@@ -139,7 +139,7 @@ def test_a_chunk_policy_learns_and_says_how(fit, tmp_path):
 
 def test_metrics_of_the_mlp_hold_errors_of_acting(fit, tmp_path):
     fit()
-    [record, *_] = read_jsonl(tmp_path / "run" / METRICS_FILE)
+    [record, *_] = read_lines(tmp_path / "run" / METRICS_FILE)
     assert {"val_loss", "val_arm_error", "val_gripper_error"} <= record.keys()
 
 
@@ -337,14 +337,13 @@ def test_curves_for_tensorboard_and_weights_and_biases(fit, tmp_path, curves):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_number_that_is_not_finite_is_null_and_lines_that_are_none_are_dropped(tmp_path, value):
+def test_a_number_that_is_not_finite_is_null_and_a_line_that_was_cut_short_is_dropped(tmp_path, value):
     path = tmp_path / "metrics.jsonl"
     lines = [json.dumps({"step": step, "grad_norm": math.nan}) for step in (1, 2, 3)]
-    path.write_text("\n".join(["[", '{"step": "1"}', *lines, ""]))
-    with json_lines(path, 2) as write:
-        write({"step": 3, "loss": 0.5, "grad_norm": value})
+    path.write_text("\n".join([*lines, '{"st']))
+    json_lines(path, 2)({"step": 3, "loss": 0.5, "grad_norm": value})
     expected = {"step": 3, "loss": 0.5, "grad_norm": None}
-    assert read_jsonl(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None}, expected]
+    assert read_lines(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None}, expected]
     assert checks.parse_json("a line", path.read_bytes().splitlines()[-1]) == expected
 
 

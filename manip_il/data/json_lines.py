@@ -1,0 +1,50 @@
+"""Files of JSON lines, a record each: a kill costs at most the line that it cut short."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from manip_il import checks
+
+Record = Mapping[str, Any]
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Return every record, without a last line that was cut short; none if there is no file.
+
+    A number that is not finite is None. Raises `ManipError` naming any other line that is not a JSON object.
+    """
+    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+    whole = [line for line in lines if line.endswith(b"\n")]
+    return [_record(f"{path}, line {number}", line) for number, line in enumerate(whole, start=1)]
+
+
+def append_line(path: Path, record: Record) -> None:
+    """Add a record, in place of a last line that was cut short; a number that is not finite is null."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(checks.open_regular(path, os.O_RDWR | os.O_CREAT), "rb+") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 1, 0))
+        if file.read(1) not in (b"", b"\n"):
+            file.seek(0)
+            file.truncate(file.read().rfind(b"\n") + 1)
+        file.seek(0, os.SEEK_END)
+        file.write(json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n")
+
+
+def _record(what: str, line: bytes) -> dict[str, Any]:
+    return checks.mapping(what, checks.parse_json(what, line, nan_is_none=True))
+
+
+def _finite(record: Record) -> dict[str, Any]:
+    return {key: None if isinstance(one, float) and not math.isfinite(one) else one for key, one in record.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Return numpy scalars and arrays, and paths, as JSON values."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
