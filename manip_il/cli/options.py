@@ -58,6 +58,7 @@ class Option:
     type: Any
     default: Any
     metadata: Mapping[str, Any]
+    is_given: bool = False  # in a `Given` group, which holds it only if it was given
 
     @property
     def help(self) -> str:
@@ -118,7 +119,7 @@ def given_options(one: dataclasses.Field[Any]) -> Iterator[Option]:
     cls, only = one.metadata["given"], one.metadata["only"]
     for inner in dataclasses.fields(cls):
         if "help" in inner.metadata and (not only or inner.name in only):
-            yield Option(inner.name, (inner.name,), _type_of(cls, inner), _default(inner), inner.metadata)
+            yield Option(inner.name, (inner.name,), _type_of(cls, inner), _default(inner), inner.metadata, True)
 
 
 def fields_of(cls: type, base: Any) -> Iterator[tuple[dataclasses.Field[Any], Any, Any]]:

@@ -191,8 +191,8 @@ def _make[T](cls: type[T], said: Mapping[str, _Said], known: Known) -> T:
             one = said[option.name]
             if option.metadata.get("command_line_only") and not one.is_word:
                 raise UsageError(f"{one.origin}: this can only be set on the command line; give --{option.name}=...")
-            if one.value is not None or option.default is not None:  # as such a file has it that was not given
-                values[option.path] = _decode_said(option.type, one)
+            if one.value is not None or not option.is_given or without_none(option.type) is not option.type:
+                values[option.path] = _decode_said(option.type, one)  # else null says that it was not given
         elif option.default is MISSING:
             raise UsageError(f"{option.label} is missing; expected {expected(option.type)}")
     return _build(cls, values)

@@ -11,9 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.cli.main import main
-from manip_il.cli.options import Open, expected, metavar, options_of, word
-from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml, parse
+from manip_il.cli.options import Given, Open, command_line, expected, metavar, options_of, word
+from manip_il.cli.options import given as given_of
+from manip_il.cli.parsing import check_values, dump_yaml, from_layers, from_yaml, parse
 from manip_il.errors import UsageError
+from manip_il.option import option
 
 
 @dataclass
@@ -203,6 +205,34 @@ def test_types_are_named_for_people():
     assert metavar(list[float]) == "FLOAT,..."
     assert metavar(Literal["cpu", "cuda"] | None) == "cpu|cuda"
     assert expected(int | None) == "a whole number or null"
+
+
+@dataclass
+class Settings:
+    hz: int = option(20, "rate", at_least=1)
+    robot: str = option("panda", "which", flag="robot.type")
+    crf: float | None = option(23.0, "quality")
+    own: int = 0  # no option
+
+
+@dataclass
+class Command:
+    env: Given = given_of(Settings, defaults={"robot": None})
+    more: Given = given_of(Settings, prefix="", only=("crf",))
+
+
+def test_of_a_group_of_anothers_options_only_what_was_given_is_held(tmp_path):
+    assert parse(Command, []) == Command()
+    command = parse(Command, ["--env.hz=30", "--robot.type=fetch", "--crf=null"])
+    assert command == Command(env={"hz": 30, "robot": "fetch"}, more={"crf": None})
+    assert command_line("x", command) == "manip-il x --env.hz=30 --robot.type=fetch --crf=null"
+    (tmp_path / "c.yaml").write_text(dump_yaml(Command()))
+    assert from_yaml(tmp_path / "c.yaml", Command).env == {"hz": 20, "crf": 23.0}
+    (tmp_path / "c.yaml").write_text("env: {hz: null}\n")  # of a file in which it was not given
+    assert from_yaml(tmp_path / "c.yaml", Command) == Command()
+    assert "unknown option '--env.own'" in fails(["--env.own=1"], Command)
+    with pytest.raises(UsageError, match="--env.hz is 0; expected at least 1"):
+        check_values(parse(Command, ["--env.hz=0"]))
 
 
 @dataclass

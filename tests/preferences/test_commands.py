@@ -74,7 +74,11 @@ def test_true_progress_scores_without_a_reward(here, capsys):
         ("reward fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),
         ("data score good --reward=nowhere", "nowhere does not exist; expected a reward", 2),
         ("data score nowhere --reward=progress", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
-        ("train --dataset.root=good --weights=nowhere.parquet", "--weights is nowhere.parquet, which is no file", 2),
+        (
+            "train --dataset.root=good --weights=nowhere.parquet",
+            "nowhere.parquet does not exist; expected rabc.parquet",
+            2,
+        ),
         ("train --dataset.root=good,bad --weights=good/meta/info.json", "give one, and no --redraw", 2),
     ],
 )
