@@ -231,7 +231,7 @@ def test_of_a_group_of_anothers_options_only_what_was_given_is_held(tmp_path):
     (tmp_path / "c.yaml").write_text("env: {hz: null}\n")  # of a file in which it was not given
     assert from_yaml(tmp_path / "c.yaml", Command) == Command()
     assert "unknown option '--env.own'" in fails(["--env.own=1"], Command)
-    with pytest.raises(UsageError, match="--env.hz is 0; expected at least 1"):
+    with pytest.raises(UsageError, match=r"--env\.hz is 0; expected at least 1"):
         check_values(parse(Command, ["--env.hz=0"]))
 
 
