@@ -199,7 +199,9 @@ class PpoOptions(Learning):
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
     init: Path = option(MISSING, _INIT, check=_require_policy)
     reward: Path = option(
-        MISSING, "the reward: a folder of manip-il reward fit", check=lambda path: require_folder(path, "a reward")
+        MISSING,
+        "the reward: a folder of manip-il reward fit",
+        check=lambda path: require_folder(path, "a reward of manip-il reward fit"),
     )
     settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
     ppo: PPOConfig = field(default_factory=PPOConfig)
