@@ -21,7 +21,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.camera import Camera
 from manip_il.data.episode_table import EpisodeTable, read_episode_table, read_picture_statistics
-from manip_il.data.info import NUMBERS, PICTURES, DatasetInfo, Feature, Info, read_info, reading
+from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_info, reading
 from manip_il.data.parquet_files import read_file, read_tasks, to_numpy
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
@@ -241,26 +241,13 @@ class Dataset:
                 yield Episode(int(own[s.SEED].flat[0]), columns, *ends, text, drawn.get(int(index[start]), {}))
             row += len(index)
 
-    @cached_property
-    def summary(self) -> DatasetInfo:
-        """Names and counts; successes from the column `next.success`, if there is one."""
-        own, success, at_end = self.own, None, None
-        if s.SUCCESS in self.features:
-            columns = self.columns([s.SUCCESS, layout.EPISODE_INDEX])
-            index, flags = (columns[name].reshape(-1) for name in (layout.EPISODE_INDEX, s.SUCCESS))
-            last = np.flatnonzero(np.diff(index, append=-1))
-            success, at_end = len(np.unique(index[flags.astype(bool)])), int(flags[last].sum())
-        return DatasetInfo(
-            root=self.root,
-            robot=own.spec.robot if own else s.robot_of(self.info.robot or UNKNOWN_ROBOT)["robot"],
-            task=own.spec.task if own else UNKNOWN_TASK,
-            instruction=self.spec.instruction if own else self.instruction,
-            fps=self.fps,
-            episodes=self.info.episodes,
-            frames=self.info.frames,
-            success=success,
-            success_at_end=at_end,
-        )
+    def count_successes(self) -> int:
+        """Return how many episodes succeeded at some step; 0 if no column says so."""
+        if s.SUCCESS not in self.features:
+            return 0
+        columns = self.columns([layout.EPISODE_INDEX, s.SUCCESS])
+        index, success = (column.reshape(-1) for column in columns.values())
+        return len(np.unique(index[success.astype(bool)]))
 
 
 def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:

@@ -81,21 +81,6 @@ class Info:
         return [feature for feature in self.features.values() if feature.dtype in dtypes]
 
 
-@dataclass(frozen=True)
-class DatasetInfo:
-    """Names and counts of a dataset. success: episodes that succeeded at some step; None if no column says so."""
-
-    root: Path
-    robot: str
-    task: str
-    instruction: str
-    fps: float
-    episodes: int
-    frames: int
-    success: int | None
-    success_at_end: int | None
-
-
 @contextmanager
 def reading(path: Path) -> Generator[None]:
     """Raise `ManipError` that names a file, in one line, for whatever is raised while it is read."""

@@ -50,7 +50,7 @@ def test_each_text_is_one_task_and_every_frame_has_its_own(root, spec):
     rows = pq.read_table(next(root.glob(layout.EPISODES_FILES)), columns=["tasks"]).column("tasks").to_pylist()
     assert rows == [[text] for text in TEXTS]
     assert texts(root) == TEXTS
-    assert Dataset.open(root).summary.instruction == spec.instruction
+    assert Dataset.open(root).spec.instruction == spec.instruction
 
 
 def test_journals_keep_the_text_and_build_the_same_dataset(tmp_path, told, spec, root):

@@ -249,7 +249,7 @@ def test_episodes_deleted_by_lerobots_command(tmp_path, recorded, edit, seen):
     edit("--repo_id", REPO, "--root", str(root), "--new_root", str(kept), *words)
     assert_holds(kept, [episodes[0], *episodes[3:]])
     s.check_same_spec("before", seen, "after", Dataset.open(kept).spec)  # LeRobot drops our file
-    assert (Dataset.open(kept).spec.instruction, Dataset.open(kept).summary.success) == (seen.instruction, 3)
+    assert (Dataset.open(kept).spec.instruction, Dataset.open(kept).count_successes()) == (seen.instruction, 3)
     assert dataset_tools.recompute_stats(load(kept)).meta.stats is not None
 
 
@@ -284,4 +284,4 @@ def test_lerobot_records_on_into_ours(tmp_path, recorded, seen):
     add_episode(dataset, episodes[2], seen)
     dataset.finalize()
     assert_holds(root, episodes[:3])
-    assert Dataset.open(root).summary.episodes == 3
+    assert Dataset.open(root).info.episodes == 3
