@@ -199,7 +199,7 @@ class Dataset:
 
     def clip(self, key: str, episode: int) -> tuple[Path, int, int]:
         """Return where a camera's pictures of an episode are: a film, the first frame in it, and their number."""
-        clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)[:1]
+        clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)
         first = round(float(clips.starts[place]) * self.fps)
         return self.root / clips.files[place], first, int(self.episodes.length[place])
 

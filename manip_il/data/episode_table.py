@@ -59,17 +59,31 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
         names = [[name for name in pq.read_schema(path).names if not name.startswith("stats/")] for path in paths]
         tables = [read_file(path, wanted) for path, wanted in zip(paths, names, strict=True)]
         table = pa.concat_tables(tables, promote_options="permissive")
-        index = _numbers(table, layout.EPISODE_INDEX)
-        drawn = table.column(layout.DRAWN).to_pylist() if layout.DRAWN in table.column_names else []
-        tasks = table.column("tasks").to_pylist() if "tasks" in table.column_names else [[]] * len(table)
+
+        def numbers(name: str) -> I64:
+            return table.column(name).cast(pa.int64()).to_numpy()
+
+        def clips(key: str) -> Clips:
+            places = zip(
+                *(numbers(f"videos/{key}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True
+            )
+            files = [
+                info.video_path.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places
+            ]
+            return Clips(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
+
+        index, none = numbers(layout.EPISODE_INDEX), [None] * len(table)
+        drawn, tasks = (
+            table.column(name).to_pylist() if name in table.column_names else none for name in (layout.DRAWN, "tasks")
+        )
         return EpisodeTable(
             index=index,
-            length=_numbers(table, "length"),
-            start=_numbers(table, "dataset_from_index"),
-            stop=_numbers(table, "dataset_to_index"),
-            tasks=[[str(text) for text in texts or []] for texts in tasks],
-            clips={feature.key: _clips(table, info, feature.key) for feature in info.of_dtype("video")},
-            drawn={number: json.loads(text or "{}") for number, text in zip(index.tolist(), drawn, strict=False)},
+            length=numbers("length"),
+            start=numbers("dataset_from_index"),
+            stop=numbers("dataset_to_index"),
+            tasks=[texts or [] for texts in tasks],
+            clips={feature.key: clips(feature.key) for feature in info.of_dtype("video")},
+            drawn={number: json.loads(text or "{}") for number, text in zip(index.tolist(), drawn, strict=True)},
         )
 
 
@@ -86,18 +100,3 @@ def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statisti
                 own.setdefault(key, {})[name] = np.array(row[column])
             found.append(own)
     return found
-
-
-def _numbers(table: pa.Table, name: str, dtype: pa.DataType | None = None) -> NDArray[Any]:
-    """A column of whole numbers, or of another type, (T,)."""
-    column = table.column(name).cast(dtype or pa.int64())
-    if column.null_count:
-        raise ValueError(f"{name} lacks {column.null_count} values")
-    return column.to_numpy()
-
-
-def _clips(table: pa.Table, info: Info, key: str) -> Clips:
-    before = f"videos/{key}"
-    places = zip(*(_numbers(table, f"{before}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True)
-    files = [info.video_path.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places]
-    return Clips(files, _numbers(table, f"{before}/from_timestamp", pa.float64()))

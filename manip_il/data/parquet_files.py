@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Feature, reading
 from manip_il.data.pictures import to_png
-from manip_il.errors import ManipError, UnknownName
 
 _MIB = 1024 * 1024
 
@@ -94,30 +93,20 @@ def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table
 
 
 def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return columns of a file. Raises `ManipError` if it is damaged, `UnknownName` for a missing column."""
+    """Return columns of a file, those that it has. Raises `ManipError` if it is damaged."""
     with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
         # one thread: handing out pieces of one episode costs more than reading them
-        table = file.read(list(columns), use_threads=False)
-    for name in columns:
-        if name not in table.column_names:
-            raise UnknownName(f"column in {path}", name, table.column_names)
-    return table.replace_schema_metadata(None)
+        return file.read(list(columns), use_threads=False).replace_schema_metadata(None)
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Return a dataset's tasks by their number; the column of texts is pandas' index, with a name or without.
-
-    Raises `ManipError` for a file that cannot be read or holds no texts.
-    """
+    """Return a dataset's tasks by their number; the column of texts is pandas' index, with a name or without."""
     path = root / layout.TASKS
-    with reading(path), pq.ParquetFile(path) as file:
-        table = file.read()
-        texts = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
-        names = [name for name in texts if name in ("task", "__index_level_0__")] or texts
-        if len(names) != 1:
-            raise ManipError(f"it has {len(texts)} columns of text; expected the tasks' texts in one called task")
-        numbers = table.column(layout.TASK_INDEX).cast(pa.int64()).to_pylist()
-        return dict(zip(numbers, table.column(names[0]).to_pylist(), strict=True))
+    with reading(path):
+        table = read_file(path, pq.read_schema(path).names)
+        texts = [one.name for one in table.schema if one.type in (pa.string(), pa.large_string())]
+        name = "task" if "task" in texts else texts[-1]  # pandas writes an index behind the columns
+        return dict(zip(table.column(layout.TASK_INDEX).to_pylist(), table.column(name).to_pylist(), strict=True))
 
 
 def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
@@ -126,21 +115,13 @@ def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
     Raises `ValueError` if values have another kind or shape, or some are missing.
     """
     array: Any = column.combine_chunks()
-    rows, nested = len(array), False
-    while True:
-        if isinstance(array.type, pa.BaseExtensionType):
-            array = array.storage
-        if array.null_count:
-            raise ValueError(f"{feature.key!r} holds {array.null_count:,} missing values")
-        if not (pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type)):
-            break
-        array, nested = array.flatten(), True
-    values = array.to_numpy(zero_copy_only=False)
+    is_vector = feature.size > 1
+    while isinstance(array, pa.ExtensionArray | pa.ListArray | pa.FixedSizeListArray):
+        array, is_vector = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten(), True
     dtype = np.dtype(feature.dtype if feature.dtype in NUMBERS else object)
-    if values.dtype.kind != dtype.kind or len(values) != rows * feature.size:
-        shape = f"{feature.dtype} of shape {list(feature.shape)}"
-        raise ValueError(
-            f"{feature.key!r} has {len(values):,} of {array.type} in {rows:,} rows; info.json says {shape}"
-        )
-    values = values.astype(dtype, copy=False)  # files may hold numbers narrower
-    return values.reshape(rows, *feature.shape) if nested or feature.size > 1 else values
+    try:  # files may hold numbers narrower
+        values = array.to_numpy(zero_copy_only=False).astype(dtype, casting="same_kind", copy=False)
+        return values.reshape(len(column), *feature.shape if is_vector else ())
+    except (TypeError, ValueError) as error:
+        what = f"{feature.dtype} of shape {list(feature.shape)}"
+        raise ValueError(f"{feature.key!r} has no {what} in each of {len(column):,} rows: {error}") from error
