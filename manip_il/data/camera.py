@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from av.container import InputContainer
 from numpy.typing import NDArray
 
+from manip_il.data.atomic import writing
 from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.info import PICTURES, Info, reading
 from manip_il.data.parquet_files import read_file
@@ -95,13 +96,8 @@ class Camera:
         called with the number of frames decoded since the last call. Raises `ManipError` if there is no room.
         """
         shape = self.frames, 3, *self.size
-        with tempfile.TemporaryFile() as file:
-            size, folder = math.prod(shape), tempfile.gettempdir()
-            try:
-                os.posix_fallocate(file.fileno(), 0, size)  # else a full disk ends the process
-            except OSError as error:
-                what = f"cannot keep {size / 1e9:.1f} GB of decoded pictures in {folder}: {error.strerror}"
-                raise ManipError(f"{what}; make room, or set TMPDIR to another disk") from error
+        with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
+            os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # else a full disk ends the process
             decoded = np.memmap(file, np.uint8, "r+", shape=shape)
 
         def fill(rows: I64) -> int:

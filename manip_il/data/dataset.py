@@ -50,11 +50,8 @@ class Dataset:
 
     @classmethod
     def open(cls, root: Path) -> Dataset:
-        """Open a folder. Raises `ManipError` for one that is no dataset, or that holds pipes, devices or sockets."""
-        root = Path(root)
-        info = read_info(root)
-        refuse_irregular(root)
-        return cls(root, info)
+        """Open a folder. Raises `ManipError` for one that is no dataset."""
+        return cls(Path(root), read_info(Path(root)))
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -272,12 +269,3 @@ def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDA
             row += len(next(iter(piece.values()), ()))
         episode += dataset.info.episodes
     return joined
-
-
-def refuse_irregular(root: Path) -> None:
-    """Raise `ManipError` for a folder that holds anything besides files and folders."""
-    for path in root.rglob("*"):
-        if not (path.is_file() or path.is_dir()):
-            raise ManipError(
-                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
-            )

@@ -15,19 +15,17 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Feature, reading
 from manip_il.data.pictures import to_png
 
-_MIB = 1024 * 1024
-
 
 class ParquetFiles:
-    """Numbered parquet files, one open at a time; a new one starts once the open one has `size_in_mb`.
+    """Numbered parquet files, one open at a time; a new one starts once the open one is full.
 
     group_rows: rows that a row group has at least, but for a file's last. A writer keeps a description of every row
     group in memory until the file is closed, so many small ones would cost more than the rows.
     """
 
-    def __init__(self, folder: Path, template: str, schema: pa.Schema, size_in_mb: float, group_rows: int = 1):
+    def __init__(self, folder: Path, template: str, schema: pa.Schema, group_rows: int = 1):
         self._folder, self._template, self.schema = folder, template, schema
-        self._limit, self._group_rows = size_in_mb * _MIB, group_rows
+        self._limit, self._group_rows = layout.DATA_FILES_SIZE_IN_MB * 2**20, group_rows
         self._number = 0
         self._path = folder
         self._writer: pq.ParquetWriter | None = None

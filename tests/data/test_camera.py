@@ -37,7 +37,7 @@ def roots(
     folder = tmp_path_factory.mktemp("datasets")
     for codec in ("h264", "libsvtav1"):
         five = numbered_episodes(make_episode, two, 5)
-        write(five, folder / codec, two, video=VideoConfig(codec), video_files_size_in_mb=0.001)
+        write(five, folder / codec, two, video=VideoConfig(codec), size=0.001)
     os.environ.setdefault("SVT_LOG", "1")  # or the encoder tells its life
     for kind in RECORDED:
         record(folder / kind, kind, 3)
@@ -73,7 +73,7 @@ def test_no_room_for_decoded_pictures_is_one_line(roots, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(ManipError, match=r"cannot keep 0\.0 GB of decoded pictures in .*: No space left .*TMPDIR"):
+    with pytest.raises(ManipError, match=r"cannot write .*: No space left"):
         Dataset.open(roots["image"]).camera(FRONT).decode()
 
 

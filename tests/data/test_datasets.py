@@ -25,7 +25,7 @@ from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 from ..damage import DATA, cut, digests, edit_json
-from ..pictures import assert_comes_back
+from ..pictures import assert_comes_back, write
 
 FINGERPRINT = {"mujoco": "3.11.0"}
 HERE = Path(__file__).parent
@@ -143,7 +143,7 @@ def test_a_merge_warns_of_different_environments(root, tmp_path, episodes, spec,
 
 
 def test_a_new_file_starts_where_one_is_full_and_a_missing_one_is_noticed(tmp_path, episodes, spec):
-    write_dataset(episodes * 4, tmp_path / "small", spec, data_files_size_in_mb=0.01, **OPTIONS)
+    write(episodes * 4, tmp_path / "small", spec, size=0.01)
     files = sorted((tmp_path / "small").glob(layout.DATA_FILES))
     assert len(files) > 1
     assert Dataset.open(tmp_path / "small").columns(["index"])["index"].tolist() == list(range(80))

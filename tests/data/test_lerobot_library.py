@@ -197,7 +197,7 @@ def test_every_frame_that_lerobot_loads_is_the_one_written(ours, episodes, spec)
 @pytest.mark.parametrize("file_size", [200.0, 0.001])
 def test_lerobot_decodes_the_right_pictures(tmp_path, make_episode, two, backend, file_size):
     episodes = numbered_episodes(make_episode, two, 6)
-    root = write(episodes, tmp_path / "film", two, video_files_size_in_mb=file_size)
+    root = write(episodes, tmp_path / "film", two, size=file_size)
     assert (len(list(root.rglob("*.mp4"))) > 2) == (file_size < 1)
     step = 1 / two.fps
     dataset = load(root, video_backend=backend, delta_timestamps={key: [-step, 0] for key in two.image_keys})

@@ -57,7 +57,7 @@ def test_every_frame_comes_back_in_its_place_nearly_as_it_was(root, filmed):
 
 def test_a_new_file_starts_between_episodes(tmp_path, make_episode, two):
     episodes = numbered_episodes(make_episode, two, 9)
-    write(episodes, tmp_path / "small", two, video_files_size_in_mb=0.001)
+    write(episodes, tmp_path / "small", two, size=0.001)
     rows = video_rows(tmp_path / "small")
     assert sum(path.parts[-3] == FRONT for path in rows) > 2
     assert {path: count_frames(path) for path in rows} == rows
