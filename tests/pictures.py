@@ -18,10 +18,10 @@ from PIL import Image
 
 from manip_il.data import lerobot_layout
 from manip_il.data import schema as s
+from manip_il.data.camera import open_video
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
 
 from .damage import DATA, edit_json

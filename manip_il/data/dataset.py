@@ -20,9 +20,15 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.camera import Camera
-from manip_il.data.episode_table import EpisodeTable, read_episode_table, read_picture_statistics
 from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_info, reading
-from manip_il.data.parquet_files import read_file, read_tasks, to_numpy
+from manip_il.data.parquet_files import (
+    EpisodeTable,
+    read_episode_table,
+    read_file,
+    read_picture_statistics,
+    read_tasks,
+    to_numpy,
+)
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode

@@ -19,8 +19,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from manip_il import checks
+from manip_il.data.camera import open_video
 from manip_il.data.info import read_info
-from manip_il.data.pictures import open_video
 from manip_il.errors import ManipError
 
 _BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG

@@ -152,17 +152,18 @@ def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
     return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
 
 
-def check_same_spec(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:
+def check_same_spec(
+    left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec, also: Sequence[str] = ()
+) -> None:
     """Raise `MismatchError` unless actions and observations mean the same on both sides.
 
-    The task may differ: a policy may be tried on another one.
+    The task may differ: a policy may be tried on another one. also: other fields that must agree.
     """
-    for what in ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning"):
-        left_value, right_value = getattr(left, what), getattr(right, what)
-        if what == "object":
-            left_value, right_value = left_value or OWN_OBJECT, right_value or OWN_OBJECT
-        if left_value != right_value:
-            raise MismatchError(what, left_name, left_value, right_name, right_value)
+    for what in ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning", *also):
+        ours, theirs = getattr(left, what), getattr(right, what)
+        if ours != theirs:
+            none = OWN_OBJECT if what == "object" else "none"
+            raise MismatchError(what, left_name, ours or none, right_name, theirs or none)
 
 
 def fitted_columns(episode: Episode, spec: RobotTaskSpec, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:

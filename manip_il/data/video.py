@@ -24,8 +24,8 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.camera import Pictures, open_video
 from manip_il.data.dataset import Dataset
-from manip_il.data.pictures import Pictures, open_video
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
 

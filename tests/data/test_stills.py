@@ -12,12 +12,12 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import schema as s
+from manip_il.data.camera import decode_picture
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.pictures import decode_picture, to_png
 from manip_il.mdp import Episode
 
-from ..pictures import episode_frames
+from ..pictures import encoded, episode_frames
 
 FRONT, SIDE = s.IMAGES + "front", s.IMAGES + "side"
 
@@ -76,7 +76,7 @@ def test_lerobots_own_description_is_enough(root, pictured):
     [
         (None, "cannot identify"),
         (b"GIF89a", "cannot identify"),
-        (to_png(np.zeros((4, 4), np.uint8)), "a picture of mode L; expected RGB"),
+        (encoded(np.zeros((4, 4), np.uint8)), "a picture of mode L; expected RGB"),
     ],
 )
 def test_a_picture_that_is_none_or_grey_is_refused(content: bytes | None, words: str):
