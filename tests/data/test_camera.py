@@ -14,10 +14,9 @@ import pytest
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
-from ..damage import edit_json
 from ..pictures import numbered_episodes, write
 
 pytestmark = pytest.mark.slow
@@ -75,19 +74,3 @@ def test_no_room_for_decoded_pictures_is_one_line(roots, monkeypatch):
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(ManipError, match=r"cannot write .*: No space left"):
         Dataset.open(roots["image"]).camera(FRONT).decode()
-
-
-def test_what_is_not_there_is_one_line(roots, tmp_path, two):
-    import shutil
-
-    for name, change in (("h264", "cut"), ("image", "size")):
-        root = tmp_path / name
-        shutil.copytree(roots[name], root)
-        late = Dataset.open(root).camera(FRONT)
-        if change == "cut":
-            shutil.rmtree(root / "videos")
-        else:
-            edit_json(root / "meta/info.json", lambda info: info["features"][FRONT].update(shape=[8, 8, 3]))
-            late = Dataset.open(root).camera(FRONT)
-        with pytest.raises((ManipError, MismatchError), match=r"cannot read .*\.mp4|shape of observation"):
-            late.rows(np.array([3]))

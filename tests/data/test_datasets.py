@@ -68,6 +68,9 @@ def test_what_a_dataset_says_of_itself(root, spec):
     info = Dataset.open(root).info
     assert (info.robot, info.fps, info.episodes, info.frames) == ("panda", 20, 3, 20)
     assert Dataset.open(root).count_successes() == 2
+    edit_json(root / layout.OURS, lambda ours: ours["spec"].pop("schema"))
+    with pytest.raises(ManipError, match=r"manip_il\.json: .*written with schema 1"):
+        _ = Dataset.open(root).spec
 
 
 def test_episodes_come_one_by_one_nothing_is_there_before_the_last_and_the_bytes_are_the_same(

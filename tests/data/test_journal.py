@@ -19,7 +19,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import journal
@@ -90,6 +89,13 @@ def filmed(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> 
     return journal.Journal(tmp_path / "filmed", spec, FINGERPRINT).write(numbered_episodes(make_episode, spec)[0])
 
 
+def test_pictures_come_back_bit_for_bit(filmed, make_episode, spec):
+    written = numbered_episodes(make_episode, with_cameras(spec, "front", "wrist"))[0]
+    columns = journal.read_journal(filmed)[1].columns
+    for key in (s.IMAGES + "front", s.IMAGES + "wrist"):
+        np.testing.assert_array_equal(columns[key], written.columns[key])
+
+
 @given(st.integers(0, 10**9), st.integers(1, 255))
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_changed_byte_anywhere_is_refused_by_name_or_changes_nothing(filmed, place, change):
@@ -115,25 +121,6 @@ def test_a_file_cut_short_is_refused_and_set_aside_so_that_its_seed_is_free(path
     assert journal.list_seeds(path.parent) == []
     assert path.with_name("episode-000000000017.mcap.damaged").read_bytes() == data
     assert "(set aside as episode-000000000017.mcap.damaged)" in caplog.text
-
-
-def test_another_mcap_and_a_missing_file_are_refused(tmp_path):
-    other = tmp_path / "episode-000000000001.mcap"
-    with other.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.finish()
-    with pytest.raises(ManipError, match="not a complete episode"):
-        journal.read_journal(other)
-    with pytest.raises(ManipError, match=r"episode-000000000002\.mcap is not a complete episode: .*No such file"):
-        journal.read_journal(tmp_path / "episode-000000000002.mcap")
-
-
-def test_what_cannot_be_read_again_is_not_written(tmp_path, spec):
-    episode = Episode(1, {"x": np.array([{}, {}], dtype=object)}, True, True)
-    with pytest.raises(ValueError, match="allow_pickle"):
-        journal.Journal(tmp_path, spec, {}).write(episode)
-    assert list(tmp_path.iterdir()) == []
 
 
 def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:

@@ -25,7 +25,6 @@ from ..damage import DATA, EPISODES
 from ..pictures import (
     assert_comes_back,
     count_frames,
-    episode_frames,
     numbered_episodes,
     numbers_of,
     video_rows,
@@ -107,26 +106,6 @@ def assert_loads(root: Path, episodes: list[Episode]) -> None:
         assert item["timestamp"] == pytest.approx(t / dataset.fps)
 
 
-def test_the_layout_is_the_librarys(spec):
-    from lerobot.datasets import utils
-    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
-    from lerobot.datasets.feature_utils import get_hf_features_from_features
-    from lerobot.utils.constants import DEFAULT_FEATURES
-
-    assert layout.VERSION == CODEBASE_VERSION
-    assert (layout.INFO, layout.STATS, layout.TASKS) == (utils.INFO_PATH, utils.STATS_PATH, utils.DEFAULT_TASKS_PATH)
-    assert (layout.DATA_PATH, layout.EPISODES_PATH) == (utils.DEFAULT_DATA_PATH, utils.DEFAULT_EPISODES_PATH)
-    assert layout.CHUNKS_SIZE == utils.DEFAULT_CHUNK_SIZE
-    assert layout.DATA_FILES_SIZE_IN_MB == utils.DEFAULT_DATA_FILE_SIZE_IN_MB
-    assert layout.VIDEO_FILES_SIZE_IN_MB == utils.DEFAULT_VIDEO_FILE_SIZE_IN_MB
-    assert layout.VIDEO_PATH == utils.DEFAULT_VIDEO_PATH
-    assert layout.all_features(s.features(spec)) == s.features(spec) | DEFAULT_FEATURES
-    hugging_face = json.loads(layout.data_schema(layout.all_features(s.features(spec))).metadata[b"huggingface"])[
-        "info"
-    ]["features"]
-    assert hugging_face == get_hf_features_from_features(layout.all_features(s.features(spec))).to_dict()
-
-
 def test_video_settings_are_the_librarys():
     from lerobot.configs.video import RGBEncoderConfig
 
@@ -156,6 +135,9 @@ def test_parquet_schemas_equal_those_of_lerobots_writer(pair, name):
     ours = [layout.DRAWN] if name == EPISODES else []
     assert [column for column in left.names if column not in right.names] == ours
     assert pa.schema([field for field in left if field.name not in ours]).equals(right)
+    if name == DATA:
+        ours, theirs = (json.loads(one.metadata[b"huggingface"])["info"]["features"] for one in (left, right))
+        assert ours == theirs
 
 
 def test_episodes_and_statistics_equal_those_of_lerobots_writer_to_their_precision(pair):
@@ -175,15 +157,6 @@ def test_episodes_and_statistics_equal_those_of_lerobots_writer_to_their_precisi
         for name in ("min", "max", "mean", "std", "count"):
             if not key.startswith(s.IMAGES):  # LeRobot looks at some of the pixels
                 np.testing.assert_allclose(left[key][name], table[name], rtol=1e-4, atol=1e-3, err_msg=f"{key} {name}")
-
-
-def test_pictures_equal_those_of_lerobots_writer(films, filmed, two):
-    assert Dataset.open(films[1]).spec.image_keys == two.image_keys
-    for key in two.image_keys:
-        for number, episode in enumerate(filmed):
-            ours, theirs = (episode_frames(root, key, number) for root in films)
-            np.testing.assert_array_equal(ours, theirs)
-            assert numbers_of(theirs) == numbers_of(episode.columns[key])
 
 
 def test_every_frame_that_lerobot_loads_is_the_one_written(ours, episodes, spec):
@@ -265,14 +238,6 @@ def test_a_dataset_split_and_merged_again_by_lerobots_command(tmp_path, recorded
     new = ("--new_repo_id", "a/all", "--new_root", str(tmp_path / "all"))
     edit(*new, "--operation.type", "merge", *words)
     assert_holds(tmp_path / "all", episodes)
-
-
-def test_lerobot_joins_ours_with_its_own(tmp_path, episodes, spec):
-    from lerobot.datasets.aggregate import aggregate_datasets
-
-    roots = [write(episodes, tmp_path / "ours", spec), write_by_lerobot(episodes, tmp_path / "theirs", spec)]
-    aggregate_datasets(["a/ours", "a/theirs"], "a/all", roots=roots, aggr_root=tmp_path / "all")
-    assert_holds(tmp_path / "all", episodes * 2)
 
 
 def test_lerobot_records_on_into_ours(tmp_path, recorded, seen):

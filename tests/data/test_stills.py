@@ -65,12 +65,6 @@ def test_the_decoded_pictures_and_lerobots_are_the_same(root, seen):
     np.testing.assert_array_equal(exact.numpy(), whole[8].transpose(2, 0, 1))
 
 
-def test_lerobots_own_description_is_enough(root, pictured):
-    (root / "meta" / "manip_il.json").unlink()
-    spec = Dataset.open(root).spec
-    assert (spec.cameras, spec.image_size, spec.video) == (pictured.cameras, pictured.image_size, False)
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
