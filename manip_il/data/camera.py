@@ -116,13 +116,8 @@ class Camera:
             decoded[rows[0] : rows[-1] + 1] = self.rows(rows).transpose(0, 3, 1, 2)
             return len(rows)
 
-        # consecutive rows of one part each
         step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
-        pieces = (
-            np.arange(start, min(start + step, part.row + part.count))
-            for part in self.parts
-            for start in range(part.row, part.row + part.count, step)
-        )
+        pieces = np.split(np.arange(self.frames), range(step, self.frames, step))
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
             for count in threads.map(fill, pieces):
                 if on_frames is not None:

@@ -111,9 +111,8 @@ class TableWriter:
         columns = {**columns, **self._index_columns(numbers)}
         statistics = dict(films[0].picture_statistics[films[1]]) if films else {}
         for key, feature in self.features.items():
-            if feature["dtype"] in PICTURES and key not in statistics:
-                frames = films[0].frames(key, films[0].rows_of(films[1])) if films else columns[key]
-                statistics[key] = picture_statistics(frames)
+            if feature["dtype"] in PICTURES and not films:
+                statistics[key] = picture_statistics(columns[key])
         plain = {key: one for key, one in columns.items() if key not in statistics and one.dtype.kind not in "OU"}
         statistics |= column_statistics(plain)
         chunk, file = self._data.write(to_table(columns, self._data.schema))
