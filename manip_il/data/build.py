@@ -208,21 +208,19 @@ def rewrite_columns(
     it raises, `ManipError` for columns of other lengths than the episodes.
     """
 
-    def changed() -> Iterator[Episode | tuple[Episode, Films]]:
-        for item, fresh in zip(_with_films(dataset), columns, strict=True):
-            episode, films = (item, None) if isinstance(item, Episode) else item
+    def changed() -> Iterator[tuple[Episode, Films | None]]:
+        for (episode, films), fresh in zip(_with_films(dataset), columns, strict=True):
             own = episode.columns | {key: values.reshape(len(values), -1) for key, values in fresh.items()}
-            anew = dataclasses.replace(episode, columns=own)
-            yield (anew, films) if films else anew
+            yield dataclasses.replace(episode, columns=own), films
 
     return write_dataset(changed(), target, dataset.spec, provenance, **options)
 
 
-def _with_films(dataset: Dataset) -> Iterator[Episode | tuple[Episode, Films]]:
+def _with_films(dataset: Dataset) -> Iterator[tuple[Episode, Films | None]]:
     """Yield the episodes of a dataset; pictures in films are not decoded, and come as these."""
     films = bool(dataset.spec.cameras and dataset.spec.video)
     for number, episode in enumerate(dataset.read_episodes(pictures=not films)):
-        yield (episode, (dataset, number)) if films else episode
+        yield episode, (dataset, number) if films else None
 
 
 def dataset_sha256(root: Path) -> str:

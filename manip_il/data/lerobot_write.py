@@ -38,7 +38,7 @@ Films = tuple[Dataset, int]  # a dataset and the number of its episode that has 
 
 
 def write_dataset(
-    episodes: Iterable[Episode | tuple[Episode, Films]],
+    episodes: Iterable[Episode | tuple[Episode, Films | None]],
     root: Path,
     spec: RobotTaskSpec,
     provenance: Mapping[str, Any] | None = None,
