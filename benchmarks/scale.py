@@ -120,7 +120,7 @@ def measure(root: Path, count: int, before: int) -> Row:
 def others(root: Path) -> dict[str, Run]:
     """Measure the commands that only read a dataset."""
     away, back = root.with_name("remote"), root.with_name("back")
-    opened = f"Dataset.open(Path({str(root)!r})).summary"
+    opened = f"Dataset.open(Path({str(root)!r})).count_successes()"
     info = f"from pathlib import Path; from manip_il.data.dataset import Dataset; {opened}"
     runs = {
         "check": manip_il("data", "check", str(root)),

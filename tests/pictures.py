@@ -13,13 +13,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 from PIL import Image
 
+from manip_il.data import lerobot_layout
 from manip_il.data import schema as s
+from manip_il.data.camera import open_video
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
 
 from .damage import DATA, edit_json
@@ -82,9 +84,14 @@ def store_pictures(root: Path, key: str, pictures: list[bytes], size: tuple[int,
     return path
 
 
-def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options: Any) -> Path:
-    """Write a dataset with options of `write_dataset`."""
-    write_dataset(episodes, root, spec, **({"repo_id": "someone/lift", "fingerprint": {}} | options))
+def write(
+    episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, size: float | None = None, **options: Any
+) -> Path:
+    """Write a dataset with options of `write_dataset`. size: of its files [MB]."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("DATA_FILES_SIZE_IN_MB", "VIDEO_FILES_SIZE_IN_MB") if size else ():
+            patch.setattr(lerobot_layout, name, size)
+        write_dataset(episodes, root, spec, **({"repo_id": "someone/lift", "fingerprint": {}} | options))
     return root
 
 

@@ -122,7 +122,7 @@ def read_dataset(root: Path) -> None:
     open_files(root)
     dataset = Dataset.open(root)
     dataset.columns()
-    _ = dataset.summary, dataset.statistics, dataset.own
+    _ = dataset.count_successes(), dataset.statistics, dataset.own
     for _ in dataset.read_episodes():
         pass
 

@@ -251,11 +251,12 @@ class ImitationRun(Run):
         made = Rollouts(0)
         with self._timed("collect"):
             if datasets and not self._is_recorded(0):
-                given = {str(one): dataset_sha256(one) for one in datasets}
-                merge_datasets(datasets, root, repo_id=self._repo_id(0), provenance={"given": given})
+                sources = {str(one): dataset_sha256(one) for one in datasets}
+                merge_datasets(datasets, root, repo_id=self._repo_id(0), provenance={"given": sources})
             if datasets:
-                info, labels = Dataset.open(root).summary, _count_labels(root)
-                made = Rollouts(0, root, 1.0, labels, labels, info.episodes, info.success or 0, info.frames)
+                given, labels = Dataset.open(root), _count_labels(root)
+                successes = given.count_successes()
+                made = Rollouts(0, root, 1.0, labels, labels, given.info.episodes, successes, len(given))
         self._made[0] = made
         return made
 

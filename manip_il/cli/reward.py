@@ -79,8 +79,8 @@ class IrlOptions:
         from manip_il.rewards.methods import learn
         from manip_il.seeding import rng_for, stream_base
 
-        info, begin, timings = Dataset.open(self.dataset).summary, time.monotonic(), dict[str, float]()
-        with progress(info.episodes, f"irl {self.dataset}") as bar:
+        dataset, begin, timings = Dataset.open(self.dataset), time.monotonic(), dict[str, float]()
+        with progress(dataset.info.episodes, f"irl {self.dataset}") as bar:
             carried = read_carried(self.dataset, bar.advance)
         timings["reading"] = time.monotonic() - begin
         begin, rng = time.monotonic(), rng_for(stream_base("training", self.seed), "irl")
@@ -95,7 +95,7 @@ class IrlOptions:
         if line := open_line(found):
             warn(line)
         say(f"report: {folder / PAGE}")
-        robot = "" if info.robot == "panda" else f"--robot.type={info.robot} "
+        robot = "" if dataset.spec.robot == "panda" else f"--robot.type={dataset.spec.robot} "
         say(f"next: manip-il eval --policy.type=expert {robot}--task.type=carry --task.reward={folder / FILE_NAME}")
 
 

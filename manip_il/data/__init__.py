@@ -6,11 +6,10 @@ environment must share. `episodes.py` turns transitions into an `Episode` with t
 `journal.py` writes one MCAP file for every finished episode, at once: a journal. `lerobot_write.py` writes datasets
 episode by episode with pyarrow and PyAV. `build.py` makes a dataset of rollouts (as they come, or of a folder of
 journals), one of several datasets, or one with other numbers in some of its columns. `dataset.py` opens any LeRobot
-dataset: `info.py` and `episode_table.py` parse its `meta/`, `camera.py` finds and decodes its pictures,
+dataset: `info.py` and `parquet_files.py` parse its `meta/` and its columns, `camera.py` finds and decodes its pictures,
 `statistics.py` has its statistics.
 Around them: LeRobot's paths and Arrow types (`lerobot_layout.py`), several as one for its policies (`joined.py`),
-parquet (`parquet_files.py`), films and pictures (`video.py` writes, `pictures.py` reads, and nothing else opens a
-picture). `gate.py` tries in a child process what arrives from outside.
+films (`video.py` writes them). `gate.py` tries in a child process what arrives from outside.
 
 What the room promises:
 

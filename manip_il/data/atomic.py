@@ -8,7 +8,6 @@ import errno
 import fcntl
 import os
 import shutil
-import tempfile
 from collections.abc import Generator
 from pathlib import Path
 
@@ -43,12 +42,16 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
         _refuse_full(root)
     with writing(root):
         root.parent.mkdir(parents=True, exist_ok=True)
-        _remove_leftovers(root)
-        partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
+        for left in root.parent.glob(f".{root.name}.*{PARTIAL}"):
+            lock = os.open(left, os.O_RDONLY)
+            if _try_lock(lock):  # refused while its writer lives
+                shutil.rmtree(left, ignore_errors=True)
+            os.close(lock)
+        partial = _partial(root)
+        partial.mkdir()
     lock = os.open(partial, os.O_RDONLY)
-    try_lock(lock)  # the kernel lets go when the writer dies: so leftovers are known
+    _try_lock(lock)  # the kernel lets go when the writer dies: so leftovers are known
     try:
-        partial.chmod(0o777 & ~umask())
         with writing(root):
             yield partial
             _libc("syncfs", lock)  # in one call, however many files it has
@@ -77,13 +80,7 @@ def exclusive(folder: Path) -> Generator[None]:
     path = folder.absolute().with_name(f".{folder.absolute().name}.lock")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    handle = None
-    try:
-        handle = _lock(folder, path)
-    except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS) or not folder.is_dir():
-            with writing(path):
-                raise
+        handle = _hold(folder, path)
     try:
         yield
     finally:
@@ -92,32 +89,21 @@ def exclusive(folder: Path) -> Generator[None]:
             os.close(handle)
 
 
-def _lock(folder: Path, path: Path) -> int:
-    while True:
-        handle = checks.open_regular(path, os.O_RDWR | os.O_CREAT)
-        if not try_lock(handle):
-            holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
-            os.close(handle)
-            raise FolderBusyError(folder, holder or "unknown")
-        if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
-            return handle
-        os.close(handle)  # its last holder removed it meanwhile: take the new one
-
-
-def try_lock(handle: int) -> bool:
-    """Lock an open file or folder until it is closed; return False if another process holds it.
-
-    True also on a network file system that knows no locks.
-    """
+def _hold(folder: Path, path: Path) -> int | None:
+    """Return the lock file, open and locked; None if it may not be written."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass
-    return True
+        handle = checks.open_regular(path, os.O_RDWR | os.O_CREAT)
+    except OSError as error:
+        if folder.is_dir() and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+            return None
+        raise
+    if not _try_lock(handle):
+        holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
+        os.close(handle)
+        raise FolderBusyError(folder, holder or "unknown")
+    os.ftruncate(handle, 0)
+    os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+    return handle
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -125,13 +111,11 @@ def write_file(path: Path, data: bytes) -> None:
 
     Its folder is made. Raises `ManipError` if the disk is full or read-only.
     """
+    partial = _partial(path)
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.parent)
-        partial = Path(name)
         try:
-            with os.fdopen(handle, "wb") as stream:
-                os.fchmod(stream.fileno(), 0o666 & ~umask())
+            with partial.open("xb") as stream:
                 stream.write(data)
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -151,6 +135,21 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
+def _partial(path: Path) -> Path:
+    """A sibling that nobody else has."""
+    return path.with_name(f".{path.name}.{os.urandom(6).hex()}{PARTIAL}")
+
+
+def _try_lock(handle: int) -> bool:
+    """Lock an open file or folder until it is closed; return False if another process holds it."""
+    with contextlib.suppress(OSError):  # of a cluster's file system that knows no locks
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+    return True
+
+
 def _libc(name: str, *arguments: int | bytes) -> None:
     """Call a function of Linux's C library that Python does not have."""
     if getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments):
@@ -161,18 +160,3 @@ def _libc(name: str, *arguments: int | bytes) -> None:
 def _refuse_full(root: Path) -> None:
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise FolderExistsError(root)
-
-
-def _remove_leftovers(root: Path) -> None:
-    for partial in root.parent.glob(f".{root.name}.*{PARTIAL}"):
-        lock = os.open(partial, os.O_RDONLY)
-        if try_lock(lock):  # refused while its writer lives
-            shutil.rmtree(partial, ignore_errors=True)
-        os.close(lock)
-
-
-def umask() -> int:
-    """Return the mask that new files are made with."""
-    mask = os.umask(0o077)  # there is no way to only read it
-    os.umask(mask)
-    return mask

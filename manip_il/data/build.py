@@ -87,7 +87,11 @@ class Recording:
             nonlocal failed, found
             labels = 0
             for journal, rollout in itertools.chain([first], rollouts):
-                _check_source(journal, rollout.seed, about)
+                name = f"the journal of seed {rollout.seed}"
+                if journal.spec != about.spec:
+                    raise MismatchError("robot, task or cameras", name, journal.spec, "the first", about.spec)
+                for line in compare_fingerprints(name, journal.fingerprint, "the first", about.fingerprint):
+                    _LOG.warning("%s", line)
                 if self._is_full(found, labels):
                     continue
                 seeds.append(rollout.seed)
@@ -117,14 +121,6 @@ class Recording:
         """Whether every asked episode or label is in."""
         asked = (self.episodes, episodes), (self.labels, labels)
         return any(most is not None and found >= most for most, found in asked)
-
-
-def _check_source(journal: Journal, seed: int, first: Journal) -> None:
-    name = f"the journal of seed {seed}"
-    if journal.spec != first.spec:
-        raise MismatchError("robot, task or cameras", name, journal.spec, "the first", first.spec)
-    for line in compare_fingerprints(name, journal.fingerprint, "the first", first.fingerprint):
-        _LOG.warning("%s", line)
 
 
 def _first_labels(episode: Episode, most: int) -> Episode:
@@ -190,20 +186,17 @@ def merge_datasets(
     if not roots:
         raise ManipError("no datasets to merge")
     opened = [Dataset.open(source) for source in roots]
-    specs, first = [one.spec for one in opened], opened[0].fingerprint
+    about = next((one for one in opened if one.spec.task != UNKNOWN_TASK), opened[0])
+    own = opened[0].fingerprint
     for one in opened:
-        check_same_spec(str(roots[0]), specs[0], str(one.root), one.spec)
-        for what in ("sim_state_size", "task"):
-            left, right = getattr(specs[0], what), getattr(one.spec, what)
-            if left != right and UNKNOWN_TASK not in (left, right):
-                raise MismatchError(what, str(roots[0]), left, str(one.root), right)
-        for warning in compare_fingerprints(str(roots[0]), first, str(one.root), one.fingerprint):
+        also = ("sim_state_size", *(("task",) if one.spec.task != UNKNOWN_TASK else ()))
+        check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
+        for warning in compare_fingerprints(str(roots[0]), own, str(one.root), one.fingerprint):
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
-    spec = next((spec for spec in specs if spec.task != UNKNOWN_TASK), specs[0])
-    about: dict[str, Any] = {"repo_id": repo_id, "fingerprint": first if fingerprint is None else fingerprint}
+    options: dict[str, Any] = {"repo_id": repo_id, "fingerprint": own if fingerprint is None else fingerprint}
     episodes = itertools.chain.from_iterable(map(_with_films, opened))
-    return write_dataset(episodes, root, spec, {**(provenance or {}), "merged": sources}, **about)
+    return write_dataset(episodes, root, about.spec, {**(provenance or {}), "merged": sources}, **options)
 
 
 def rewrite_columns(
@@ -215,21 +208,19 @@ def rewrite_columns(
     it raises, `ManipError` for columns of other lengths than the episodes.
     """
 
-    def changed() -> Iterator[Episode | tuple[Episode, Films]]:
-        for item, fresh in zip(_with_films(dataset), columns, strict=True):
-            episode, films = (item, None) if isinstance(item, Episode) else item
+    def changed() -> Iterator[tuple[Episode, Films | None]]:
+        for (episode, films), fresh in zip(_with_films(dataset), columns, strict=True):
             own = episode.columns | {key: values.reshape(len(values), -1) for key, values in fresh.items()}
-            anew = dataclasses.replace(episode, columns=own)
-            yield (anew, films) if films else anew
+            yield dataclasses.replace(episode, columns=own), films
 
     return write_dataset(changed(), target, dataset.spec, provenance, **options)
 
 
-def _with_films(dataset: Dataset) -> Iterator[Episode | tuple[Episode, Films]]:
+def _with_films(dataset: Dataset) -> Iterator[tuple[Episode, Films | None]]:
     """Yield the episodes of a dataset; pictures in films are not decoded, and come as these."""
     films = bool(dataset.spec.cameras and dataset.spec.video)
     for number, episode in enumerate(dataset.read_episodes(pictures=not films)):
-        yield (episode, (dataset, number)) if films else episode
+        yield episode, (dataset, number) if films else None
 
 
 def dataset_sha256(root: Path) -> str:

@@ -1,7 +1,13 @@
-"""The pictures of one camera of a LeRobot v3.0 dataset, in films or in the data files, decoded when they are read."""
+"""The pictures of one camera of a LeRobot v3.0 dataset, in films or in the data files, decoded when they are read.
+
+Nothing else opens a picture of a dataset, and this takes MP4, PNG and JPEG alone. FFmpeg looks at what a file holds,
+not at its name: a playlist named `.mp4` makes it open other files and addresses. Pillow hands other formats to other
+programs (EPS to Ghostscript).
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import tempfile
@@ -10,24 +16,31 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pyarrow.parquet as pq
 from av.container import InputContainer
 from numpy.typing import NDArray
+from PIL import Image
 
-from manip_il.data.episode_table import EpisodeTable
+from manip_il.data.atomic import writing
 from manip_il.data.info import PICTURES, Info, reading
-from manip_il.data.parquet_files import read_file
-from manip_il.data.pictures import Pictures, decode_picture, open_video, read_frames
+from manip_il.data.parquet_files import EpisodeTable, read_file
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
 I64 = NDArray[np.int64]
+Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
 _PIECE_BYTES = 32 * 1024 * 1024  # of pictures that a thread decodes at once
 _PIECE = 32  # frames that are, however large: decoding starts at the last key frame before them
+_OPTIONS = {
+    "protocol_whitelist": "file",
+    "enable_drefs": "0",  # tracks that are in other files
+}
 _OPEN_FILMS, _OPEN_TABLES = 32, 4  # files that one process holds open
 
 
@@ -95,26 +108,16 @@ class Camera:
         called with the number of frames decoded since the last call. Raises `ManipError` if there is no room.
         """
         shape = self.frames, 3, *self.size
-        with tempfile.TemporaryFile() as file:
-            size, folder = math.prod(shape), tempfile.gettempdir()
-            try:
-                os.posix_fallocate(file.fileno(), 0, size)  # else a full disk ends the process
-            except OSError as error:
-                what = f"cannot keep {size / 1e9:.1f} GB of decoded pictures in {folder}: {error.strerror}"
-                raise ManipError(f"{what}; make room, or set TMPDIR to another disk") from error
+        with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
+            os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # else a full disk ends the process
             decoded = np.memmap(file, np.uint8, "r+", shape=shape)
 
         def fill(rows: I64) -> int:
             decoded[rows[0] : rows[-1] + 1] = self.rows(rows).transpose(0, 3, 1, 2)
             return len(rows)
 
-        # consecutive rows of one part each
         step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
-        pieces = (
-            np.arange(start, min(start + step, part.row + part.count))
-            for part in self.parts
-            for start in range(part.row, part.row + part.count, step)
-        )
+        pieces = np.split(np.arange(self.frames), range(step, self.frames, step))
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
             for count in threads.map(fill, pieces):
                 if on_frames is not None:
@@ -136,6 +139,42 @@ class Camera:
             what, found = f"shape of {self.key}", pictures.shape[1:]
             raise MismatchError(what, f"frame {rows[0]}", found, f"info.json of {self.root}", (*self.size, 3))
         return pictures
+
+
+def decode_picture(content: bytes | None) -> Pictures:
+    """Return the picture (height, width, 3) in the content of a PNG or JPEG file.
+
+    Raises `ValueError` or `OSError` for another format, one that is not RGB, or None.
+    """
+    with Image.open(BytesIO(content or b""), formats=("PNG", "JPEG")) as picture:
+        if picture.mode != "RGB":
+            raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
+        return np.asarray(picture)
+
+
+def open_video(path: Path) -> InputContainer:
+    """Open an MP4 file for reading; its pictures are not decoded yet. Raises `av.FFmpegError` for what is none."""
+    return av.open(f"file:{path}", format="mp4", options=_OPTIONS)
+
+
+def read_frames(container: InputContainer, first: int, count: int, fps: float) -> Pictures:
+    """Decode frames `first` to `first + count - 1` of an open video, (count, height, width, 3).
+
+    Raises `ValueError` if it does not hold each of them, and what the decoder raises.
+    """
+    stream = container.streams.video[0]
+    tick = stream.time_base or 1  # [s]
+    container.seek(round(first / fps / tick), stream=stream)  # to the key frame there or before
+    pictures: list[NDArray[np.uint8]] = []
+    for frame in itertools.islice(container.decode(stream), first + count):  # also where more claim to come before
+        ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
+        if ahead == 0:
+            pictures.append(frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False))
+        if ahead > 0 or len(pictures) == count:
+            break
+    if len(pictures) != count:
+        raise ValueError(f"it has no frame {first + len(pictures)}; its dataset counts {count} from {first} on")
+    return np.stack(pictures)
 
 
 @lru_cache(_OPEN_FILMS)

@@ -20,9 +20,15 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.camera import Camera
-from manip_il.data.episode_table import EpisodeTable, read_episode_table, read_picture_statistics
-from manip_il.data.info import NUMBERS, PICTURES, DatasetInfo, Feature, Info, read_info, reading
-from manip_il.data.parquet_files import read_file, read_tasks, to_numpy
+from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_info, reading
+from manip_il.data.parquet_files import (
+    EpisodeTable,
+    read_episode_table,
+    read_file,
+    read_picture_statistics,
+    read_tasks,
+    to_numpy,
+)
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
@@ -50,11 +56,8 @@ class Dataset:
 
     @classmethod
     def open(cls, root: Path) -> Dataset:
-        """Open a folder. Raises `ManipError` for one that is no dataset, or that holds pipes, devices or sockets."""
-        root = Path(root)
-        info = read_info(root)
-        refuse_irregular(root)
-        return cls(root, info)
+        """Open a folder. Raises `ManipError` for one that is no dataset."""
+        return cls(Path(root), read_info(Path(root)))
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -199,7 +202,7 @@ class Dataset:
 
     def clip(self, key: str, episode: int) -> tuple[Path, int, int]:
         """Return where a camera's pictures of an episode are: a film, the first frame in it, and their number."""
-        clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)[:1]
+        clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)
         first = round(float(clips.starts[place]) * self.fps)
         return self.root / clips.files[place], first, int(self.episodes.length[place])
 
@@ -241,26 +244,13 @@ class Dataset:
                 yield Episode(int(own[s.SEED].flat[0]), columns, *ends, text, drawn.get(int(index[start]), {}))
             row += len(index)
 
-    @cached_property
-    def summary(self) -> DatasetInfo:
-        """Names and counts; successes from the column `next.success`, if there is one."""
-        own, success, at_end = self.own, None, None
-        if s.SUCCESS in self.features:
-            columns = self.columns([s.SUCCESS, layout.EPISODE_INDEX])
-            index, flags = (columns[name].reshape(-1) for name in (layout.EPISODE_INDEX, s.SUCCESS))
-            last = np.flatnonzero(np.diff(index, append=-1))
-            success, at_end = len(np.unique(index[flags.astype(bool)])), int(flags[last].sum())
-        return DatasetInfo(
-            root=self.root,
-            robot=own.spec.robot if own else s.robot_of(self.info.robot or UNKNOWN_ROBOT)["robot"],
-            task=own.spec.task if own else UNKNOWN_TASK,
-            instruction=self.spec.instruction if own else self.instruction,
-            fps=self.fps,
-            episodes=self.info.episodes,
-            frames=self.info.frames,
-            success=success,
-            success_at_end=at_end,
-        )
+    def count_successes(self) -> int:
+        """Return how many episodes succeeded at some step; 0 if no column says so."""
+        if s.SUCCESS not in self.features:
+            return 0
+        columns = self.columns([layout.EPISODE_INDEX, s.SUCCESS])
+        index, success = (column.reshape(-1) for column in columns.values())
+        return len(np.unique(index[success.astype(bool)]))
 
 
 def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -285,12 +275,3 @@ def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDA
             row += len(next(iter(piece.values()), ()))
         episode += dataset.info.episodes
     return joined
-
-
-def refuse_irregular(root: Path) -> None:
-    """Raise `ManipError` for a folder that holds anything besides files and folders."""
-    for path in root.rglob("*"):
-        if not (path.is_file() or path.is_dir()):
-            raise ManipError(
-                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
-            )

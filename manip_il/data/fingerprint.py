@@ -17,8 +17,6 @@ import numpy as np
 from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 from threadpoolctl import threadpool_info
 
-from manip_il.checks import shorten
-
 _LONGEST = 80  # characters of a value in a warning
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 _MEANING = {
@@ -62,12 +60,11 @@ def compare_fingerprints(
 ) -> list[str]:
     """Return one warning, naming both sides, for every entry that differs; an empty list where nothing does."""
     warnings: list[str] = []
-    for key in [*left, *(key for key in right if key not in left)]:
-        left_value, right_value = left.get(key, "nothing"), right.get(key, "nothing")
-        if left_value != right_value:
-            what = _MEANING.get(key, key)
-            left_text, right_text = _short(left_value), _short(right_value)
-            warnings.append(f"{what} differs: {left_name} has {left_text}, {right_name} has {right_text}")
+    for key in dict.fromkeys([*left, *right]):
+        ours, theirs = left.get(key, "nothing"), right.get(key, "nothing")
+        if ours != theirs:
+            sides = f"{left_name} has {str(ours)[:_LONGEST]}, {right_name} has {str(theirs)[:_LONGEST]}"
+            warnings.append(f"{_MEANING.get(key, key)} differs: {sides}")
     return warnings
 
 
@@ -96,10 +93,3 @@ def _version(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "absent"
-
-
-def _short(value: object) -> str:
-    text = value if isinstance(value, str) else shorten(value)
-    if len(text) == hashlib.sha256().digest_size * 2:
-        return f"{text[:12]}..."
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

@@ -1,6 +1,6 @@
 """Channels of messages that Foxglove shows without settings, one message a frame, and pictures read back from them.
 
-Schemas: Foxglove's own in protobuf (`JointStates`, `FrameTransforms`, `RawImage`, `Log`), LeRobot's scalars in JSON.
+Schemas: Foxglove's own in protobuf (`JointStates`, `RawImage`, `Log`), LeRobot's scalars in JSON.
 Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd, which uses what
 successive frames share: on rendered frames of 128 x 128 that took a third of a PNG's bytes and a fifth of its time.
 """
@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -27,19 +26,15 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from manip_il.data import schema as s
 from manip_il.mdp import Episode
 
-F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 Times = Sequence[int]  # nanoseconds, one a frame
 
 NANOSECONDS = 1_000_000_000
-WORLD = "world"
 IMAGE_TOPICS = "/observation/images/"  # before a camera's name, as LeRobot has it
-RGB = "rgb8"  # bytes R, G, B
 _JOINT_TOPICS = {"/joint_states": s.STATE, "/action": s.ACTION, "/executed_action": s.EXECUTED_ACTION}
 _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 
@@ -75,21 +70,7 @@ def joint_states(topic: str, names: Sequence[str], values: NDArray[Any], times: 
         for joint, value in zip(joints, row, strict=True):
             joint.position = value
 
-    return _protobuf_channel(topic, message, [message.timestamp], times, values.tolist(), fill)
-
-
-def frame_transforms(topic: str, poses: Mapping[str, tuple[F64, F64]], times: Times) -> Channel:
-    """Make a channel of poses in the world. poses: frame -> positions (T, 3) [m], quaternions wxyz (T, 4)."""
-    message = FrameTransforms()
-    transforms = [message.transforms.add(parent_frame_id=WORLD, child_frame_id=frame) for frame in poses]
-    rows = np.concatenate([np.concatenate(pose, axis=1) for pose in poses.values()], axis=1)
-
-    def fill(row: list[float]) -> None:
-        for start, transform in zip(range(0, len(row), 7), transforms, strict=True):
-            p, q = transform.translation, transform.rotation
-            p.x, p.y, p.z, q.w, q.x, q.y, q.z = row[start : start + 7]
-
-    return _protobuf_channel(topic, message, [one.timestamp for one in transforms], times, rows.tolist(), fill)
+    return _protobuf_channel(topic, message, message.timestamp, times, values.tolist(), fill)
 
 
 def scalars(topic: str, labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Channel:
@@ -103,14 +84,14 @@ def scalars(topic: str, labels: Sequence[str], rows: Iterable[Sequence[float]]) 
 
 def images(topic: str, frame_id: str, pictures: Iterable[U8], times: Times) -> Channel:
     """Make a channel of RGB pictures (height, width, 3), without loss."""
-    message = RawImage(frame_id=frame_id, encoding=RGB)
+    message = RawImage(frame_id=frame_id, encoding="rgb8")
 
     def fill(picture: U8) -> None:
         message.height, message.width, depth = picture.shape
         message.step = message.width * depth
         message.data = picture.tobytes()
 
-    return _protobuf_channel(topic, message, [message.timestamp], times, pictures, fill)
+    return _protobuf_channel(topic, message, message.timestamp, times, pictures, fill)
 
 
 def texts(topic: str, name: str, lines: Iterable[str], times: Times) -> Channel:
@@ -120,7 +101,7 @@ def texts(topic: str, name: str, lines: Iterable[str], times: Times) -> Channel:
     def fill(line: str) -> None:
         message.message = line
 
-    return _protobuf_channel(topic, message, [message.timestamp], times, lines, fill)
+    return _protobuf_channel(topic, message, message.timestamp, times, lines, fill)
 
 
 def episode_channels(episode: Episode, spec: s.RobotTaskSpec) -> Iterator[Channel]:
@@ -129,10 +110,6 @@ def episode_channels(episode: Episode, spec: s.RobotTaskSpec) -> Iterator[Channe
     for topic, key in _JOINT_TOPICS.items():
         if key in columns:
             yield joint_states(topic, spec.joint_names, columns[key], times)
-    if s.ENVIRONMENT_STATE in columns:
-        values = columns[s.ENVIRONMENT_STATE].T.astype(np.float64)
-        if poses := _poses(dict(zip(spec.environment_state_names, values, strict=True))):
-            yield frame_transforms("/tf", poses, times)
     if numbers := {key: columns[key].reshape(-1) for key in _SCALARS if key in columns}:
         lists = [(one.astype(np.int64) if one.dtype.kind == "b" else one).tolist() for one in numbers.values()]
         yield scalars("/scalars", list(numbers), zip(*lists, strict=True))
@@ -180,7 +157,7 @@ def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8
 def _protobuf_channel[Row](
     topic: str,
     message: Message,
-    stamps: Sequence[Timestamp],
+    stamp: Timestamp,
     times: Times,
     rows: Iterable[Row],
     fill: Callable[[Row], None],
@@ -189,8 +166,7 @@ def _protobuf_channel[Row](
 
     def messages() -> Iterator[bytes]:
         for time, row in zip(times, rows, strict=True):
-            for stamp in stamps:
-                stamp.seconds, stamp.nanos = divmod(time, NANOSECONDS)
+            stamp.seconds, stamp.nanos = divmod(time, NANOSECONDS)
             fill(row)
             yield message.SerializeToString(deterministic=True)
 
@@ -201,32 +177,3 @@ def _protobuf_channel[Row](
 def _protobuf_schema(message: type[Message]) -> Schema:
     data = build_file_descriptor_set(message).SerializeToString(deterministic=True)
     return Schema(data=data, encoding="protobuf", id=0, name=message.DESCRIPTOR.full_name)
-
-
-def _poses(states: dict[str, F64]) -> dict[str, tuple[F64, F64]]:
-    """Return positions (T, 3) and quaternions wxyz (T, 4) of all frames among named columns (T,).
-
-    `a_from_b` is a difference, and no frame.
-    """
-    found = [name[: -len(".x")] for name in states if name.endswith(".x")]
-    frames = [frame for frame in found if "_from_" not in frame and {f"{frame}.y", f"{frame}.z"} <= states.keys()]
-    return {frame: (_stack(states, frame, "xyz"), _rotations(frame, states)) for frame in frames}
-
-
-def _rotations(frame: str, states: dict[str, F64]) -> F64:
-    """Return T_world_frame's quaternions wxyz, (T, 4): from two axes, from a cube's yaw, else the identity."""
-    y_axis, z_axis = (f"rx{axis} ry{axis} rz{axis}".split() for axis in "yz")
-    if all(f"{frame}.{name}" in states for name in y_axis + z_axis):
-        y, z = (np.clip(_stack(states, frame, axis), -1, 1) for axis in (y_axis, z_axis))
-        turned = Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=2))
-        return turned.as_quat(canonical=True, scalar_first=True)
-    x = states[f"{frame}.x"]
-    zero = np.zeros(len(x))
-    if f"{frame}.cos4yaw" in states:
-        yaw = np.arctan2(states[f"{frame}.sin4yaw"], states[f"{frame}.cos4yaw"]) / 4
-        return np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)
-    return np.stack([zero + 1, zero, zero, zero], axis=1)
-
-
-def _stack(states: dict[str, F64], frame: str, names: str | list[str]) -> F64:
-    return np.stack([states[f"{frame}.{name}"] for name in names], axis=1)

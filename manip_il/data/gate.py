@@ -19,9 +19,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from manip_il import checks
-from manip_il.data.dataset import refuse_irregular
+from manip_il.data.camera import open_video
 from manip_il.data.info import read_info
-from manip_il.data.pictures import open_video
 from manip_il.errors import ManipError
 
 _BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG
@@ -40,12 +39,15 @@ def check_arrived(root: Path, *, strict: bool = True) -> None:
 
 def open_files(root: Path, strict: bool = True) -> None:
     """Open every file of a dataset, in the child process. Raises `ManipError` as `check_arrived` does."""
-    refuse_irregular(root)
     pictures: dict[str, tuple[bytes, ...]] = {}  # column -> what its cells may begin with
     with suppress(ManipError):  # else no reader gets to its pictures
         cameras = read_info(root).of_dtype("image")
         pictures = {one.key: _BEGIN if one.is_rgb else (*_BEGIN, *_DEPTH) for one in cameras}
-    for path in sorted(path for path in root.rglob("*") if path.is_file()):
+    for path in sorted(path for path in root.rglob("*") if not path.is_dir()):
+        if not path.is_file():
+            raise ManipError(
+                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
+            )
         checks.opening(str(path))
         try:
             _open_file(path, pictures)

@@ -19,7 +19,7 @@ NUMBERS = (
     *("float16", "float32", "float64"),
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "bool"),
 )
-INDEX_FEATURES = (layout.TIMESTAMP, layout.FRAME_INDEX, layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
+INDEX_FEATURES = (*layout.INDEX_DTYPES,)
 
 # LeRobot's placeholders alone (`str.format` would also read attributes), and no way out of the dataset
 _TEMPLATE = re.compile(r"(?!/)(?!.*\.\.)(?:[^{}]|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
@@ -79,21 +79,6 @@ class Info:
     def of_dtype(self, *dtypes: str) -> list[Feature]:
         """Return features of these dtypes."""
         return [feature for feature in self.features.values() if feature.dtype in dtypes]
-
-
-@dataclass(frozen=True)
-class DatasetInfo:
-    """Names and counts of a dataset. success: episodes that succeeded at some step; None if no column says so."""
-
-    root: Path
-    robot: str
-    task: str
-    instruction: str
-    fps: float
-    episodes: int
-    frames: int
-    success: int | None
-    success_at_end: int | None
 
 
 @contextmanager

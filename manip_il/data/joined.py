@@ -33,8 +33,12 @@ class JoinedDatasets:
     def __init__(self, roots: Sequence[Path]):
         self.datasets = tuple(Dataset.open(root) for root in roots)
         self.roots, first = tuple(roots), self.datasets[0]
-        for other in self.datasets[1:]:
-            _check_same_nature(first, other)
+        for other in self.datasets[1:]:  # the rate, and the columns that are learnt from, are the same
+            pairs = {"rate": (first.fps, other.fps)}
+            pairs |= {f"column {key}": (_shape(first, key) or "none", _shape(other, key) or "none") for key in LEARNT}
+            for what, (ours, theirs) in pairs.items():
+                if ours != theirs:
+                    raise MismatchError(what, str(first.root), ours, str(other.root), theirs)
         self.repo_id, self.fps = f"local/{first.root.name}", first.fps
         self.features: Features = {
             key: {"dtype": one.dtype, "shape": one.shape, "names": one.names}
@@ -69,17 +73,6 @@ class JoinedDatasets:
         imagenet = {name: np.array(values, np.float32).reshape(3, 1, 1) for name, values in _IMAGENET.items()}
         cameras = {key: self.datasets[0].statistics.get(key, {}) | imagenet for key in self.camera_keys}
         return pooled.result() | cameras
-
-
-def _check_same_nature(left: Dataset, right: Dataset) -> None:
-    """Raise `MismatchError` unless rate and the columns that are learnt from agree."""
-    sides = str(left.root), str(right.root)
-    if left.fps != right.fps:
-        raise MismatchError("rate", sides[0], left.fps, sides[1], right.fps)
-    for key in LEARNT:
-        ours, theirs = _shape(left, key), _shape(right, key)
-        if ours != theirs:
-            raise MismatchError(f"column {key}", sides[0], ours or "none", sides[1], theirs or "none")
 
 
 def _shape(dataset: Dataset, key: str) -> tuple[int, ...]:

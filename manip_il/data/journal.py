@@ -26,7 +26,7 @@ from manip_il.data import foxglove, schema
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
-from manip_il.errors import ManipError, MismatchError, OlderSchemaError
+from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
@@ -109,12 +109,8 @@ class Journal:
                 continue
         else:
             return []
-        here = f"{self.spec.robot} {self.spec.task}"
-        check_same_spec(str(self.folder), there.spec, here, self.spec)
-        for what in ("task", "cameras", "image_size"):
-            left, right = getattr(there.spec, what), getattr(self.spec, what)
-            if left != right:
-                raise MismatchError(what, str(self.folder), left, here, right)
+        here, also = f"{self.spec.robot} {self.spec.task}", ("task", "cameras", "image_size")
+        check_same_spec(str(self.folder), there.spec, here, self.spec, also)
         return compare_fingerprints(str(self.folder), there.fingerprint, "this machine", self.fingerprint)
 
 
@@ -169,11 +165,8 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     if found != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
     values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
-    spec, fingerprint, frames = (
-        RobotTaskSpec.from_json(values.pop("spec")),
-        values.pop("fingerprint"),
-        values.pop("frames"),
-    )
+    spec, fingerprint = RobotTaskSpec.from_json(values.pop("spec")), values.pop("fingerprint")
+    frames = values.pop("frames")
     if spec.cameras:  # else nothing in the messages is needed
         pictures = foxglove.read_images(chunks, (frames, *spec.image_size, 3))
         columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}

@@ -34,7 +34,7 @@ INDEX = "index"
 TASK_INDEX = "task_index"
 DRAWN = "drawn"  # of meta/episodes, ours: what an episode drew, as JSON
 
-_INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
+INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's content, and the name that it had
 VIDEO_COLUMNS = {  # of meta/episodes, behind `videos/<camera column>/`
@@ -48,7 +48,7 @@ STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 def all_features(own: Features) -> Features:
     """Return a dataset's own features and LeRobot's five, in the order of the columns."""
-    return {**own, **{key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _INDEX_DTYPES.items()}}
+    return {**own, **{key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_DTYPES.items()}}
 
 
 def data_schema(features: Features) -> pa.Schema:

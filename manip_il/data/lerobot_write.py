@@ -38,7 +38,7 @@ Films = tuple[Dataset, int]  # a dataset and the number of its episode that has 
 
 
 def write_dataset(
-    episodes: Iterable[Episode | tuple[Episode, Films]],
+    episodes: Iterable[Episode | tuple[Episode, Films | None]],
     root: Path,
     spec: RobotTaskSpec,
     provenance: Mapping[str, Any] | None = None,
@@ -47,8 +47,6 @@ def write_dataset(
     fingerprint: Mapping[str, Any],
     video: VideoConfig | None = None,
     replace: bool = False,
-    data_files_size_in_mb: float = layout.DATA_FILES_SIZE_IN_MB,
-    video_files_size_in_mb: float = layout.VIDEO_FILES_SIZE_IN_MB,
 ) -> Info:
     """Write the episodes, in order, as a dataset of this program's columns; return what its `info.json` says.
 
@@ -58,10 +56,10 @@ def write_dataset(
     holds something, `UsageError` for pictures or settings that the encoder refuses, both before an episode is taken;
     what `fitted_columns` raises for one that does not fit; `ManipError` if there is none, or no space.
     """
-    video, sizes = video or VideoConfig(), (data_files_size_in_mb, video_files_size_in_mb)
+    video = video or VideoConfig()
     if spec.cameras and spec.video:
         try_encoder(video, spec.image_size, spec.fps)
-    about = features(spec), spec.fps, spec.lerobot_type, video, sizes
+    about = features(spec), spec.fps, spec.lerobot_type, video
     with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about, drawn=True)) as writer:
         for item in episodes:
             episode, films = (item, None) if isinstance(item, Episode) else item
@@ -77,8 +75,7 @@ def write_dataset(
 class TableWriter:
     """Writes a LeRobot dataset of any features into a folder, an episode after the other.
 
-    features: of the dataset's own columns and cameras. file_sizes: of data and video files [MB]. drawn: whether
-    episodes say what they drew.
+    features: of the dataset's own columns and cameras. drawn: whether episodes say what they drew.
     """
 
     def __init__(
@@ -88,21 +85,16 @@ class TableWriter:
         fps: float,
         robot_type: str | None,
         video: VideoConfig | None = None,
-        file_sizes: tuple[float, float] = (layout.DATA_FILES_SIZE_IN_MB, layout.VIDEO_FILES_SIZE_IN_MB),
         *,
         drawn: bool = False,
     ):
         self.features, self.folder = layout.all_features(features), folder
-        self._fps, self._robot_type, self._file_sizes = fps, robot_type, file_sizes
-        self._data = ParquetFiles(
-            folder, layout.DATA_PATH, layout.data_schema(self.features), file_sizes[0], _GROUP_ROWS
-        )
+        self._fps, self._robot_type = fps, robot_type
+        self._data = ParquetFiles(folder, layout.DATA_PATH, layout.data_schema(self.features), _GROUP_ROWS)
         rows = layout.episodes_schema(self.features, drawn=drawn)
-        self._meta = ParquetFiles(folder, layout.EPISODES_PATH, rows, file_sizes[0])
-        video = video or VideoConfig()
+        self._meta = ParquetFiles(folder, layout.EPISODES_PATH, rows)
         films = [key for key, feature in features.items() if feature["dtype"] == "video"]
-        self.films = {key: CameraFiles(folder, key, video, int(fps), file_sizes[1]) for key in films}
-        self._source: Dataset | None = None  # of the films that were copied last
+        self.films = {key: CameraFiles(folder, key, video or VideoConfig(), int(fps)) for key in films}
         self._pooled = PooledStatistics()
         self._rows: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}  # text -> its number, as they first appear
@@ -119,12 +111,10 @@ class TableWriter:
         columns = {**columns, **self._index_columns(numbers)}
         statistics = dict(films[0].picture_statistics[films[1]]) if films else {}
         for key, feature in self.features.items():
-            if feature["dtype"] in PICTURES and key not in statistics:
-                frames = films[0].frames(key, films[0].rows_of(films[1])) if films else columns[key]
-                statistics[key] = picture_statistics(frames)
+            if feature["dtype"] in PICTURES and not films:
+                statistics[key] = picture_statistics(columns[key])
         plain = {key: one for key, one in columns.items() if key not in statistics and one.dtype.kind not in "OU"}
         statistics |= column_statistics(plain)
-        another, self._source = bool(films) and films[0] is not self._source, films[0] if films else None
         chunk, file = self._data.write(to_table(columns, self._data.schema))
         row: dict[str, Any] = {
             layout.EPISODE_INDEX: self.episodes,
@@ -137,7 +127,7 @@ class TableWriter:
             layout.DRAWN: drawn,
         }
         for key, film in self.films.items():
-            clip = film.copy(*films[0].clip(key, films[1]), again=another) if films else film.write(columns[key])
+            clip = film.copy(*films) if films else film.write(columns[key])
             row |= {
                 f"videos/{key}/chunk_index": clip.chunk,
                 f"videos/{key}/file_index": clip.file,
@@ -171,8 +161,8 @@ class TableWriter:
             "total_frames": self.frames,
             "total_tasks": len(self._tasks),
             "chunks_size": layout.CHUNKS_SIZE,
-            "data_files_size_in_mb": self._file_sizes[0],
-            "video_files_size_in_mb": self._file_sizes[1],
+            "data_files_size_in_mb": layout.DATA_FILES_SIZE_IN_MB,
+            "video_files_size_in_mb": layout.VIDEO_FILES_SIZE_IN_MB,
             "data_path": layout.DATA_PATH,
             "video_path": layout.VIDEO_PATH if self.films else None,
             "robot_type": self._robot_type,

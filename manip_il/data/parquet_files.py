@@ -1,8 +1,16 @@
-"""Parquet files of datasets: write numbered ones a row group at a time, read columns as numpy arrays."""
+"""Parquet files of datasets: write numbered ones a row group at a time, read columns, tasks and the table of episodes.
+
+An episode's draws are this program's: text in a column of its own of `meta/episodes`, one JSON object an episode, `{}`
+for nothing. LeRobot's merge keeps the column, its split and delete drop it; every frame's `sim_state` has the draws
+all the same.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +18,26 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from PIL import Image
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.info import NUMBERS, Feature, reading
-from manip_il.data.pictures import to_png
-from manip_il.errors import ManipError, UnknownName
+from manip_il.data.info import NUMBERS, Feature, Info, reading
+from manip_il.data.statistics import Statistics
+from manip_il.errors import ManipError
 
-_MIB = 1024 * 1024
+I64, F64 = NDArray[np.int64], NDArray[np.float64]
 
 
 class ParquetFiles:
-    """Numbered parquet files, one open at a time; a new one starts once the open one has `size_in_mb`.
+    """Numbered parquet files, one open at a time; a new one starts once the open one is full.
 
     group_rows: rows that a row group has at least, but for a file's last. A writer keeps a description of every row
     group in memory until the file is closed, so many small ones would cost more than the rows.
     """
 
-    def __init__(self, folder: Path, template: str, schema: pa.Schema, size_in_mb: float, group_rows: int = 1):
+    def __init__(self, folder: Path, template: str, schema: pa.Schema, group_rows: int = 1):
         self._folder, self._template, self.schema = folder, template, schema
-        self._limit, self._group_rows = size_in_mb * _MIB, group_rows
+        self._limit, self._group_rows = layout.DATA_FILES_SIZE_IN_MB * 2**20, group_rows
         self._number = 0
         self._path = folder
         self._writer: pq.ParquetWriter | None = None
@@ -79,45 +88,44 @@ class ParquetFiles:
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:
     """Return columns (T,) and (T, ...) as an Arrow table: vectors as lists, pictures as PNG."""
     arrays: list[pa.Array] = []
-    for field in schema:
-        values = columns[field.name]
-        if field.type == layout.PICTURE:
-            arrays.append(pa.array([{"bytes": to_png(picture), "path": None} for picture in values], field.type))
+    for column in schema:
+        values = columns[column.name]
+        if column.type == layout.PICTURE:
+            arrays.append(pa.array([{"bytes": _to_png(picture), "path": None} for picture in values], column.type))
         elif values.ndim > 2:
-            arrays.append(pa.array(values.tolist(), field.type))
+            arrays.append(pa.array(values.tolist(), column.type))
         elif values.ndim > 1:
-            flat = pa.array(np.ascontiguousarray(values).reshape(-1), field.type.value_type)
-            arrays.append(pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(field.type))
+            flat = pa.array(np.ascontiguousarray(values).reshape(-1), column.type.value_type)
+            arrays.append(pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(column.type))
         else:
-            arrays.append(pa.array(values, field.type))
+            arrays.append(pa.array(values, column.type))
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
+def _to_png(picture: NDArray[np.uint8]) -> bytes:
+    """Return a picture (height, width, 3) as the content of a PNG file."""
+    stream = BytesIO()
+    Image.fromarray(picture).save(
+        stream, "PNG", compress_level=1
+    )  # the next levels save a tenth and take twice as long
+    return stream.getvalue()
+
+
 def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return columns of a file. Raises `ManipError` if it is damaged, `UnknownName` for a missing column."""
+    """Return columns of a file, those that it has. Raises `ManipError` if it is damaged."""
     with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
         # one thread: handing out pieces of one episode costs more than reading them
-        table = file.read(list(columns), use_threads=False)
-    for name in columns:
-        if name not in table.column_names:
-            raise UnknownName(f"column in {path}", name, table.column_names)
-    return table.replace_schema_metadata(None)
+        return file.read(list(columns), use_threads=False).replace_schema_metadata(None)
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Return a dataset's tasks by their number; the column of texts is pandas' index, with a name or without.
-
-    Raises `ManipError` for a file that cannot be read or holds no texts.
-    """
+    """Return a dataset's tasks by their number; the column of texts is pandas' index, with a name or without."""
     path = root / layout.TASKS
-    with reading(path), pq.ParquetFile(path) as file:
-        table = file.read()
-        texts = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
-        names = [name for name in texts if name in ("task", "__index_level_0__")] or texts
-        if len(names) != 1:
-            raise ManipError(f"it has {len(texts)} columns of text; expected the tasks' texts in one called task")
-        numbers = table.column(layout.TASK_INDEX).cast(pa.int64()).to_pylist()
-        return dict(zip(numbers, table.column(names[0]).to_pylist(), strict=True))
+    with reading(path):
+        table = read_file(path, pq.read_schema(path).names)
+        texts = [one.name for one in table.schema if one.type in (pa.string(), pa.large_string())]
+        name = "task" if "task" in texts else texts[-1]  # pandas writes an index behind the columns
+        return dict(zip(table.column(layout.TASK_INDEX).to_pylist(), table.column(name).to_pylist(), strict=True))
 
 
 def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
@@ -126,21 +134,89 @@ def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
     Raises `ValueError` if values have another kind or shape, or some are missing.
     """
     array: Any = column.combine_chunks()
-    rows, nested = len(array), False
-    while True:
-        if isinstance(array.type, pa.BaseExtensionType):
-            array = array.storage
-        if array.null_count:
-            raise ValueError(f"{feature.key!r} holds {array.null_count:,} missing values")
-        if not (pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type)):
-            break
-        array, nested = array.flatten(), True
-    values = array.to_numpy(zero_copy_only=False)
+    is_vector = feature.size > 1
+    while isinstance(array, pa.ExtensionArray | pa.ListArray | pa.FixedSizeListArray):
+        array, is_vector = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten(), True
     dtype = np.dtype(feature.dtype if feature.dtype in NUMBERS else object)
-    if values.dtype.kind != dtype.kind or len(values) != rows * feature.size:
-        shape = f"{feature.dtype} of shape {list(feature.shape)}"
-        raise ValueError(
-            f"{feature.key!r} has {len(values):,} of {array.type} in {rows:,} rows; info.json says {shape}"
+    try:  # files may hold numbers narrower
+        values = array.to_numpy(zero_copy_only=False).astype(dtype, casting="same_kind", copy=False)
+        return values.reshape(len(column), *feature.shape if is_vector else ())
+    except (TypeError, ValueError) as error:
+        what = f"{feature.dtype} of shape {list(feature.shape)}"
+        raise ValueError(f"{feature.key!r} has no {what} in each of {len(column):,} rows: {error}") from error
+
+
+@dataclass(frozen=True)
+class Clips:
+    """Places of one camera's episodes, one entry an episode: a video file, and the start in it [s]."""
+
+    files: list[str]
+    starts: F64
+
+
+@dataclass(frozen=True)
+class EpisodeTable:
+    """One entry an episode. drawn: by the index of the episode."""
+
+    index: I64
+    length: I64
+    start: I64
+    stop: I64
+    tasks: list[list[str]]
+    clips: dict[str, Clips]  # camera column -> places
+    drawn: dict[int, dict[str, Any]] = field(default_factory=dict[int, dict[str, Any]])
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def read_episode_table(root: Path, info: Info) -> EpisodeTable:
+    """Read all files of `meta/episodes`, but for statistics. Raises `ManipError` naming what cannot be read."""
+    paths = sorted(root.glob(layout.EPISODES_FILES))
+    if not paths:
+        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
+    with reading(root / "meta/episodes"):
+        names = [[name for name in pq.read_schema(path).names if not name.startswith("stats/")] for path in paths]
+        tables = [read_file(path, wanted) for path, wanted in zip(paths, names, strict=True)]
+        table = pa.concat_tables(tables, promote_options="permissive")
+
+        def numbers(name: str) -> I64:
+            return table.column(name).cast(pa.int64()).to_numpy()
+
+        def clips(key: str) -> Clips:
+            places = zip(
+                *(numbers(f"videos/{key}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True
+            )
+            files = [
+                info.video_path.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places
+            ]
+            return Clips(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
+
+        index, none = numbers(layout.EPISODE_INDEX), [None] * len(table)
+        drawn, tasks = (
+            table.column(name).to_pylist() if name in table.column_names else none for name in (layout.DRAWN, "tasks")
         )
-    values = values.astype(dtype, copy=False)  # files may hold numbers narrower
-    return values.reshape(rows, *feature.shape) if nested or feature.size > 1 else values
+        return EpisodeTable(
+            index=index,
+            length=numbers("length"),
+            start=numbers("dataset_from_index"),
+            stop=numbers("dataset_to_index"),
+            tasks=[texts or [] for texts in tasks],
+            clips={feature.key: clips(feature.key) for feature in info.of_dtype("video")},
+            drawn={number: json.loads(text or "{}") for number, text in zip(index.tolist(), drawn, strict=True)},
+        )
+
+
+def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statistics]:
+    """Return the statistics of every episode's pictures, of cameras by their column, as far as there are any."""
+    found: list[Statistics] = []
+    for path in sorted(root.glob(layout.EPISODES_FILES)):
+        names = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
+        here = [name for name in pq.read_schema(path).names if name in names]
+        for row in read_file(path, [layout.EPISODE_INDEX, *here]).to_pylist():
+            own: Statistics = {}
+            for column in here:
+                key, name = names[column]
+                own.setdefault(key, {})[name] = np.array(row[column])
+            found.append(own)
+    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -85,12 +85,11 @@ class RobotTaskSpec:
         """Return the inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
         if (found := data.get("schema", 1)) != VERSION:
             raise OlderSchemaError(checks.shorten(found), VERSION)
-        known = {field.name for field in fields(cls)}
-        needed = {field.name for field in fields(cls) if field.default is MISSING}
-        if odd := sorted((needed - set(data)) | (set(data) - known)):
-            raise ManipError(f"a robot-task spec with wrong keys: {checks.shorten(odd)} missing or unknown")
         values: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in data.items()}
-        return cls(**values)
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise ManipError(f"a robot-task spec with wrong keys: {error}") from error
 
     @property
     def lerobot_type(self) -> str:
@@ -152,17 +151,18 @@ def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
     return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
 
 
-def check_same_spec(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:
+def check_same_spec(
+    left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec, also: Sequence[str] = ()
+) -> None:
     """Raise `MismatchError` unless actions and observations mean the same on both sides.
 
-    The task may differ: a policy may be tried on another one.
+    The task may differ: a policy may be tried on another one. also: other fields that must agree.
     """
-    for what in ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning"):
-        left_value, right_value = getattr(left, what), getattr(right, what)
-        if what == "object":
-            left_value, right_value = left_value or OWN_OBJECT, right_value or OWN_OBJECT
-        if left_value != right_value:
-            raise MismatchError(what, left_name, left_value, right_name, right_value)
+    for what in ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning", *also):
+        ours, theirs = getattr(left, what), getattr(right, what)
+        if ours != theirs:
+            none = OWN_OBJECT if what == "object" else "none"
+            raise MismatchError(what, left_name, ours or none, right_name, theirs or none)
 
 
 def fitted_columns(episode: Episode, spec: RobotTaskSpec, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:

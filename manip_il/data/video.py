@@ -24,11 +24,10 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.pictures import Pictures, open_video
+from manip_il.data.camera import Pictures, open_video
+from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
-
-_MIB = 1024 * 1024
 
 
 @dataclass(frozen=True)
@@ -44,26 +43,25 @@ class Clip:
 class CameraFiles:
     """One camera's numbered video files, one open at a time; the same episodes give the same bytes."""
 
-    def __init__(self, folder: Path, key: str, config: VideoConfig, fps: int, size_in_mb: float):
+    def __init__(self, folder: Path, key: str, config: VideoConfig, fps: int):
         self._folder, self._key, self._config, self._fps = folder, key, config, fps
-        self._limit = size_in_mb * _MIB
+        self._limit = layout.VIDEO_FILES_SIZE_IN_MB * 2**20
         self._number = self._frames = self._bytes = 0
         self._container: OutputContainer | None = None
         self._stream: VideoStream | None = None
-        self._copied: dict[Path, tuple[int, int]] = {}  # chunk and file index
+        self._copied: dict[tuple[Dataset, Path], tuple[int, int]] = {}  # chunk and file index
 
-    def copy(self, source: Path, first: int, frames: int, *, again: bool = False) -> Clip:
-        """Take frames that another dataset has in a file: it is copied, once, or `again` once for every dataset."""
-        if again:
-            self._copied.clear()
-        if source not in self._copied:
+    def copy(self, dataset: Dataset, episode: int) -> Clip:
+        """Take an episode's frames from a dataset's film, which is copied once."""
+        source, first, frames = dataset.clip(self._key, episode)
+        if (dataset, source) not in self._copied:
             self.close()
-            name, *place = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
+            name, chunk, file = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
             (self._folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, self._folder / name)
-            self._copied[source] = place[0], place[1]
+            self._copied[dataset, source] = chunk, file
             self._number += 1
-        return Clip(*self._copied[source], first, frames)
+        return Clip(*self._copied[dataset, source], first, frames)
 
     def write(self, frames: Pictures) -> Clip:
         """Append the frames of an episode. Raises `av.FFmpegError` if they cannot be encoded or written."""

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.camera import open_video
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
-from manip_il.data.pictures import open_video
 from manip_il.doctor.finding import Finding, by_deletion, by_journals, by_repair, journals_of, list_first, warning
 from manip_il.errors import ManipError
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.data.atomic import umask, writing
+from manip_il.data.atomic import writing
 from manip_il.errors import FolderExistsError, ManipError, MismatchError
 from manip_il.learn.checkpoint import META_FILE, Origin
 
@@ -96,7 +96,7 @@ def publish(temporary: Path, final: Path) -> None:
     """Give a checkpoint that is whole its name, and make it `last`."""
     for path in temporary.rglob("*"):
         if path.is_file():  # safetensors hides its files from other users, a container's among them
-            path.chmod(0o666 & ~umask())
+            path.chmod(temporary.stat().st_mode & 0o666)
     temporary.rename(final)
     link = final.parent / ".last.tmp"
     link.unlink(missing_ok=True)

@@ -20,7 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data.pictures import decode_picture
+from manip_il.data.camera import decode_picture
 from manip_il.errors import ManipError
 
 U8 = NDArray[np.uint8]

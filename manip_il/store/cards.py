@@ -75,7 +75,7 @@ def policy_facts(root: Path) -> dict[str, Any]:
     ]
     order = ("is_test", "n_episodes", "success_rate")
     facts["evaluation"] = max(evaluations, key=lambda one: [one[key] for key in order], default={})
-    fitted_to = Dataset.open(root / "dataset").summary if (root / "dataset" / INFO).is_file() else None
+    fitted_to = Dataset.open(root / "dataset").info if (root / "dataset" / INFO).is_file() else None
     return {**facts, "is_ours": bool(facts["manip_il"]), "fitted_to": fitted_to, "options": options(root)}
 
 

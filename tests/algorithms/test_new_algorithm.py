@@ -60,7 +60,7 @@ def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorith
     assert [result.beta for result in whole] == betas
     assert [result.episodes for result in whole] == [2, 4, 6][:rounds]
     assert [result.labels for result in whole] == sorted({result.labels for result in whole})
-    assert Dataset.open(tmp_path / "whole/dataset").summary.episodes == 2 * rounds
+    assert Dataset.open(tmp_path / "whole/dataset").info.episodes == 2 * rounds
     count = 0
 
     def stop(episode: Episode) -> None:

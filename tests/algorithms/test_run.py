@@ -59,7 +59,7 @@ def test_a_round_leaves_its_episodes_dataset_policy_and_evaluation_and_the_run_i
     folder, results, _ = run
     for round_, episodes in enumerate((4, 2)):
         here = round_folder(folder, round_)
-        assert Dataset.open(here / "dataset").summary.episodes == episodes
+        assert Dataset.open(here / "dataset").info.episodes == episodes
         assert (results[round_].policy / "model.safetensors").is_file()
         assert EvalResult.read(here / "eval.json") == results[round_].validation
     assert files(folder / "best" / "pretrained_model") == files(best_round(results).policy)
@@ -179,7 +179,7 @@ def test_a_run_begins_with_recorded_demonstrations_in_place_of_its_own(run, tmp_
     given = tuple(datasets(run[0], 1))
     config = replace(CONFIG, datasets=given, beta=ALONE)
     results = list(run_algorithm(config, tmp_path / "run", Engine()))
-    assert results[0].episodes == sum(Dataset.open(root).summary.episodes for root in given)
+    assert results[0].episodes == sum(Dataset.open(root).info.episodes for root in given)
     assert results[0].labels == joined_columns(given, ("label_valid",))["label_valid"].sum()
     assert not (round_folder(tmp_path / "run", 0) / "journals").exists()
     assert results[1].labels > results[0].labels
@@ -211,7 +211,7 @@ def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
     results = list(run_algorithm(config, tmp_path, Engine()))
     assert [result.labels for result in results][-1] == 180 == labels(tmp_path, results[-1].round)
     assert results[-1].round < 5
-    assert Dataset.open(tmp_path / "dataset").summary.frames >= 180
+    assert Dataset.open(tmp_path / "dataset").info.frames >= 180
 
 
 @pytest.mark.parametrize("method", ["cloning", "dart"])
@@ -225,7 +225,7 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
     assert set(table["seed"].ravel()[later]) <= set(stream_seeds("round/1", 10))
     held_out = tmp_path / "held_out/dataset"
     assert held_out.is_dir() == (method == "dart")
-    extra = Dataset.open(held_out).summary.frames if method == "dart" else 0
+    extra = Dataset.open(held_out).info.frames if method == "dart" else 0
     assert results[1].queries == results[1].labels + extra
 
 
@@ -236,7 +236,7 @@ def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(t
     assert not (round_folder(tmp_path, 1) / "dataset").exists()
     assert "the expert was queried in none of its rollouts" in caplog.text
     assert results[2].queries > results[0].queries  # it was queried in every state, to know
-    assert Dataset.open(tmp_path / "dataset").summary.episodes == 4
+    assert Dataset.open(tmp_path / "dataset").info.episodes == 4
 
 
 def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
@@ -272,5 +272,5 @@ def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
     assert results[1].labels > results[0].labels
     sees = json.loads((results[1].policy / "config.json").read_text())["input_features"]
     assert set(sees) == {"observation.state", "observation.images.front"}
-    merged = Dataset.open(tmp_path / "dataset").summary
-    assert merged.episodes == sum(Dataset.open(root).summary.episodes for root in datasets(tmp_path, 1))
+    merged = Dataset.open(tmp_path / "dataset").info
+    assert merged.episodes == sum(Dataset.open(root).info.episodes for root in datasets(tmp_path, 1))

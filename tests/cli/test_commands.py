@@ -77,8 +77,9 @@ def test_a_config_loads_by_the_command_in_its_first_line(path):
 
 
 def test_record_writes_successes_and_their_provenance(demos):
-    info = Dataset.open(demos).summary
-    assert (info.episodes, info.success, info.robot, info.task) == (3, 3, "panda", "pick_place")
+    dataset = Dataset.open(demos)
+    assert (dataset.info.episodes, dataset.count_successes()) == (3, 3)
+    assert (dataset.spec.robot, dataset.spec.task) == ("panda", "pick_place")
     table = Dataset.open(demos).columns(["seed", "actor", "label_valid"])
     assert np.unique(table["seed"]).tolist() == [1_000_000, 1_000_001, 1_000_002]
     assert not table["actor"].any()
@@ -162,7 +163,7 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
     assert "--beta differs" in error()
     assert main([*words, "--resume=true", "--rounds=2"]) == 0
     assert [record["round"] for record in read_lines(run / "metrics.jsonl")] == [0, 1, 2]
-    assert Dataset.open(run / "dataset").summary.episodes == 3 + 2 * 2
+    assert Dataset.open(run / "dataset").info.episodes == 3 + 2 * 2
 
 
 @pytest.mark.slow

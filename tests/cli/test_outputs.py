@@ -156,7 +156,7 @@ def test_where_nothing_may_be_written_beside_it_a_folder_is_taken_unheld(tmp_pat
     def refused(*_: object) -> int:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("manip_il.data.atomic._lock", refused)
+    monkeypatch.setattr("manip_il.checks.open_regular", refused)
     with exclusive(folder):
         assert [path.name for path in tmp_path.rglob("*")] == ["volume"]
     with pytest.raises(PermissionError), exclusive(tmp_path / "new"):

@@ -59,7 +59,7 @@ def test_a_damaged_journal_is_left_out_and_said(recorded, tmp_path, capsys):
     err = capsys.readouterr().err
     assert f"warning: {cut} is not a complete episode" in err
     assert "error: 1 journal could not be read" in err
-    assert Dataset.open(tmp_path / "x").summary.episodes == 2
+    assert Dataset.open(tmp_path / "x").info.episodes == 2
     capsys.readouterr()
     assert main(["record", *record(tmp_path / "x", "--dataset.repo_id=me/demos", "--resume=true")[1:]]) == 0
     assert files(tmp_path / "x") == files(recorded)

@@ -38,7 +38,7 @@ def redrawn(demos, tmp_path_factory) -> Path:
 @pytest.mark.gl
 @pytest.mark.slow
 def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
-    info, spec = Dataset.open(redrawn).summary, Dataset.open(redrawn).spec
+    info, spec = Dataset.open(redrawn).info, Dataset.open(redrawn).spec
     assert info.episodes == info.frames == 60
     assert (spec.cameras, spec.image_size, spec.video) == (("front", "side", "wrist"), (32, 32), False)
     assert Dataset.open(redrawn).provenance["redrawn"]["from"] == "demos"
@@ -70,7 +70,7 @@ def test_branches_are_episodes_for_policies_that_plan(demos, tmp_path):
     target = tmp_path / "branches"
     words = ["--frames=6", "--branch_steps=4", *SMALL[1:]]
     assert main(["data", "redraw", str(demos), str(target), *words]) == 0
-    assert (Dataset.open(target).summary.episodes, Dataset.open(target).summary.frames) == (6, 24)
+    assert (Dataset.open(target).info.episodes, Dataset.open(target).info.frames) == (6, 24)
     table = Dataset.open(target).columns(["action", "executed_action"])
     np.testing.assert_array_equal(table["action"], table["executed_action"])
 
@@ -111,7 +111,7 @@ def test_train_redraws_in_passing_and_goes_on_after_a_kill(demos, tmp_path, caps
     words = ["train", f"--dataset.root={demos}", "--policy.type=cnn", "--policy.width=16", "--redraw=30", "--steps=2"]
     words += ["--batch_size=4", "--log_freq=1", f"--output_dir={run}", "--quiet"]
     assert main(words) == 0
-    assert Dataset.open(run / "redrawn").summary.frames == 30
+    assert Dataset.open(run / "redrawn").info.frames == 30
     config = json.loads((run / "checkpoints/last/pretrained_model/config.json").read_text())
     assert set(config["input_features"]) == {
         "observation.state", "observation.images.front", "observation.images.side", "observation.images.wrist"
@@ -136,8 +136,8 @@ def test_dagger_by_pictures_redraws_every_rounds_states_the_same_after_a_kill(de
     words += ["--validation_episodes=1", *SMALL[1:], f"--output_dir={run}"]
     assert main(words) == 0
     first, second = (run / f"round_{number:03d}" for number in range(2))
-    states = [Dataset.open(one / "dataset").summary.frames for one in (first, second)]
-    scenes = [Dataset.open(one / "redrawn").summary.frames for one in (first, second)]
+    states = [Dataset.open(one / "dataset").info.frames for one in (first, second)]
+    scenes = [Dataset.open(one / "redrawn").info.frames for one in (first, second)]
     assert scenes == [60, 60 * states[1] // states[0]]
     assert Dataset.open(first / "redrawn").spec.cameras == ("front", "side", "wrist")
     assert Dataset.open(second / "dataset").spec.cameras == Dataset.open(run / "dataset").spec.cameras == ()

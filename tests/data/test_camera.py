@@ -14,10 +14,9 @@ import pytest
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
-from ..damage import edit_json
 from ..pictures import numbered_episodes, write
 
 pytestmark = pytest.mark.slow
@@ -37,7 +36,7 @@ def roots(
     folder = tmp_path_factory.mktemp("datasets")
     for codec in ("h264", "libsvtav1"):
         five = numbered_episodes(make_episode, two, 5)
-        write(five, folder / codec, two, video=VideoConfig(codec), video_files_size_in_mb=0.001)
+        write(five, folder / codec, two, video=VideoConfig(codec), size=0.001)
     os.environ.setdefault("SVT_LOG", "1")  # or the encoder tells its life
     for kind in RECORDED:
         record(folder / kind, kind, 3)
@@ -73,21 +72,5 @@ def test_no_room_for_decoded_pictures_is_one_line(roots, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(ManipError, match=r"cannot keep 0\.0 GB of decoded pictures in .*: No space left .*TMPDIR"):
+    with pytest.raises(ManipError, match=r"cannot write .*: No space left"):
         Dataset.open(roots["image"]).camera(FRONT).decode()
-
-
-def test_what_is_not_there_is_one_line(roots, tmp_path, two):
-    import shutil
-
-    for name, change in (("h264", "cut"), ("image", "size")):
-        root = tmp_path / name
-        shutil.copytree(roots[name], root)
-        late = Dataset.open(root).camera(FRONT)
-        if change == "cut":
-            shutil.rmtree(root / "videos")
-        else:
-            edit_json(root / "meta/info.json", lambda info: info["features"][FRONT].update(shape=[8, 8, 3]))
-            late = Dataset.open(root).camera(FRONT)
-        with pytest.raises((ManipError, MismatchError), match=r"cannot read .*\.mp4|shape of observation"):
-            late.rows(np.array([3]))

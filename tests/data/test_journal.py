@@ -19,7 +19,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import journal
@@ -90,6 +89,13 @@ def filmed(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> 
     return journal.Journal(tmp_path / "filmed", spec, FINGERPRINT).write(numbered_episodes(make_episode, spec)[0])
 
 
+def test_pictures_come_back_bit_for_bit(filmed, make_episode, spec):
+    written = numbered_episodes(make_episode, with_cameras(spec, "front", "wrist"))[0]
+    columns = journal.read_journal(filmed)[1].columns
+    for key in (s.IMAGES + "front", s.IMAGES + "wrist"):
+        np.testing.assert_array_equal(columns[key], written.columns[key])
+
+
 @given(st.integers(0, 10**9), st.integers(1, 255))
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_changed_byte_anywhere_is_refused_by_name_or_changes_nothing(filmed, place, change):
@@ -117,25 +123,6 @@ def test_a_file_cut_short_is_refused_and_set_aside_so_that_its_seed_is_free(path
     assert "(set aside as episode-000000000017.mcap.damaged)" in caplog.text
 
 
-def test_another_mcap_and_a_missing_file_are_refused(tmp_path):
-    other = tmp_path / "episode-000000000001.mcap"
-    with other.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.finish()
-    with pytest.raises(ManipError, match="not a complete episode"):
-        journal.read_journal(other)
-    with pytest.raises(ManipError, match=r"episode-000000000002\.mcap is not a complete episode: .*No such file"):
-        journal.read_journal(tmp_path / "episode-000000000002.mcap")
-
-
-def test_what_cannot_be_read_again_is_not_written(tmp_path, spec):
-    episode = Episode(1, {"x": np.array([{}, {}], dtype=object)}, True, True)
-    with pytest.raises(ValueError, match="allow_pickle"):
-        journal.Journal(tmp_path, spec, {}).write(episode)
-    assert list(tmp_path.iterdir()) == []
-
-
 def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Topic -> log times and decoded messages."""
     found: dict[str, list[tuple[int, Any]]] = {}
@@ -146,25 +133,15 @@ def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
     return found
 
 
-def test_foxglove_sees_joints_frames_and_scalars(tmp_path, make_episode, spec):
+def test_foxglove_sees_joints_and_scalars(tmp_path, make_episode, spec):
     episode = make_episode(8, 3)
-    turned = [0, 1, 0, -1, 0, 0]  # the hand's y axis along world y, its z axis along world -x
-    episode.columns[s.ENVIRONMENT_STATE][:, 3:9] = turned
-    episode.columns[s.ENVIRONMENT_STATE][:, 12:14] = [np.cos(0.4), np.sin(0.4)]  # a yaw of 0.1 rad
     topics = messages(journal.Journal(tmp_path, spec, {}).write(episode))
-    assert sorted(topics) == ["/action", "/executed_action", "/joint_states", "/scalars", "/tf"]
-    assert [time for time, _ in topics["/tf"]] == [0, 50_000_000, 100_000_000]
+    assert sorted(topics) == ["/action", "/executed_action", "/joint_states", "/scalars"]
+    assert [time for time, _ in topics["/scalars"]] == [0, 50_000_000, 100_000_000]
     _, last = topics["/joint_states"][2]
     assert last.timestamp.ToNanoseconds() == 100_000_000
     assert [joint.name for joint in last.joints] == list(spec.joint_names)
     assert [joint.position for joint in last.joints] == episode.columns[s.STATE][2].tolist()
-    hand, cube = topics["/tf"][0][1].transforms
-    assert (hand.parent_frame_id, hand.child_frame_id, cube.child_frame_id) == ("world", "ee", "object")
-    place = [hand.translation.x, hand.translation.y, hand.translation.z]
-    assert place == episode.columns[s.ENVIRONMENT_STATE][0, :3].tolist()
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose([getattr(hand.rotation, axis) for axis in "wxyz"], [half, 0, -half, 0], atol=1e-6)
-    np.testing.assert_allclose(cube.rotation.z, np.sin(0.05), atol=1e-6)
     scalars = {scalar["label"]: scalar["value"] for scalar in topics["/scalars"][2][1]["scalars"]}
     assert scalars[s.SUCCESS] == 1
     assert scalars[s.REWARD] == episode.columns[s.REWARD][2].item()

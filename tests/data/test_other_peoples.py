@@ -62,7 +62,7 @@ def check(root: Path, folder: Path) -> str:
     """Open, examine and train; return what the spec calls the joints."""
     dataset = Dataset.open(root)
     assert sum(map(len, map(dataset.rows_of, range(dataset.info.episodes)))) == len(dataset)
-    assert len(dataset.columns()["action"]) == len(dataset) == dataset.summary.frames
+    assert len(dataset.columns()["action"]) == len(dataset) == dataset.info.frames
     assert [str(one) for one in examine_folder(root) if one.place != layout.STATS] == []
     policy = [f"--policy.{name}={value}" for name, value in (ACT | {"chunk_size": 4, "n_action_steps": 2}).items()]
     words = [*policy, "--policy.pretrained_backbone_weights=null", "--observation=images", "--batch_size=4"]

@@ -31,8 +31,9 @@ def test_it_is_small_and_whole():
 
 
 def test_it_holds_ten_successful_episodes_of_pick_place():
-    info = Dataset.open(SAMPLE).summary
-    assert (info.robot, info.task, info.episodes, info.success) == ("panda", "pick_place", 10, 10)
+    dataset = Dataset.open(SAMPLE)
+    assert (dataset.spec.robot, dataset.spec.task) == ("panda", "pick_place")
+    assert (dataset.info.episodes, dataset.count_successes()) == (10, 10)
     table = Dataset.open(SAMPLE).columns(["label_valid", "actor"])
     assert table["label_valid"].all()
     assert not table["actor"].any()  # the expert drove

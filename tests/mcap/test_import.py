@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manip_il.data.journal import Journal
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS
+from manip_il.data.schema import ACTION, STATE, SUCCESS
 from manip_il.errors import ManipError
 from manip_il.mcap.importing import import_files, pick, read_frames
 from manip_il.mcap.mapping import Source
@@ -112,17 +112,14 @@ def test_what_is_no_picture_or_of_another_encoding_is_refused(tmp_path, monkeypa
 def test_our_journals_come_in_by_a_mapping_of_their_topics(tmp_path, make_episode: MakeEpisode, spec) -> None:
     episode = make_episode(3, 6)
     path = Journal(tmp_path, spec, {}).write(episode)
-    places = [f"transforms[child_frame_id=ee].translation.{axis}" for axis in "xyz"]
     features = {
         STATE: feature("/joint_states", field="joints[:].position", dtype="float32", names=list(spec.joint_names)),
         ACTION: feature("/action", field="joints[:].position", dtype="float32", resample="previous"),
-        "place": feature("/tf", field=places),
         SUCCESS: feature("/scalars", field="scalars[label=next.success].value", dtype="bool"),
     }
     rows = list(read_frames(path, load(tmp_path, features, fps=spec.fps)))
     for key in (STATE, ACTION, SUCCESS):
         np.testing.assert_array_equal([row[key] for row in rows], episode.columns[key])
-    np.testing.assert_array_equal([row["place"] for row in rows], episode.columns[ENVIRONMENT_STATE][:, :3])
 
 
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)
