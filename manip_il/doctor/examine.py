@@ -59,7 +59,8 @@ def _explain(root: Path, problem: Exception) -> Finding:
     text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
     text = text.partition("; run `manip-il data check")[0].replace(f"{root}/", "").removeprefix(f"{root}: ")
     text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as if its recorder had died")
-    return Finding(([str(root)] + _FILE.findall(text))[-1], text)  # the last is a file in a folder
+    place = [str(root), *_FILE.findall(text)][-1]  # the last is a file in a folder
+    return Finding(place, text.replace(f"cannot read {place}: ", "cannot be read: "))
 
 
 def has_errors(findings: Sequence[Finding]) -> bool:

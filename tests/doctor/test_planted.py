@@ -1,4 +1,4 @@
-"""Fifteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found, and nothing else."""
+"""Kinds of defects, planted into twenty datasets of this program and of LeRobot: found, and nothing else."""
 
 from __future__ import annotations
 
@@ -76,25 +76,24 @@ def rows(root: Path, rng: Rng) -> str:
 
 def names(root: Path, rng: Rng) -> str | None:
     wrong = [None, ["width", "height", "channels"], ["channels", "height", "width"]][rng.integers(3)]
-    if (key := next(iter(Dataset.open(root).cameras), None)) is None:
-        return None
-    edit_json(root / layout.INFO, lambda info: info["features"][key].update(names=wrong))
-    return f"meta/info.json: {key}: .* LeRobot does not train"
+    for key in Dataset.open(root).cameras:
+        edit_json(root / layout.INFO, lambda info, key=key: info["features"][key].update(names=wrong))
+        return f"error    meta/info.json: {key}: .* LeRobot does not train; set .*channels"
+    return None
 
 
 def frames(root: Path, rng: Rng) -> str:
     """A camera's pictures missing or of another size; without cameras, rows missing."""
     dataset, lost = Dataset.open(root), int(rng.integers(1, 20))
-    key = next(iter(dataset.cameras), "")
-    if not key:
-        pq.write_table(pq.read_table(root / DATA).slice(0, len(dataset) - lost), root / DATA)
-        return r"meta/info.json: .*counts \d+ frames, its data files \d+"
-    pictures, fewer = dataset.frames(key, np.arange(len(dataset))), rng.random() < 0.5
-    if fewer and dataset.features[key].dtype == "image":
-        edit_table(root / DATA, lambda table: table[key].__setitem__(lost, {"bytes": None, "path": None}))
-        return f"{DATA}: {key}: 1 of .* rows have no picture"
-    show(root, {key: pictures[:-lost] if fewer else pictures[:, :40]})
-    return r"videos/.*: \d+ frames for \d+ rows" if fewer else r".*\(40, 64, 3\)"
+    for key in dataset.cameras:
+        pictures, fewer = dataset.frames(key, np.arange(len(dataset))), rng.random() < 0.5
+        if fewer and dataset.features[key].dtype == "image":
+            edit_table(root / DATA, lambda table, key=key: table[key].__setitem__(lost, {"bytes": None, "path": None}))
+            return f"{DATA}: {key}: 1 of .* rows have no picture"
+        show(root, {key: pictures[:-lost] if fewer else pictures[:, :40]})
+        return r"videos/.*: \d+ frames for \d+ rows" if fewer else r".*\(40, 64, 3\)"
+    pq.write_table(pq.read_table(root / DATA).slice(0, len(dataset) - lost), root / DATA)
+    return r"meta/info.json: .*counts \d+ frames, its data files \d+"
 
 
 def finite(root: Path, rng: Rng) -> str:
@@ -125,18 +124,12 @@ def died(root: Path, rng: Rng) -> str:
     return "left by a recorder, writer or download that died"
 
 
-def tasks(root: Path, rng: Rng) -> str:
-    if rng.random() < 0.5:
-        store(root, {layout.TASK_INDEX: np.full(len(Dataset.open(root)), 3)})
-        return "data: task_index: 3 .*expected 0"
-    edit_table(root / EPISODES, lambda table: table["tasks"].__setitem__(0, ["Drop it"]))
-    return "meta/episodes: tasks: .*Drop it"
-
-
-def own(root: Path, rng: Rng) -> str | None:
-    if not (root / layout.OURS).exists():
-        return None
-    key = str(rng.choice([s.LABEL_VALID, s.ACTOR, s.SEED, "spec"]))
+def own(root: Path, rng: Rng) -> str:
+    """Our columns or file; where there are none, or at times, a task that is none."""
+    key = str(rng.choice([s.LABEL_VALID, s.ACTOR, s.SEED, layout.TASK_INDEX, "spec"]))
+    if key == layout.TASK_INDEX or not (root / layout.OURS).exists():
+        edit_table(root / DATA, lambda table: table[layout.TASK_INDEX].__setitem__(9, 3))
+        return "data: task_index: 3 at 9; expected 0"
     if key == "spec":
         edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "other"))
         return "meta/manip_il.json: .*; meta/info.json says"
@@ -215,7 +208,7 @@ def commands(root: Path, rng: Rng) -> str:
 
 
 PLANTS: tuple[Plant, ...] = (
-    *(counts, rows, names, frames, finite, times, statistics, died, tasks, own),
+    *(counts, rows, names, frames, finite, times, statistics, died, own),
     *(idle, lag, cameras, joint, commands),
 )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -23,24 +22,16 @@ from .teaching import make
 FRONT = "observation.images.front"
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One of ours with cameras beside its journals, and one of LeRobot's."""
-    folder = tmp_path_factory.mktemp("made")
-    make(folder / "ours", 3)
-    make(folder / "theirs", 2)
-    return folder
+@pytest.fixture
+def ours(tmp_path: Path) -> Path:
+    """One with cameras, beside its journals."""
+    return make(tmp_path / "ours", 3)
 
 
 @pytest.fixture
-def ours(made: Path, tmp_path: Path) -> Path:
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
-    return tmp_path / "ours"
-
-
-@pytest.fixture
-def theirs(ours: Path) -> Path:
-    return ours.with_name("theirs")
+def theirs(tmp_path: Path) -> Path:
+    """One of LeRobot's."""
+    return make(tmp_path / "theirs", 2)
 
 
 def mend(root: Path) -> list[str]:
