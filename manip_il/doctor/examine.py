@@ -72,11 +72,13 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
     """Repair what can be repaired; yield one line for each thing that was done, or was not and why.
 
     Nothing is deleted: what is replaced or moved is kept in `ROOT.before-repair`. Raises `ManipError` if that is there,
-    and while another process is at work on the dataset. Examine it anew afterwards.
+    for what is reached through links, and while another process is at work on it. Examine it anew afterwards.
     """
     kept = root.with_name(f"{root.name}.before-repair")
     if kept.exists():
         raise ManipError(f"{kept} is there already, from an earlier repair; move it elsewhere first")
+    if linked := [path for path in root.rglob("*") if not path.resolve().is_relative_to(root.resolve())]:
+        raise ManipError(f"{linked[0]} is a link to elsewhere, where nothing is changed; repair a copy of the dataset")
     with exclusive(root):
         if has_errors(findings) and journals_of(root).is_dir():
             yield _rebuild(root, kept)
