@@ -90,6 +90,8 @@ def _differ(found: NDArray[Any], wanted: Any, tolerance: Any = 0) -> str:
     bad = np.flatnonzero(~(np.abs(found.astype(np.float64) - wanted) <= tolerance))
     if not len(bad):
         return ""
+    if len(found) == 1:
+        return f"{found[0]:.6g}; expected {wanted[0]:.6g}"
     return f"{found[bad[0]]:.6g} at {bad[0]:,}; expected {wanted[bad[0]]:.6g} ({len(bad):,} of {len(found):,} differ)"
 
 
