@@ -190,7 +190,7 @@ def commands(root: Path, rng: Rng) -> str:
         if what == "never reached":
             state[:, 4] = 0.04 + (state[:, 4] - 0.04) * follows
         elif what == "cut off":
-            limits = (low, None) if action[0, place] > low else (None, high)
+            limits: Any = (low, None) if action[0, place] > low else (None, high)
             action[:, place] = action[:, place].clip(*limits)
         else:
             state[:, :4], action[:, :4] = 2 * state[0, :4] - state[:, :4], 2 * action[0, :4] - action[:, :4]
