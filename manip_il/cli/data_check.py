@@ -83,13 +83,12 @@ def _examine(root: Path) -> list[Finding]:
 def _say_verdict(root: Path, findings: list[Finding]) -> None:
     """Print how much is whole, and what its episodes draw; raises `NotWhole` with the numbers after errors."""
     from manip_il.data.dataset import Dataset
-    from manip_il.doctor.examine import has_errors
-    from manip_il.doctor.finding import NotWhole, Severity
+    from manip_il.doctor.finding import NotWhole
 
-    severities = [finding.severity for finding in findings]
-    numbers = {kind.value: severities.count(kind) for kind in Severity}
+    errors = sum(finding.is_error for finding in findings)
+    numbers = {"error": errors, "warning": len(findings) - errors}
     counts = [f"{number} {name}{'' if number == 1 else 's'}" for name, number in numbers.items() if number]
-    if has_errors(findings):
+    if errors:
         raise NotWhole(f"{root}: {', '.join(counts)}")
     dataset = Dataset.open(root)
     whole = f"{dataset.info.episodes:,} episodes, {dataset.info.frames:,} frames: whole"

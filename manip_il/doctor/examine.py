@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,12 @@ from manip_il.data.info import NUMBERS
 from manip_il.data.lerobot_layout import DATA_FILES, EPISODE_INDEX, INFO, STATS, write_json
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, to_lists
 from manip_il.doctor import files, learning
-from manip_il.doctor.finding import Finding, Severity, by_journals, by_repair, journals_of
+from manip_il.doctor.finding import Finding, journals_of, mend
 from manip_il.errors import ManipError
 
 Check = Callable[[Dataset], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (*files.CHECKS, *learning.CHECKS)
 _FILE = re.compile(r"(?:meta|data|videos)/[\w.\-/]*\w")
-_ADVICE = re.compile(r"\W*(?:run|see)? ?`manip-il .*")  # of readers, to examine the dataset
 _PICTURES = 100  # of a camera, of which its statistics are
 
 
@@ -40,35 +41,38 @@ def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
         check_arrived(root, strict=False)
         dataset = Dataset.open(root)
     except ManipError as problem:
-        return [_explain(root, problem)]
-    found = dict[Finding, None]()  # several checks may need the same file
-    for check in (*CHECKS, *more):
-        try:
-            for finding in check(dataset):
-                found[finding] = None
-        except Exception as problem:  # what one check cannot read or finish must not hide the others
-            found[_explain(root, problem)] = None
-    return list(found)
+        found = [_explain(root, problem)]
+    else:
+        found = [finding for check in (*CHECKS, *more) for finding in _run(check, dataset)]
+    # several checks may need the same file
+    return list(dict.fromkeys(replace(one, remedy=one.remedy or mend(root, one)) for one in found))
 
 
-def has_errors(findings: Sequence[Finding]) -> bool:
-    """Return whether one of the findings is an error."""
-    return any(finding.severity is Severity.ERROR for finding in findings)
+def _run(check: Check, dataset: Dataset) -> Iterator[Finding]:
+    try:
+        yield from check(dataset)
+    except Exception as problem:  # what one check cannot read or finish must not hide the others
+        yield _explain(dataset.root, problem)
 
 
 def _explain(root: Path, problem: Exception) -> Finding:
     text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
-    text = _ADVICE.sub("", text).replace(f"{root}/", "").removeprefix(f"{root}: ")
+    text = text.partition("; run `manip-il data check")[0].replace(f"{root}/", "").removeprefix(f"{root}: ")
     text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as if its recorder had died")
-    place = found[-1] if (found := _FILE.findall(text)) else str(root)  # the last is a file in a folder
-    return Finding(place, text, (by_repair if place in (INFO, STATS) else by_journals)(root))
+    place = [str(root), *_FILE.findall(text)][-1]  # the last is a file in a folder
+    return Finding(place, text.replace(f"cannot read {place}: ", "cannot be read: "))
+
+
+def has_errors(findings: Sequence[Finding]) -> bool:
+    """Return whether one of the findings is an error."""
+    return any(finding.is_error for finding in findings)
 
 
 def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
     """Repair what can be repaired; yield one line for each thing that was done, or was not and why.
 
-    Nothing is deleted: what is replaced or moved is kept in `ROOT.before-repair`. Raises `ManipError` for what is
-    reached through links, and while another process is at work on it. Examine it anew afterwards.
+    Nothing is deleted: what is replaced or moved is kept in `ROOT.before-repair`. Raises `ManipError` if that is there,
+    for what is reached through links, and while another process is at work on it. Examine it anew afterwards.
     """
     kept = root.with_name(f"{root.name}.before-repair")
     if kept.exists():
@@ -82,16 +86,14 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
             kept.mkdir(exist_ok=True)
             shutil.move(path, kept)
             yield f"moved away: {path.name}"
-        try:
-            for name, compute in ((INFO, _recount), (STATS, _recompute)):
+        for name, compute in ((INFO, _recount), (STATS, _recompute)):
+            with suppress(ManipError, OSError, ValueError):  # what cannot be read stays a finding
                 if content := compute(root):
                     kept.mkdir(exist_ok=True)
                     for path in root.glob(name):
                         shutil.copy2(path, kept)
                     write_json(root / name, content)
                     yield f"computed from the data: {name}"
-        except (ManipError, OSError, ValueError) as problem:
-            yield f"not repaired further: {checks.one_line(problem)}"
         if kept.exists():
             yield f"what was replaced or moved is kept in {kept}"
 
@@ -99,10 +101,9 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
 def _rebuild(root: Path, kept: Path) -> str:
     """Build the dataset from its journals, unless they hold less than it does."""
     journals, fresh = journals_of(root), root.with_name(f".{root.name}.rebuilt.partial")
-    try:
+    held = 0  # if nothing of it can be read
+    with suppress(ManipError):
         held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
-    except ManipError:
-        held = 0  # nothing of it can be read
     try:
         result = build(journals, fresh, replace=True)
     except ManipError as problem:

@@ -5,22 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.camera import open_video
 from manip_il.data.dataset import Dataset
-from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
-from manip_il.doctor.finding import Finding, by_deletion, by_journals, by_repair, journals_of, list_first, warning
-from manip_il.errors import ManipError
+from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, reading
+from manip_il.doctor.finding import Finding, journals_of, list_first, of_episodes, warning
 
 _AXES = (["height", "width", "channels"], ["height", "width", "channel"], ["channels", "height", "width"])
 _TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # shares: LeRobot computes in float32
@@ -32,7 +30,7 @@ def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
     """Check that no recorder, writer or download died here."""
     for path in leftovers(dataset.root):
         name = path.relative_to(dataset.root.absolute().parent).as_posix()
-        yield warning(name, "left by a recorder, writer or download that died", by_repair(dataset.root))
+        yield warning(name, "left by a recorder, writer or download that died")
 
 
 def leftovers(root: Path) -> list[Path]:
@@ -44,34 +42,30 @@ def leftovers(root: Path) -> list[Path]:
 
 
 def check_info(dataset: Dataset) -> Iterator[Finding]:
-    """Check that `meta/info.json` has names and shapes with which LeRobot trains, every column, and right counts."""
-    info, root = dataset.info, dataset.root
-    for key, feature in info.features.items():
+    """Check that `meta/info.json` has every column, and cameras with names and shapes with which LeRobot trains."""
+    for feature in dataset.info.of_dtype(*PICTURES):
         shape, names = list(feature.shape), feature.names
-        right = names in _AXES and len(shape) == 3 and shape[0 if names[0] == "channels" else 2] in (1, 3)
-        if feature.dtype in PICTURES and not right:
+        if names not in _AXES or len(shape) != 3 or shape[0 if names[0] == "channels" else 2] not in (1, 3):
             text = f"a camera of shape {shape} with names {names}, on which LeRobot does not train"
-            say = warning if isinstance(names, list) and names[:2] == ["height", "width"] else Finding  # some train
             remedy = 'set [height, width, 3] and ["height", "width", "channels"] there'
-            yield say(f"{layout.INFO}: {key}", text, remedy)
-    counts = {"episodes": (info.episodes, len(dataset.episodes)), "tasks": (info.tasks, len(dataset.tasks))}
-    for what, (said, found) in counts.items():
-        if said not in (None, found):
-            yield Finding(layout.INFO, f"total_{what} is {said}; the file of {what} has {found}", by_repair(root))
-    wanted = {key for key, feature in info.features.items() if feature.dtype != "video"} | {*INDEX_FEATURES}
+            some_train = isinstance(names, list) and names[:2] == ["height", "width"]
+            yield Finding(f"{layout.INFO}: {feature.key}", text, remedy, is_error=not some_train)
+    wanted = {key for key, feature in dataset.features.items() if feature.dtype != "video"} | {*INDEX_FEATURES}
     for path in dataset.data_files:
         if odd := sorted(wanted ^ {*pq.read_schema(path).names}):
             text = f"has other columns than {layout.INFO}, with which LeRobot does not load it: {list_first(odd)}"
-            yield Finding(path.relative_to(root).as_posix(), text, by_journals(root))
+            yield Finding(path.relative_to(dataset.root).as_posix(), text)
 
 
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
     """Check that episodes count from 0 and follow each other, that the rows are theirs, at the rate's times."""
-    table, tasks = dataset.episodes, dataset.tasks
+    table, tasks, info = dataset.episodes, dataset.tasks, dataset.info
     ends = np.cumsum(table.length)
     frame = np.concatenate([np.arange(length) for length in table.length])
     columns = {key: dataset.columns([key])[key].reshape(-1) for key in INDEX_FEATURES}
     for place, found, wanted in (
+        (f"{layout.INFO}: total_episodes", np.array([info.episodes]), np.array([len(table)])),
+        (f"{layout.INFO}: total_tasks", np.array([len(tasks) if info.tasks is None else info.tasks]), [len(tasks)]),
         ("meta/episodes: episode_index", table.index, np.arange(len(table))),
         ("meta/episodes: dataset_from_index", table.start, ends - table.length),
         ("meta/episodes: dataset_to_index", table.stop, ends),
@@ -83,19 +77,21 @@ def check_rows(dataset: Dataset) -> Iterator[Finding]:
         (f"data: timestamp at {dataset.fps:.6g} frames a second", columns[layout.TIMESTAMP], frame / dataset.fps),
     ):
         if text := _differ(found, wanted, _LATE + 1e-6 * np.abs(wanted)):
-            yield Finding(place, text, by_journals(dataset.root))
+            yield Finding(place, text)
     if unknown := {text for texts in table.tasks for text in texts} - {*tasks.values()}:
-        text = f"names the task {list_first(map(repr, unknown))}, which {layout.TASKS} does not hold"
-        yield Finding("meta/episodes: tasks", text, by_journals(dataset.root))
+        text = f"names the task {list_first([*map(repr, unknown)])}, which {layout.TASKS} does not hold"
+        yield Finding("meta/episodes: tasks", text)
 
 
-def _differ(found: NDArray[Any], wanted: NDArray[Any], tolerance: Any = 0) -> str:
+def _differ(found: NDArray[Any], wanted: Any, tolerance: Any = 0) -> str:
     """Return where numbers (N,) differ first, and how many do; empty if none does."""
     if len(found) != len(wanted):
         return f"{len(found):,} values; expected {len(wanted):,}"
     bad = np.flatnonzero(~(np.abs(found.astype(np.float64) - wanted) <= tolerance))
     if not len(bad):
         return ""
+    if len(found) == 1:
+        return f"{found[0]:.6g}; expected {wanted[0]:.6g}"
     return f"{found[bad[0]]:.6g} at {bad[0]:,}; expected {wanted[bad[0]]:.6g} ({len(bad):,} of {len(found):,} differ)"
 
 
@@ -104,19 +100,20 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
     root, ends = dataset.root, np.cumsum(dataset.episodes.length)
     stored = dataset.statistics if (root / layout.STATS).exists() else None
     if stored is None:
-        yield warning(layout.STATS, "is missing: LeRobot normalises nothing without it", by_repair(root))
+        yield warning(layout.STATS, "is missing: LeRobot normalises nothing without it")
     for feature in dataset.info.of_dtype(*NUMBERS, *PICTURES):
         key, text, table = feature.key, "", (stored or {}).get(feature.key)
         if feature.dtype in NUMBERS:
             values = dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64, copy=False)
             if len(bad := np.flatnonzero(~np.isfinite(values).all(axis=1))):
-                episodes = sorted({*np.searchsorted(ends, bad, side="right").tolist()})
-                remedy = by_journals(root) if journals_of(root).is_dir() else by_deletion(root, episodes)
-                yield Finding(f"data: {key}", f"no number in row {bad[0]:,} ({len(bad):,} such rows)", remedy)
+                episodes = np.unique(np.searchsorted(ends, bad, side="right")).tolist()
+                what = f"no number in row {bad[0]:,} ({len(bad):,} such rows)"
+                lost = of_episodes(root, f"data: {key}", what, episodes)
+                yield replace(lost, is_error=True, remedy="" if journals_of(root).is_dir() else lost.remedy)
             elif table is not None:
                 text = _compare(table, values, feature)
         if stored is not None and key not in INDEX_FEATURES and (text or table is None):  # of those nobody needs any
-            yield Finding(f"{layout.STATS}: {key}", text or "is missing", by_repair(root))
+            yield Finding(f"{layout.STATS}: {key}", text or "is missing")
 
 
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:
@@ -137,46 +134,40 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
             cells: Any = pq.read_table(path, columns=[key]).column(key).combine_chunks()
             if lacking := cells.field("bytes").null_count:
                 place = f"{path.relative_to(root).as_posix()}: {key}"
-                yield Finding(place, f"{lacking:,} of {len(cells):,} rows have no picture", by_journals(root))
+                yield Finding(place, f"{lacking:,} of {len(cells):,} rows have no picture")
     for clips in table.clips.values():
         for name in dict.fromkeys(clips.files):
-            try:
-                with closing(open_video(root / name)) as container:
-                    stream = container.streams.video[0]
-                    tick = float(stream.time_base or 1)
-                    times = np.sort([one.pts * tick for one in container.demux(stream) if one.pts is not None])
-            except (ManipError, av.FFmpegError, OSError, ValueError, IndexError) as problem:
-                text = f"cannot be read, as if its encoder had died: {checks.one_line(problem)}"
-                yield Finding(name, text.replace(f"{root}/", ""), by_journals(root))
-                continue
+            with reading(root / name), closing(open_video(root / name)) as container:
+                [stream] = container.streams.video
+                tick = float(stream.time_base or 1)
+                times = np.sort([one.pts * tick for one in container.demux(stream) if one.pts is not None])
             rows = [row for row, file in enumerate(clips.files) if file == name]
             wanted = np.concatenate([clips.starts[row] + np.arange(table.length[row]) / dataset.fps for row in rows])
             lacking = int((np.searchsorted(times, wanted - _LATE) == np.searchsorted(times, wanted + _LATE)).sum())
             if lacking or len(times) != len(wanted):
                 text = f"{len(times):,} frames for {len(wanted):,} rows; {lacking:,} rows have none at their time"
-                yield Finding(name, text, by_journals(root))
+                yield Finding(name, text)
 
 
 def check_own(dataset: Dataset) -> Iterator[Finding]:
     """Check this program's own columns and file: names, shapes, labels, drivers, seeds."""
-    own, features, root = dataset.own, dataset.features, dataset.root
+    own, features = dataset.own, dataset.features
     if own is None:
         if {s.SIM_STATE, s.EXECUTED_ACTION} <= features.keys():
             text = "is missing (LeRobot's tools drop it): robot, task and versions are unknown"
             yield warning(layout.OURS, text, "copy it from the dataset that this one was made from")
         return
-    there = {key: ([*one.shape], one.names) for key, one in features.items()} | {"fps": dataset.fps}
+    there: dict[str, Any] = {key: ([*one.shape], one.names) for key, one in features.items()} | {"fps": dataset.fps}
     said = {key: ([*one["shape"]], one["names"]) for key, one in s.features(own.spec).items()}
     for key, wanted in {**said, "fps": own.spec.fps}.items():
-        if there.get(key) != wanted:
-            text = f"{key} is {str(there.get(key, 'missing'))[:80]}; {layout.OURS} says {str(wanted)[:80]}"
-            yield Finding(layout.INFO, text, by_journals(root))
+        if (found := there.get(key, "missing")) != wanted:
+            yield Finding(layout.OURS, f"{key} is {str(wanted)[:80]}; {layout.INFO} says {str(found)[:80]}")
     valid, actor, seed = (dataset.columns([key])[key].reshape(-1) for key in (s.LABEL_VALID, s.ACTOR, s.SEED))
     first = seed[np.repeat(dataset.episodes.start, dataset.episodes.length)]
     right = {s.LABEL_VALID: (valid, valid.clip(0, 1)), s.ACTOR: (actor, actor.clip(0, 2)), s.SEED: (seed, first)}
     for key, (found, wanted) in right.items():
         if text := _differ(found, wanted):
-            yield Finding(f"data: {key}", text, by_journals(root))
+            yield Finding(f"data: {key}", text)
 
 
 CHECKS = (check_leftovers, check_info, check_rows, check_numbers, check_frames, check_own)

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from manip_il import checks
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
-from manip_il.doctor.finding import Finding, by_deletion, by_journals, edit, list_first, warning
-from manip_il.errors import ManipError
+from manip_il.doctor.finding import Finding, edit, list_first, of_episodes, warning
 from manip_il.mdp import Actor
 
 F64, Mask = NDArray[np.float64], NDArray[np.bool_]
@@ -65,9 +63,8 @@ def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
         moving = [np.ptp(both[start : start + second], axis=0).max() > _STILL for start in starts]
         idle[episode] = max(np.flatnonzero(moving), default=-1) + 1 - sum(moving)
     if (share := sum(idle.values()) * second / len(both)) > _IDLE:
-        odd = [episode for episode, seconds in idle.items() if seconds]
-        text = f"nothing moves for seconds, in {share:.0%} of the frames (episodes {list_first(odd)})"
-        yield warning(s.ACTION, f"{text}: a policy learns to stand still there", by_deletion(dataset.root, odd))
+        text = f"nothing moves for seconds, in {share:.0%} of the frames: a policy learns to stand still there"
+        yield of_episodes(dataset.root, s.ACTION, text, [episode for episode, seconds in idle.items() if seconds])
 
 
 def _check_lag(dataset: Dataset, rows: Rows, told: F64, found: F64) -> Iterator[Finding]:
@@ -105,10 +102,9 @@ def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: ND
         measures = (("starts at", starts, apart), ("correlates with its action by", agree, against[:, place]))
         for what, values, odd in measures:
             if odd.any():
-                episodes = np.array([*rows])[odd]
-                text = f"{name} {what} {values[odd, place].mean():.3g} in episodes {list_first(episodes)}"
-                text += f", else {values[~odd, place].mean():.3g}: its zero or sign differs"
-                yield warning(s.STATE, text, by_deletion(dataset.root, episodes))
+                means = f"{values[odd, place].mean():.3g}, elsewhere {values[~odd, place].mean():.3g}"
+                text = f"{name} {what} {means}: its zero or sign differs"
+                yield of_episodes(dataset.root, s.STATE, text, np.array([*rows])[odd])
 
 
 def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
@@ -160,25 +156,18 @@ def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
             continue  # few, or the first observation tells which
         what = f"{len(here)} of {len(same)} episodes ({list_first(episodes)}) move in another way than the rest"
         own = json.dumps(dict.fromkeys(map(str, episodes), "NEW TEXT"))
-        remedy = (
-            f"give them a text of their own: {edit(dataset.root, 'modify_tasks')} --operation.episode_tasks='{own}'"
-        )
-        yield warning("task", f"{what}, for one text {text[:60]!r}", remedy)
+        command = f"{edit(dataset.root, 'modify_tasks')} --operation.episode_tasks='{own}'"
+        yield warning("task", f"{what}, for one text {text[:60]!r}", f"give them a text of their own: {command}")
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
     """Check some pictures of every episode: they are decoded and have their size, and show what they should."""
-    table, root, _ = dataset.episodes, dataset.root, dataset.data_files  # what raises here is said once
+    table, _ = dataset.episodes, dataset.data_files  # what raises here is said once
     chosen = np.flatnonzero(table.length > 1)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(_EPISODES, len(chosen))).astype(int)]
     rows = np.linspace(table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1)
-    seen: dict[str, F64] = {}
-    for key in [key for key in dataset.cameras if dataset.features[key].is_rgb and len(rows)]:
-        try:
-            seen[key] = np.stack([_thumbnails(dataset.frames(key, one)) for one in rows])
-        except ManipError as problem:
-            text = checks.one_line(problem).replace(f"{root}/", "").partition("; run `manip-il")[0]
-            yield Finding(key, text, by_journals(root))
+    cameras = [key for key in dataset.cameras if dataset.features[key].is_rgb and len(rows)]
+    seen = {key: np.stack([_thumbnails(dataset.frames(key, one)) for one in rows]) for key in cameras}
     moved = np.zeros((len(rows), _PICTURES - 1), bool)  # by a tenth of a joint's range, from picture to picture
     if seen and s.STATE in dataset.features:
         state = dataset.columns([s.STATE])[s.STATE].reshape(len(dataset), -1).astype(np.float64)
@@ -191,9 +180,8 @@ def check_cameras(dataset: Dataset) -> Iterator[Finding]:
         odd |= {f"is swapped with {other}": _find_swapped(pictures, seen[other]) for other in seen if other > key}
         for what, which in odd.items():
             if which.any():
-                episodes = table.index[chosen[which]]
-                text = f"{what} in {which.sum()} of {len(which)} episodes ({list_first(episodes)})"
-                yield warning(key, text, by_deletion(root, episodes))
+                text = f"{what} in {which.sum()} of {len(which)} episodes"
+                yield of_episodes(dataset.root, key, text, table.index[chosen[which]])
 
 
 def _thumbnails(pictures: NDArray[np.uint8]) -> F64:

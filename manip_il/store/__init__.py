@@ -9,9 +9,8 @@ they promise, and the tests in `tests/store` that show it:
     a killed transfer leaves no half version                 test_a_killed_transfer
     a pull verifies every hash                               test_bytes_that_differ_are_refused
     nothing is written outside the target folder             test_a_hostile_manifest_is_refused_and_nothing_is_written
-    links are not followed                                   test_links_are_not_followed
-    a dataset is examined before its push                    test_a_dataset_is_examined_before_its_push
+    a dataset is examined first, links are not followed      test_a_dataset_is_examined_before_its_push_and_...
     only known hosts; a mistake is one line                  test_a_mistake_is_one_line
     secrets are never printed                                test_no_token_is_said, tests/cli/test_secrets.py
-    a card claims nothing of what others made                test_the_card_of_another_programs_dataset_claims_...
+    a card claims nothing of what others made                test_a_datasets_card_says_what_the_hub_reads_and_...
 """

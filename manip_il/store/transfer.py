@@ -13,7 +13,7 @@ from manip_il.data import atomic
 from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.examine import examine_folder
-from manip_il.doctor.finding import NotWhole, Severity, journals_of
+from manip_il.doctor.finding import NotWhole, journals_of
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.store.errors import RemoteError
 from manip_il.store.hub import Hub
@@ -66,7 +66,7 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
         text = "datasets go to hf://datasets/USER/NAME, runs to hf://USER/NAME"
         raise UsageError(f"{source} is a {kind}, {remote.name} is for a {remote.kind}; {text}")
     for dataset in datasets_in(source):
-        if errors := [one for one in examine_folder(dataset) if one.severity is Severity.ERROR]:
+        if errors := [one for one in examine_folder(dataset) if one.is_error]:
             text = f"{dataset} is damaged and was not pushed: {' '.join(str(errors[0]).split())}"
             raise NotWhole(f"{text}; see all with manip-il data check, and try manip-il data repair {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:

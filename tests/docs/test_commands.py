@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import boto3
 import pytest
 
 from manip_il.cli.main import load
@@ -15,8 +14,7 @@ from manip_il.cli.parsing import parse
 from manip_il.evaluation import film
 from manip_il.tasks.table import TASKS
 
-from ..store.hub_server import TOKEN, Hub, clean_environment, hub_server, talk_to
-from ..store.s3 import KEY, SECRET, running_moto, variables
+from ..store.servers import TOKEN, Hub, hub_server, s3_server, talk_to
 from ..warm import Warm
 from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, command_of, help_lines, page_lines
 from .sizes import shrink_study
@@ -41,10 +39,8 @@ def running_hub() -> Iterator[Hub]:
 @pytest.fixture(scope="session")
 def bucket() -> Iterator[dict[str, str]]:
     """What a program must have in its environment to find it."""
-    with running_moto() as endpoint:
-        client = boto3.client("s3", endpoint_url=endpoint, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
-        client.create_bucket(Bucket=BUCKET)
-        yield variables(endpoint)
+    with s3_server(BUCKET) as variables:
+        yield variables
 
 
 @pytest.fixture(scope="session")
@@ -52,7 +48,8 @@ def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Itera
     """Runs a command of LeRobot's, or a script, in a folder; the Hub of the tests is the only one that it knows."""
     home = tmp_path_factory.mktemp("home")
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
-    clean |= clean_environment(running_hub, home / "hf", TOKEN)
+    clean |= {"HF_ENDPOINT": running_hub.url, "HF_HOME": str(home / "hf"), "HF_TOKEN": TOKEN}
+    clean |= {"HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1"}
     clean |= {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": str(ROOT)}
     with Warm(clean, home, ["manip_il.lerobot_plugin"]) as warm:
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from manip_il.data import schema as s
 from manip_il.data.journal import list_episodes
 from manip_il.doctor.examine import examine_folder, repair
 from manip_il.doctor.finding import Finding
+from manip_il.errors import ManipError
 
 from ..damage import DATA, cut, digests, edit_json, edit_table, lines
 from ..warm import Warm
@@ -23,24 +23,16 @@ from .teaching import make
 FRONT = "observation.images.front"
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One of ours with cameras beside its journals, and one of LeRobot's."""
-    folder = tmp_path_factory.mktemp("made")
-    make(folder / "ours", 3)
-    make(folder / "theirs", 2)
-    return folder
+@pytest.fixture
+def ours(tmp_path: Path) -> Path:
+    """One with cameras, beside its journals."""
+    return make(tmp_path / "ours", 3)
 
 
 @pytest.fixture
-def ours(made: Path, tmp_path: Path) -> Path:
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
-    return tmp_path / "ours"
-
-
-@pytest.fixture
-def theirs(ours: Path) -> Path:
-    return ours.with_name("theirs")
+def theirs(tmp_path: Path) -> Path:
+    """One of LeRobot's."""
+    return make(tmp_path / "theirs", 2)
 
 
 def mend(root: Path) -> list[str]:
@@ -77,6 +69,16 @@ def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     np.testing.assert_allclose(stats[FRONT]["mean"], whole[FRONT]["mean"], atol=0.05)
     kept = theirs.with_name("theirs.before-repair")
     assert sorted(path.name for path in kept.iterdir()) == ["images", "info.json", "stats.json"]
+
+
+def test_what_a_link_leads_to_is_not_changed(theirs):
+    info = theirs / layout.INFO
+    elsewhere = info.rename(theirs.with_name("info.json"))
+    info.symlink_to(elsewhere)
+    edit_json(elsewhere, lambda info: info.update(total_frames=3))
+    with pytest.raises(ManipError, match=r"info\.json is a link to elsewhere"):
+        mend(theirs)
+    assert json.loads(elsewhere.read_text())["total_frames"] == 3
 
 
 def test_lerobots_tool_deletes_the_episodes_that_a_remedy_names(theirs, warm_lerobot: Warm):

@@ -108,20 +108,16 @@ def test_an_export_read_by_others_holds_the_datasets_values(ours: Path, tmp_path
     assert [path.read_bytes() for path in paths] == [path.read_bytes() for path in again]
 
 
-def test_a_number_that_is_not_finite_is_refused_by_name(ours: Path, tmp_path: Path) -> None:
+def test_a_number_that_is_not_finite_is_refused_and_a_column_without_a_place_left_out(ours: Path, tmp_path: Path):
     root = shutil.copytree(ours, tmp_path / "d")
+    odd = {"text": {"dtype": "language"}, "depth": {"dtype": "image", "info": {"is_depth_map": True}}}
+    odd = {key: {"shape": [4, 4, 3], "names": None, **one} for key, one in odd.items()}
+    edit_json(root / layout.INFO, lambda info: info["features"].update(odd))
+    assert left_out(Dataset.open(root).info) == ["text", "depth"]
+    assert not {"/text", "/depth"} & by_topic(export(root, tmp_path / "rest")[1]).keys()
     edit_table(root / DATA, lambda columns: columns.update({s.REWARD: [0.0, np.nan, *[1.0] * 18]}))
     with pytest.raises(NotFiniteError, match=r"column 'next\.reward': nan at index 1"):
         export(root, tmp_path / "out")
-
-
-@pytest.mark.parametrize("change", [{"dtype": "language"}, {"dtype": "image", "info": {"is_depth_map": True}}])
-def test_a_column_without_a_place_in_mcap_is_left_out_and_named(ours: Path, tmp_path: Path, change) -> None:
-    root = shutil.copytree(ours, tmp_path / "d")
-    odd = {"shape": [4, 4, 3], "names": None, **change}
-    edit_json(root / layout.INFO, lambda info: info["features"].update(odd=odd))
-    assert left_out(Dataset.open(root).info) == ["odd"]
-    assert "/odd" not in by_topic(export(root, tmp_path / "rest")[1])
 
 
 @pytest.mark.slow

@@ -15,15 +15,12 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.data.journal import Journal
-from manip_il.data.schema import ACTION, STATE, SUCCESS
 from manip_il.errors import ManipError
 from manip_il.mcap.importing import import_files, pick, read_frames
 from manip_il.mcap.mapping import Source
 
 from ..damage import digests
 from ..pictures import encoded
-from ..synthetic import MakeEpisode
 from .use import Messages, feature, load, ramp, write
 
 STEADY = range(0, 1000, 100)
@@ -74,6 +71,9 @@ def test_pictures_come_in_pixel_for_pixel(tmp_path: Path) -> None:
             np.testing.assert_array_equal(row[name], picture(number))
 
 
+CAMERA = {"field": None, "dtype": "string", "video": False}
+
+
 @pytest.mark.parametrize(
     ("messages", "changes", "why"),
     [
@@ -83,43 +83,18 @@ def test_pictures_come_in_pixel_for_pixel(tmp_path: Path) -> None:
         ([(0, {"x": 1.5})], {"dtype": "int64"}, r"\[1.5\]; expected finite numbers of int64"),
         ([(0, {"x": [1, 2]})], {"names": ["a"]}, "f at 0 ns: 2 values; expected 1"),
         ([(0, {"x": 1}), (100, {"y": 1})], {}, "f at 100000000 ns: no field 'x'"),
+        ([(0, raw(0, "mono8"))], CAMERA, "at 0 ns: a picture encoded as 'mono8'; expected rgb8 or bgr8"),
+        ([(0, b"cdr")], CAMERA, "messages are cdr .*expected protobuf, json or cdr .*ROS 2: pip install mcap-ros2"),
         (ramp(STEADY), {"topic": "/b"}, "has no messages of /b .*its topics: /a, /late, /steady"),
         (ramp(STEADY), {"topic": "/late"}, r"/steady ends 4\.1 s before /late starts"),
     ],
 )
-def test_what_cannot_be_is_refused_by_file_topic_and_time(tmp_path, messages: Messages, changes, why: str) -> None:
+def test_what_cannot_be_is_refused_by_file_topic_and_time(tmp_path, monkeypatch, messages: Messages, changes, why):
+    monkeypatch.setattr("manip_il.mcap.read.find_spec", lambda name: None)  # mcap-ros2-support may be installed
     path = write(tmp_path / "bad.mcap", {"/a": messages, "/steady": ramp(STEADY), "/late": ramp([5000, 5100])})
     steady = {"g": feature("/steady")} if "topic" in changes else {}
     with pytest.raises(ManipError, match=rf"bad\.mcap.*{why}"):
         list(read_frames(path, load(tmp_path, {"f": feature(**changes), **steady})))
-
-
-@pytest.mark.parametrize(
-    ("message", "encoding", "why"),
-    [
-        (raw(0, "mono8"), "", "topic /a at 0 ns: a picture encoded as 'mono8'; expected rgb8 or bgr8"),
-        ({"x": 1}, "cdr", r"messages are cdr .*expected protobuf, json or cdr .*ROS 2: pip install mcap-ros2-support"),
-    ],
-)
-def test_what_is_no_picture_or_of_another_encoding_is_refused(tmp_path, monkeypatch, message, encoding, why) -> None:
-    monkeypatch.setattr("manip_il.mcap.read.find_spec", lambda name: None)  # mcap-ros2-support may be installed
-    path = write(tmp_path / "p.mcap", {"/a": [(0, message)]}, encoding)
-    mapping = load(tmp_path, {"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
-    with pytest.raises(ManipError, match=rf"p\.mcap.* {why}"):
-        list(read_frames(path, mapping))
-
-
-def test_our_journals_come_in_by_a_mapping_of_their_topics(tmp_path, make_episode: MakeEpisode, spec) -> None:
-    episode = make_episode(3, 6)
-    path = Journal(tmp_path, spec, {}).write(episode)
-    features = {
-        STATE: feature("/joint_states", field="joints[:].position", dtype="float32", names=list(spec.joint_names)),
-        ACTION: feature("/action", field="joints[:].position", dtype="float32", resample="previous"),
-        SUCCESS: feature("/scalars", field="scalars[label=next.success].value", dtype="bool"),
-    }
-    rows = list(read_frames(path, load(tmp_path, features, fps=spec.fps)))
-    for key in (STATE, ACTION, SUCCESS):
-        np.testing.assert_array_equal([row[key] for row in rows], episode.columns[key])
 
 
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)

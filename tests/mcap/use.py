@@ -46,19 +46,20 @@ def ramp(stamps: Iterable[int]) -> list[tuple[int, Any]]:
     return [(stamp, {"x": float(stamp)}) for stamp in stamps]
 
 
-def write(path: Path, topics: dict[str, Messages], encoding: str = "json") -> Path:
-    """Write topics of JSON or protobuf messages, in this order."""
+def write(path: Path, topics: dict[str, Messages]) -> Path:
+    """Write topics of messages, in this order: JSON, protobuf, or bytes as of ROS 2."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         for topic, messages in topics.items():
             channel = None
             for stamp, content in messages:
-                is_json = isinstance(content, dict)
+                kind = {dict: "json", bytes: "cdr"}.get(type(content), "protobuf")
                 if channel is None:
-                    schema = 0 if is_json else register_schema(writer, type(content))
-                    channel = writer.register_channel(topic, encoding if is_json else "protobuf", schema)
-                data = json.dumps(content).encode() if is_json else content.SerializeToString()
+                    schema = register_schema(writer, type(content)) if kind == "protobuf" else 0
+                    channel = writer.register_channel(topic, kind, schema)
+                data = json.dumps(content).encode() if kind == "json" else content
+                data = content.SerializeToString() if kind == "protobuf" else data
                 writer.add_message(channel, stamp * MS, data, stamp * MS)
         writer.finish()
     return path

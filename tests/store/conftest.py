@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from ..synthetic import make_episode, spec
-from .hub_server import TOKEN, Hub, hub_server, talk_to
-from .s3 import client_of, running_moto, variables
-from .sshd import Sshd, running_sshd
+from .servers import TOKEN, Hub, Sshd, hub_server, s3_server, sshd_server, talk_to
 
 __all__ = ["make_episode", "spec"]  # fixtures
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
@@ -20,14 +18,14 @@ DATASET, POLICY = "hf://datasets/user/demos", "hf://user/policy"
 
 
 @pytest.fixture(scope="session")
-def moto() -> Iterator[str]:
-    with running_moto() as endpoint:
-        yield endpoint
+def s3() -> Iterator[dict[str, str]]:
+    with s3_server("bucket") as variables:
+        yield variables
 
 
 @pytest.fixture(scope="session")
 def sshd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sshd]:
-    with running_sshd(tmp_path_factory.mktemp("sshd")) as server:
+    with sshd_server(tmp_path_factory.mktemp("sshd")) as server:
         yield server
 
 
@@ -41,12 +39,11 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
 
 
 @pytest.fixture
-def bucket(moto: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
-    for name, value in variables(moto).items():
+def bucket(s3: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+    """A URL in an S3 where nothing is yet."""
+    for name, value in s3.items():
         monkeypatch.setenv(name, value)
-    name = f"b{abs(hash(request.node.nodeid)):x}"
-    client_of(moto).create_bucket(Bucket=name)
-    return name
+    return f"s3://bucket{tmp_path}"
 
 
 @pytest.fixture(params=["file", "s3", pytest.param("sftp", marks=pytest.mark.slow), "hub"])
@@ -59,7 +56,7 @@ def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     if request.param == "hub":
         request.getfixturevalue("hub")
         return POLICY
-    return f"file://{tmp_path}/store" if request.param == "file" else f"s3://{request.getfixturevalue('bucket')}/a/b"
+    return f"file://{tmp_path}/store" if request.param == "file" else request.getfixturevalue("bucket")
 
 
 def make_run(folder: Path, seed: int = 1, size: int = 20_000) -> Path:
@@ -77,7 +74,5 @@ def make_run(folder: Path, seed: int = 1, size: int = 20_000) -> Path:
 
 def content(folder: Path) -> dict[str, object]:
     """Everything below: bytes of files, targets of links."""
-    paths = [path for path in sorted(folder.rglob("*")) if path.is_symlink() or path.is_file()]
-    return {
-        str(path.relative_to(folder)): os.readlink(path) if path.is_symlink() else path.read_bytes() for path in paths
-    }
+    paths = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_symlink() or path.is_file()}
+    return {name: os.readlink(path) if path.is_symlink() else path.read_bytes() for name, path in paths.items()}

@@ -32,34 +32,27 @@ def demos(tmp_path: Path) -> Path:
     return shutil.copytree(SAMPLE, tmp_path / "demos")
 
 
-def test_a_datasets_card_says_what_the_hub_reads_and_shows(demos: Path, tmp_path: Path):
+def test_a_datasets_card_says_what_the_hub_reads_and_claims_nothing_of_what_others_made(demos: Path, tmp_path: Path):
     files = cards(demos)
     text, data = files[CARD].decode(), DatasetCard(files[CARD].decode()).data.to_dict()
     assert (data["license"], data["task_categories"]) == ("apache-2.0", ["robotics"])
     assert {"LeRobot", "robotics", "manip_il", "panda", "pick_place"} == set(data["tags"])
-    assert data["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
-    for fact in ("| episodes | 10 |", "375 at 20 a second", "10 of 10", "1000000 to 1000009", "model_sha256"):
+    for fact in ("| episodes | 10 |", "375 at 20 a second", "10 of 10", "1000000 to 1000009", "model_sha256", PICTURE):
         assert fact in text
     assert 'LeRobotDataset("user/demos")' in text
-    assert f"]({PICTURE})" in text
     assert cards(shutil.copytree(SAMPLE, tmp_path / "again")) == files
-
-
-def test_the_card_of_another_programs_dataset_claims_neither_its_licence_nor_its_making(demos: Path):
     (demos / "meta" / "manip_il.json").unlink()
     text = cards(demos)[CARD].decode()
     data = DatasetCard(text).data.to_dict()
     assert "license" not in data
     assert "manip_il" not in data["tags"]
     assert "made by" not in text
-    assert "there is no fingerprint" in text
 
 
 def test_a_card_that_somebody_wrote_is_kept_and_one_of_ours_is_made_again(demos: Path):
     (demos / CARD).write_text("# My own words\n")
     assert set(cards(demos)) == {PICTURE}
-    (demos / CARD).write_text("# panda\n| made by | manip_il 0.0.9 |\n")  # of the version before
-    assert b"user/demos" in cards(demos)[CARD]
+    (demos / CARD).unlink()
     (demos / CARD).write_bytes(cards(demos, place="user/old")[CARD])
     assert b"user/demos" in cards(demos)[CARD]
 
@@ -91,7 +84,6 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     assert data["model-index"][0]["results"][0]["metrics"][0]["value"] == pytest.approx(0.84)
     assert "**84.0%** [75.6%, 89.9%] (95% interval, 100 episodes), on unseen seeds" in text
     assert "--env.task=PandaPickPlace-v0" in text
-    assert "manip-il eval --policy.path=runs/act --eval.n_episodes=200\n" in text
     shutil.rmtree(run / "best")
     with pytest.raises(ManipError, match="no policy in"):
         cards(run, "policy", "user/act")

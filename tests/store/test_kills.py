@@ -13,7 +13,7 @@ import pytest
 from manip_il.store.transfer import open_remote, pull, push
 
 from .conftest import content, make_run
-from .hub_server import talk_to
+from .servers import talk_to
 
 KILLS = int(os.environ.get("MANIP_IL_KILLS", "3"))  # in each direction, on each kind of remote
 
@@ -56,9 +56,8 @@ def test_a_killed_transfer(do: str, place: str, request: pytest.FixtureRequest, 
             pull(open_remote(place, quiet=True), folder)
             assert content(folder) in [content(run) for run in runs]
             push(source, open_remote(place, quiet=True))
+        if do == "push" or not folder.exists():
             pull(open_remote(place, quiet=True), folder, overwrite=True)
-        elif not folder.exists():
-            pull(open_remote(place, quiet=True), folder)
         assert content(folder) == content(source)
         assert not list(tmp_path.glob(f".got{number}*"))
         if killed == KILLS:

@@ -15,29 +15,29 @@ from manip_il.store.manifest import Manifest
 from manip_il.store.transfer import open_remote, pull, push
 
 from .conftest import DATASET, POLICY, SAMPLE, content, make_run
-from .hub_server import TOKEN, Hub
-from .sshd import Sshd
+from .servers import TOKEN, Hub, Sshd
 
 DATA = b"payload"
 SHA = hashlib.sha256(DATA).hexdigest()
 
 
-def manifest_of(path: Any, size: Any = 7, sha256: Any = SHA, **more: Any) -> bytes:
-    files = [{"path": "config.json", "size": len(DATA), "sha256": SHA}, {"path": path, "size": size, "sha256": sha256}]
-    return json.dumps({"version": 1, "kind": "policy", "files": files, **more}).encode()
+def manifest_of(path: Any = "x", size: Any = 7, sha256: Any = SHA, **more: Any) -> bytes:
+    return json.dumps(
+        {"version": 1, "kind": "policy", "files": [{"path": path, "size": size, "sha256": sha256}], **more}
+    ).encode()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *(manifest_of(path) for path in ("../x", "/tmp/x", "a/../../x", "a//x", "", "..\\x", "a\0b", None, 3)),
-        *(manifest_of(path) for path in (".git/hooks/x", "a/.bashrc", "x.PT", "a/run.py", "con\n")),
-        *(manifest_of("x", size) for size in (-1, 1.5, None, True, 2**80)),
-        *(manifest_of("x", sha256=sha) for sha in ("", f"../{SHA}", None, SHA.upper())),
-        *(manifest_of("x", **more) for more in ({"version": 2}, {"kind": "code"}, {"files": {"a": 1}})),
-        *(b"", b"[]", b"[" * 100_000, b"\x80\x04K\x01."),
-    ],
+HOSTILE = (
+    *map(manifest_of, ("../x", "/tmp/x", "a/../../x", "a//x", "", "..\\x", "a\0b", None, 3)),
+    *map(manifest_of, (".git/hooks/x", "a/.bashrc", "x.PT", "a/run.py", "con\n")),
+    *(manifest_of(size=size) for size in (-1, 1.5, None, True, 2**80)),
+    *(manifest_of(sha256=sha) for sha in ("", f"../{SHA}", None, SHA.upper())),
+    *(manifest_of(**more) for more in ({"version": 2}, {"kind": "code"}, {"files": {"a": 1}})),
+    *(b"", b"[]", b"[" * 100_000, b"\x80\x04K\x01."),
 )
+
+
+@pytest.mark.parametrize("text", HOSTILE)
 def test_a_hostile_manifest_is_refused_and_nothing_is_written(text: bytes, tmp_path: Path):
     (tmp_path / "store/objects" / SHA[:2]).mkdir(parents=True)
     (tmp_path / "store/objects" / SHA[:2] / SHA).write_bytes(DATA)
@@ -48,9 +48,9 @@ def test_a_hostile_manifest_is_refused_and_nothing_is_written(text: bytes, tmp_p
     assert content(tmp_path) == before
 
 
-def test_bytes_that_differ_are_refused(place: str, tmp_path: Path, monkeypatch):
-    push(make_run(tmp_path / "run"), open_remote(place, quiet=True))
-    remote = open_remote(place, quiet=True)
+def test_bytes_that_differ_are_refused(tmp_path: Path, monkeypatch):
+    remote = open_remote(f"file://{tmp_path}/store", quiet=True)
+    push(make_run(tmp_path / "run"), remote)
     fetch = remote.fetch
 
     def lie(manifest: Manifest, paths: list[str], folder: Path) -> None:
@@ -61,10 +61,6 @@ def test_bytes_that_differ_are_refused(place: str, tmp_path: Path, monkeypatch):
     with pytest.raises(ManipError, match=r"'new\.txt' twice did not have the hash"):
         pull(remote, tmp_path / "got")
     assert not list(tmp_path.glob("*got*"))
-    times = iter([lie, fetch])
-    monkeypatch.setattr(remote, "fetch", lambda *words: next(times)(*words))
-    pull(remote, tmp_path / "got")
-    assert content(tmp_path / "got") == content(tmp_path / "run")
 
 
 def test_a_hub_that_names_a_path_or_a_commit_outside_the_folder(hub: Hub, tmp_path: Path):
