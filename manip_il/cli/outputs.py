@@ -178,7 +178,7 @@ def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         _mend_tail(path)
-        with open(checks.open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as file:
+        with open(path, "ab", opener=checks.without_link) as file:
             file.write(line.encode() + b"\n")
 
 
@@ -189,8 +189,7 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    with open(checks.open_regular(path), "rb") as file:
-        *lines, tail = file.read().split(b"\n")
+    *lines, tail = path.read_bytes().split(b"\n")
     records = [_record(line) for line in lines]
     if None in records:
         number = records.index(None)
@@ -242,7 +241,7 @@ def _delete(folder: Path) -> None:
 def _mend_tail(path: Path) -> None:
     if not path.exists():
         return
-    with open(checks.open_regular(path, os.O_RDWR), "rb+") as file:
+    with open(path, "rb+", opener=checks.without_link) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 1, 0))
         if file.read(1) in (b"", b"\n"):

@@ -94,7 +94,7 @@ def exclusive(folder: Path) -> Generator[None]:
 
 def _lock(folder: Path, path: Path) -> int:
     while True:
-        handle = checks.open_regular(path, os.O_RDWR | os.O_CREAT)
+        handle = checks.without_link(str(path), os.O_RDWR | os.O_CREAT)
         if not try_lock(handle):
             holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
             os.close(handle)

@@ -16,8 +16,6 @@ from av.container import InputContainer
 from numpy.typing import NDArray
 from PIL import Image
 
-from manip_il import checks
-
 _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # tracks that are in other files
@@ -57,7 +55,7 @@ def open_video(path: Path) -> InputContainer:
     Raises `ValueError` for a codec without a decoder, `OSError` and `av.FFmpegError` for what is no MP4 file or cannot
     be read.
     """
-    with open(checks.open_regular(path), "rb") as file:
+    with path.open("rb") as file:
         if file.read(8)[4:] != b"ftyp":
             raise ValueError("it does not begin as an MP4 file does; FFmpeg would take it for another format")
     container = av.open(f"file:{path}", format="mp4", options=_OPTIONS)

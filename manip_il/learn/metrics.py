@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -48,7 +47,7 @@ def json_lines(path: Path, step: int) -> Iterator[Writer]:
     write_file(path, "".join(f"{line}\n" for line in lines if _is_until(step, line)).encode())
 
     def write(record: Record) -> None:
-        with writing(path), open(checks.open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as file:
+        with writing(path), open(path, "ab", opener=checks.without_link) as file:
             finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
             file.write((json.dumps(finite, allow_nan=False) + "\n").encode())
 
