@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.child_processes import map_in_order
 from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, is_known, make_expert
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
+from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256, local_id, rewrite_columns
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from kept import label_all
 
-from manip_il.child_processes import map_in_order
 from manip_il.collect.edits import (
     Source,
     Target,
@@ -28,6 +27,7 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.scenes import CHUNK, Scenes
+from manip_il.collect.workers import map_in_order
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
