@@ -94,25 +94,17 @@ def mapping(what: str, value: object) -> dict[str, Any]:
     return value
 
 
-def parse_json(what: str, data: str | bytes, *, nan_is_none: bool = False) -> Any:
-    """Return what a JSON text holds; broken, too deep, or with NaN or Infinity, it is refused.
-
-    nan_is_none: NaN and Infinity are read as None instead.
-    """
-
-    def other(constant: str) -> None:
-        if not nan_is_none:
-            raise ValueError(f"{constant} is not a number in JSON")
-
+def parse_json(what: str, data: str | bytes) -> Any:
+    """Return what a JSON text holds, None for NaN and Infinity; broken or too deep, it is refused."""
     try:
-        return json.loads(data, parse_constant=other)
+        return json.loads(data, parse_constant=lambda constant: None)
     except (RecursionError, ValueError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         raise ManipError(f"{what} is not valid JSON: {error}") from error
 
 
-def read_json(path: Path, what: str, largest: int = LARGEST_JSON, *, nan_is_none: bool = False) -> dict[str, Any]:
+def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
     """Return the object in a JSON file of at most `largest` bytes. what: the file should be, for the message."""
-    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest), nan_is_none=nan_is_none))
+    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
 
 
 def parse_yaml(text: str) -> Any:

@@ -53,7 +53,7 @@ def test_names_that_could_leave_a_folder_are_refused(value):
     assert checks.repo_id("repo id", "user/so-101_v1.2") == "user/so-101_v1.2"
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": NaN}', "9" * 5_000, "{", b"\xff"], ids=lambda text: text[:2])
+@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5_000, "{", b"\xff"], ids=lambda text: text[:2])
 def test_json_that_is_none_is_refused_in_one_line(text):
     with pytest.raises(ManipError, match="f is not valid JSON"):
         checks.parse_json("f", text)
@@ -63,6 +63,7 @@ def test_a_file_larger_than_allowed_is_refused(tmp_path):
     path = tmp_path / "x.json"
     path.write_text('{"a": 1000}')
     assert checks.read_json(path, "an x") == {"a": 1000}
+    assert checks.parse_json("an x", "[NaN, -Infinity]") == [None, None]
     with pytest.raises(ManipError, match="more than 5 bytes"):
         checks.read_json(path, "an x", largest=5)
 

@@ -257,7 +257,7 @@ def _mend_tail(path: Path) -> None:
 
 def _record(line: bytes) -> dict[str, Any] | None:
     try:
-        return checks.mapping("a record", checks.parse_json("a record", line, nan_is_none=True))
+        return checks.mapping("a record", checks.parse_json("a record", line))
     except ManipError:
         return None
 

@@ -73,7 +73,7 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     path = folder / METRICS_FILE
     lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
     whole = [line for line in lines if line.endswith(b"\n")]
-    return [checks.mapping(str(path), checks.parse_json(str(path), line, nan_is_none=True)) for line in whole]
+    return [checks.mapping(str(path), checks.parse_json(str(path), line)) for line in whole]
 
 
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
