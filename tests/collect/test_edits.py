@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -136,23 +135,6 @@ def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path
             exact = render_states(ENV, cameras, episode.columns[schema.SIM_STATE])
             for key in spec.image_keys:  # but for what the video's compression costs
                 assert np.abs(episode.columns[key].astype(int) - exact[key]).mean() < 4
-
-
-@pytest.mark.gl
-@pytest.mark.parametrize(
-    "edit", [partial(render_dataset, cameras=SMALL), relabel_dataset, partial(redraw_dataset, scenes=Scenes(SMALL, 3))]
-)
-def test_what_was_there_goes_only_once_the_new_dataset_is_whole(demos, tmp_path, edit):
-    target = write(Dataset.open(demos).read_episodes(), tmp_path / "target", ENV)
-    before = digests(target)
-
-    def stop() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        edit(open_source(demos), target=Target(target, replace=True, on_piece=stop))
-    assert digests(target) == before
-    assert [path.name for path in tmp_path.iterdir()] == ["target"]
 
 
 def edit_own_file(part: str, **entries: object) -> Callable[[Path], None]:

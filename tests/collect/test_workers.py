@@ -22,9 +22,9 @@ from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.collect.record import journal_of
-from manip_il.collect.workers import Engine, map_in_order, split
+from manip_il.collect.workers import Engine, map_in_order
 from manip_il.data.journal import list_seeds
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
@@ -73,16 +73,6 @@ def engine(backend: str, request: pytest.FixtureRequest) -> Iterator[Engine]:
         request.getfixturevalue("cluster")
     with Engine(2, backend) as two:
         yield two
-
-
-@pytest.mark.parametrize(("seeds", "workers"), [(1, 2), (7, 2), (200, 3)])
-def test_every_seed_is_in_one_task_and_no_worker_idles(seeds: int, workers: int):
-    for job in (JOB, replace(JOB, driver=PolicyDriver((Path("x"),)))):
-        tasks = split(job, range(seeds), workers)
-        assert [seed for task in tasks for seed in task] == list(range(seeds))
-        assert len(tasks) >= min(seeds, workers)
-    with pytest.raises(UsageError, match="workers is 0"):
-        Engine(0)
 
 
 @pytest.mark.slow
