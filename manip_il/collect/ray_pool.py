@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import tempfile
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import zstandard
 
 from manip_il import __version__
 from manip_il.collect.drivers import PolicyDriver
@@ -29,7 +32,7 @@ except ImportError as missing:
     raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
 
 Files = dict[str, bytes]
-Found = list[tuple[Episode, bytes]]  # with the bytes of their journals
+_LEVEL = 1  # of compression; an episode of numbers is then a fifth
 _DEATHS = (
     exceptions.WorkerCrashedError,
     exceptions.NodeDiedError,
@@ -77,11 +80,11 @@ class RayPool:
         if self._ours and ray.is_initialized():
             ray.shutdown()
 
-    def _settle(self, future: Future[list[Episode]], answer: Future[Found], journal: Journal | None) -> None:
+    def _settle(self, future: Future[list[Episode]], answer: Future[bytes], journal: Journal | None) -> None:
         """Store what came home, and hand the episodes or the error on."""
         self._running.pop(future, None)
         try:
-            found = answer.result()
+            found: list[tuple[Episode, bytes]] = pickle.loads(zstandard.decompress(answer.result()))
             for episode, content in found:
                 if journal is not None:
                     journal.store(episode.seed, content)
@@ -102,8 +105,8 @@ class RayPool:
 
 def run_there(
     version: str, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None, *policies: Files
-) -> Found:
-    """Return what a task makes on a node. Raises `ManipError` if it has another version of the program."""
+) -> bytes:
+    """Return the packed answer of a task on a node. Raises `ManipError` if it has another version of the program."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
@@ -111,7 +114,8 @@ def run_there(
         if isinstance(job.driver, PolicyDriver):
             here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
             job = replace(job, driver=replace(job.driver, policies=here))
-        return [(one.without_pictures(), journal.encode(one) if journal else b"") for one in job.run(seeds)]
+        found = [(one.without_pictures(), journal.encode(one) if journal else b"") for one in job.run(seeds)]
+        return zstandard.compress(pickle.dumps(found), _LEVEL)
 
 
 # Deaths are counted by the engine: Ray itself is to try once. Its function keeps a name of its own, so that what is
