@@ -26,10 +26,10 @@ from _machine import describe_machine
 from numpy.typing import NDArray
 
 import manip_il.collect.expert as expert
-import manip_il.collect.job as jobs
 import manip_il.learn.mlp as mlp
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.imitation import run_algorithm
+from manip_il.collect.environments import make_expert
 from manip_il.collect.workers import Engine
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.network import Statistics
@@ -65,14 +65,14 @@ def jumping_labels() -> Iterator[None]:
     def unclipped(ik: ArmIK, position: F64, rotation: F64, _longest: float, lean: float) -> tuple[F64, float] | None:
         return plain(ik, position, rotation, FAR, lean)
 
-    jobs._expert.cache_clear()
+    make_expert.cache_clear()
     unbounded: dict[str, Any] = {
         "_clip_norm": lambda vector, _longest: vector,
         "_turn_towards": lambda _rotation, target, _largest: target,
     }
     with patch.object(ArmIK, "step", unclipped), patch.multiple(expert, **unbounded):
         yield
-    jobs._expert.cache_clear()
+    make_expert.cache_clear()
 
 
 VARIANTS: dict[str, Callable[[], AbstractContextManager[None]]] = {

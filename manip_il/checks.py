@@ -6,7 +6,6 @@ its value, shortened, and what was expected. `in_child` opens what arrives from 
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
@@ -14,7 +13,6 @@ import pickle
 import re
 import resource
 import signal
-import stat
 import subprocess
 import sys
 from collections.abc import Callable
@@ -55,25 +53,14 @@ def name(what: str, value: object) -> str:
 
 def repo_id(what: str, value: object) -> str:
     """Return a dataset's or policy's id, `NAME` or `USER/NAME`, both parts as `name` has them."""
-    parts = value.split("/") if isinstance(value, str) else []
-    if not 1 <= len(parts) <= 2:
-        raise ManipError(f"{what} is {shorten(value)}; expected USER/NAME")
-    for part in parts:
-        name(what, part)
-    return "/".join(parts)
+    user, slash, rest = text(what, value).partition("/")
+    return f"{name(what, user)}/{name(what, rest)}" if slash else name(what, user)
 
 
 def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
     """Return a string of at most `longest` characters."""
     if not isinstance(value, str) or len(value) > longest:
         raise ManipError(f"{what} is {shorten(value)}; expected text of at most {longest} characters")
-    return value
-
-
-def truth(what: str, value: object) -> bool:
-    """Return a bool; 0, 1 and "true" are none."""
-    if not isinstance(value, bool):
-        raise ManipError(f"{what} is {shorten(value)}; expected true or false")
     return value
 
 
@@ -107,27 +94,17 @@ def mapping(what: str, value: object) -> dict[str, Any]:
     return value
 
 
-def parse_json(what: str, data: str | bytes, *, nan_is_none: bool = False) -> Any:
-    """Return what a JSON text holds; broken, too deep, or with NaN or Infinity, it is refused.
-
-    nan_is_none: NaN and Infinity are read as None instead.
-    """
-
-    def other(constant: str) -> None:
-        if not nan_is_none:
-            raise ValueError(f"{constant} is not a number in JSON")
-
+def parse_json(what: str, data: str | bytes) -> Any:
+    """Return what a JSON text holds, None for NaN and Infinity; broken or too deep, it is refused."""
     try:
-        return json.loads(data, parse_constant=other)
-    except RecursionError as error:
-        raise ManipError(f"{what} is not valid JSON: it is nested too deeply") from error
-    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are
+        return json.loads(data, parse_constant=lambda constant: None)
+    except (RecursionError, ValueError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         raise ManipError(f"{what} is not valid JSON: {error}") from error
 
 
-def read_json(path: Path, what: str, largest: int = LARGEST_JSON, *, nan_is_none: bool = False) -> dict[str, Any]:
+def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
     """Return the object in a JSON file of at most `largest` bytes. what: the file should be, for the message."""
-    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest), nan_is_none=nan_is_none))
+    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
 
 
 def parse_yaml(text: str) -> Any:
@@ -149,9 +126,9 @@ def read_yaml(path: Path, what: str) -> Any:
 
 
 def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a regular file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
+    """Return a file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
     try:
-        with open(open_regular(path), "rb") as file:
+        with path.open("rb") as file:
             data = file.read(largest + 1)
     except OSError as error:
         raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
@@ -160,65 +137,46 @@ def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = 
     return data
 
 
-def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Return the descriptor of a regular file; a pipe, device or socket of that name neither blocks nor is written to.
-
-    A file opened for writing is not reached through a link, which could lead to any other file. Raises `OSError` as
-    `os.open` does, with the reason "not a regular file" for another kind.
-    """
-    no_link = os.O_NOFOLLOW if flags & (os.O_WRONLY | os.O_RDWR) else 0
-    try:
-        handle = os.open(path, flags & ~os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC | no_link, 0o666)
-    except OSError as error:
-        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link, or a pipe that nobody reads
-            raise OSError(error.errno, "not a regular file", str(path)) from None
-        raise
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
-        os.close(handle)
-        raise OSError(errno.EINVAL, "not a regular file", str(path))
-    if flags & os.O_TRUNC:  # only once it is known to be a regular file
-        os.ftruncate(handle, 0)
-    return handle
+def without_link(path: str, flags: int) -> int:
+    """Open a file to be written, as the `opener` of `open`; `OSError` for a link, which could lead to any file."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
-def in_child(what: str, function: Callable[..., object], *arguments: object) -> None:
+def in_child(what: str, function: Callable[..., object], *arguments: object, seconds: float = SECONDS_IN_CHILD) -> None:
     """Call `function(*arguments)` in a child process, which may take 4 GB of memory and 120 s, or so long a file.
 
     Nothing but the text of its `ManipError` comes back, as what it opens may be from anyone. Raises that, and
     `ManipError` if the child exceeds its limits or dies. what: the thing that is opened, for these messages; a function
     that opens several calls `opening`.
     """
-    call = pickle.dumps((MEMORY_IN_CHILD, SECONDS_IN_CHILD, function, arguments))
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
-    done = subprocess.run(command, input=call, capture_output=True, check=False)
-    lines = done.stdout.decode(errors="replace").splitlines()
+    done = subprocess.run(command, input=pickle.dumps((seconds, function, arguments)), capture_output=True, check=False)
+    *_, last = what, *done.stdout.decode(errors="replace").splitlines()
     if done.returncode == _REFUSED:
-        raise ManipError(lines[-1])
+        raise ManipError(last)
     if done.returncode != 0:
-        limits = f"{MEMORY_IN_CHILD / 1024**3:g} GB of memory and {SECONDS_IN_CHILD:g} s"
         code = "out of memory" if b"bad_alloc" in done.stderr or b"MemoryError" in done.stderr else done.returncode
         code = "out of time" if done.returncode == -signal.SIGALRM else code
-        raise ManipError(f"{lines[-1] if lines else what} cannot be opened in {limits}: {code}")
+        limits = f"{MEMORY_IN_CHILD / 1024**3:g} GB of memory and {seconds:g} s"
+        raise ManipError(f"{last} cannot be opened in {limits}: {code}")
 
 
 def opening(name: str) -> None:
     """Say in the child process which file is opened next, and give it as much time as there is for one."""
-    sys.stdout.write(" ".join(name.split()) + "\n")
-    sys.stdout.flush()
-    signal.setitimer(signal.ITIMER_REAL, SECONDS_IN_CHILD)  # ends the process
+    print(" ".join(name.split()), flush=True)
+    _, seconds = signal.getitimer(signal.ITIMER_REAL)
+    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
 
 
 def answer_parent() -> None:
     """Run in the child process what `in_child` asks for."""
-    memory, seconds, function, arguments = pickle.load(sys.stdin.buffer)
-    globals()["SECONDS_IN_CHILD"] = seconds
-    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    seconds, function, arguments = pickle.load(sys.stdin.buffer)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_IN_CHILD, MEMORY_IN_CHILD))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)  # ends the process; the interval is for `opening`
     try:
         function(*arguments)
     except ManipError as error:
-        sys.stdout.write(" ".join(str(error).split()) + "\n")
-        sys.stdout.flush()
+        print(" ".join(str(error).split()), flush=True)
         os._exit(_REFUSED)
     os._exit(0)

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 
 _FEW = 3  # names that an error offers
 _BEGINNING = 3  # characters of a name that tell it from others
-_LONGEST_NAME = 200  # [characters] of a name that is compared
 _LONGEST_PRINTED = 300  # [characters]
 _PRINTED = reprlib.Repr()
 _PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
@@ -29,7 +28,7 @@ class ManipError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle by the message: subclasses build theirs from other arguments, and a worker's error must come home."""
-        return _with_message, (type(self), str(self))
+        return ManipError.__new__, (type(self), str(self))
 
 
 class UsageError(ManipError):
@@ -84,21 +83,8 @@ class FolderExistsError(UsageError):
         super().__init__(f"{folder} exists already; continue with --resume=true, or replace it with --overwrite=true")
 
 
-class FolderBusyError(ManipError):
-    """A folder that another process is writing to."""
-
-    def __init__(self, folder: object, process: object):
-        super().__init__(f"{folder} is in use by process {process}; wait until that is done, or choose another folder")
-
-
 class RenderError(ManipError):
     """No working OpenGL for off-screen pictures."""
-
-
-def _with_message(kind: type[ManipError], message: str) -> ManipError:
-    error = kind.__new__(kind)
-    error.args = (message,)
-    return error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -108,7 +94,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 def nearest_names(name: str, known: Iterable[str], most: int = _FEW) -> list[str]:
     """Return the known names that `name` may stand for, at most `most`: those that it begins, then the most alike."""
-    known, name = list(known), name[:_LONGEST_NAME]
+    known = list(known)
     begun = [one for one in known if len(name) >= _BEGINNING and one.startswith(name)]
     alike = difflib.get_close_matches(name, known, n=most, cutoff=0.6 if len(name) > _BEGINNING else 0.5)
     return list(dict.fromkeys([*begun, *alike]))[:most]
@@ -127,10 +113,7 @@ def printable(text: str) -> str:
 
 def shorten(value: object) -> str:
     """Return `repr(value)` in at most 300 characters, whatever the value is."""
-    try:
-        printed = _PRINTED.repr(value)
-    except ValueError:  # an int of more digits than Python prints
-        printed = f"a huge {type(value).__name__}"
+    printed = _PRINTED.repr(value)
     return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
 
 

@@ -13,7 +13,7 @@ from manip_il.errors import UsageError
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
     """Return a dataclass's field. default: a value, a class or function that makes one, or `MISSING` for none.
 
-    metadata: `at_least` and `at_most` (see `check_bounds`), and what else the command line is to know, see
+    metadata: `at_least` and `at_most` (see `check_bound`), and what else the command line is to know, see
     `manip_il.cli.options.Option`.
     """
     metadata = {"help": help_text, **metadata}
@@ -27,12 +27,6 @@ def option_of(cls: type, name: str, default: Any = MISSING, help_text: str = "")
     [theirs] = [one for one in fields(cls) if one.name == name]
     own = theirs.default if theirs.default_factory is MISSING else theirs.default_factory
     return option(own if default is MISSING else default, help_text or theirs.metadata["help"])
-
-
-def check_bounds(options: Any) -> None:
-    """Raise `UsageError` if a field of a dataclass is out of its bounds, see `check_bound`."""
-    for one in fields(options):
-        check_bound(one.name, getattr(options, one.name), one.metadata)
 
 
 def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:

@@ -33,7 +33,6 @@ IMPORTED_ONCE = [
     "manip_il.algorithms.imitation",
     "manip_il.collect.record",
     "manip_il.collect.job",
-    "manip_il.child_processes",
     "manip_il.evaluation.eval_report",
     "manip_il.learn.policy",
     "manip_il.learn.train",

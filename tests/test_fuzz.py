@@ -27,8 +27,8 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from manip_il.checks import MEMORY_IN_CHILD
-from manip_il.child_processes import open_pool
 from manip_il.cli.main import LONGEST_LINE
+from manip_il.collect.workers import open_pool
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import open_files
 from manip_il.data.journal import Journal, list_episodes, read_journal

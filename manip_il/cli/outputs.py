@@ -196,6 +196,6 @@ def _delete(folder: Path) -> None:
 
 def _record(line: bytes) -> dict[str, Any] | None:
     try:
-        return checks.mapping("a record", checks.parse_json("a record", line, nan_is_none=True))
+        return checks.mapping("a record", checks.parse_json("a record", line))
     except ManipError:
         return None

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.child_processes import map_in_order
 from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, is_known, make_expert
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
+from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256, local_id, rewrite_columns
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
@@ -188,7 +188,7 @@ def label_episode(env: EnvConfig, episode: Episode) -> Columns:
 
     Where there is no sound label the action holds the arm still, and `label_valid` is 0.
     """
-    expert = _expert(env)
+    expert = make_expert(env)
     labels = [expert.label(State.from_vector(state)) for state in episode.columns[schema.SIM_STATE]]
     return {
         schema.ACTION: np.stack([label.action for label in labels]).astype(np.float32),
@@ -238,4 +238,4 @@ def _origin(source: Source) -> dict[str, str]:
     return {"from": source.dataset.root.name, "sha256": dataset_sha256(source.dataset.root)}
 
 
-_expert, _drawer = lru_cache(1)(make_expert), lru_cache(1)(SceneDrawer)
+_drawer = lru_cache(1)(SceneDrawer)

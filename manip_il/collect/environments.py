@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 from manip_il.collect.expert import Expert
@@ -22,7 +22,7 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
 from manip_il.sim.props import VERSION as DRAWN
-from manip_il.sim.scene import Scene, build_scene
+from manip_il.sim.scene import SCENES_KEPT, Scene, build_scene
 from manip_il.stock.simulation import StockSimulation, require_no_cameras
 from manip_il.stock.table import ACTION_MEANING, PHASES, STATE_NAMES, get_stock
 from manip_il.stock.table import ROBOT as STOCK
@@ -48,8 +48,9 @@ def make_env(
     return ManipEnv.of(config, cameras, conditions)
 
 
+@lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
-    """Make the expert of an environment."""
+    """Make the expert of an environment, or return the one that was made."""
     return _STOCK.expert(config) if config.robot == STOCK else Expert(_scene(config))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +19,6 @@ from manip_il.learn.policy_files import policy_cameras
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
-from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.shape import draws_shape
 from manip_il.stock.table import ROBOT as STOCK
 
@@ -92,7 +90,7 @@ class RolloutJob:
 
     def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:
         """An episode's frames as columns, with what the expert gives as `label` has it."""
-        beta, expert = self.driver.beta, _expert(self.env)
+        beta, expert = self.driver.beta, make_expert(self.env)
         if self.label == "last":
             return to_episode(frames, self.round, beta, labelled=False)
         if self.label == "takeover":
@@ -116,7 +114,7 @@ def run_steps(
     horizon = (2 if takeover else 1) * job.env.horizon  # one for the learner, and one for the expert
     rules = Rules(horizon, job.hold, job.patience, takeover)
     gate = gate_of(job.label, job.query, setting)
-    return rollout(envs, seeds, act or job.driver.start(setting), rules, _expert(job.env), gate)
+    return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)
 
 
 def observed_cameras(job: RolloutJob) -> CameraConfig | None:
@@ -145,6 +143,3 @@ def _load(job: RolloutJob, path: Path, env: Environment) -> LearnedPolicy:
 
 def _without_pictures(frame: Transition) -> Transition:
     return replace(frame, observation=replace(frame.observation, images={}, keypoints={}))
-
-
-_expert = lru_cache(SCENES_KEPT)(make_expert)

@@ -33,55 +33,59 @@ _STREAM = "ask"  # of random numbers; another name would draw other states
 
 @dataclass(frozen=True)
 class Query:
-    """A rule that says when the expert is queried, one of `RULES`. bound: 0 for rules without one.
+    """A rule that says when the expert is queried, one of `RULES`. bound: None for rules without one.
 
     Raises `UnknownName` for its kind, `UsageError` for a bound outside the rule's range.
     """
 
     kind: str = "every"
-    bound: float = 0.0
+    bound: float | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in RULES:
             raise UnknownName("query rule", self.kind, RULES)
-        if limits := RULES[self.kind].limits:
+        _, limits = RULES[self.kind]
+        if limits is None and self.bound is not None:
+            raise UsageError(f"query is {self}; expected {self.kind} alone")
+        if limits and not (
+            self.bound is not None and math.isfinite(self.bound) and limits[0] <= self.bound <= limits[1]
+        ):
             low, high = limits
-            if not (math.isfinite(self.bound) and low <= self.bound <= high):
-                raise UsageError(f"query is {self}; expected {RULES[self.kind].words}")
+            raise UsageError(f"query is {self}; expected {self.kind}:NUMBER, finite and from {low:g} to {high:g}")
 
     def __str__(self) -> str:
-        return f"{self.kind}:{self.bound:g}" if RULES[self.kind].limits else self.kind
+        return self.kind if self.bound is None else f"{self.kind}:{self.bound:g}"
 
     def start(self, setting: Setting) -> Gate:
         """Return the rule at work, for the episodes of one process. Raises `UsageError` for policies that lack it."""
-        return RULES[self.kind].start(self.bound, setting)
-
-
-@dataclass(frozen=True)
-class Rule:
-    """A kind of rule. words: for errors. start: gives the rule of a bound at work. limits: of the bound, if any."""
-
-    words: str
-    start: Callable[[float, Setting], Gate]
-    limits: tuple[float, float] | None = None
+        rule, _ = RULES[self.kind]
+        return rule(self.bound or 0.0, setting)
 
 
 def _every(bound: float, setting: Setting) -> Gate:
+    """In every state (Ross et al. 2011)."""
     return lambda turns, actions: [True] * len(turns)
 
 
 def _one(bound: float, setting: Setting) -> Gate:
-    """One step, drawn evenly; of a takeover from the horizon, so never if the episode ends before."""
+    """Once an episode, at a step drawn evenly (with one episode a round: Stagger, Li & Zhang 2025).
+
+    Of a takeover it is drawn from the horizon, so never if the episode ends before.
+    """
     return lambda turns, actions: [turn.step == drawn_step(turn.seed, setting.horizon) for turn in turns]
 
 
 def _probability(bound: float, setting: Setting) -> Gate:
+    """At each step by chance."""
     rngs = generators(_STREAM)
     return lambda turns, actions: [rngs(turn.seed).uniform() < bound for turn in turns]
 
 
 def _ensemble(bound: float, setting: Setting) -> Gate:
-    """Root mean square distance of the members' actions to their mean, in the worst dimension."""
+    """Where policies that differ by their seed disagree by more than the bound (Menda et al. 2019).
+
+    Measured by the root mean square distance of their actions to the mean, in the worst dimension.
+    """
     if len(setting.policies) < 2:
         raise UsageError("query=ensemble needs other policies to disagree with")
     others = setting.policies[1:]
@@ -94,6 +98,7 @@ def _ensemble(bound: float, setting: Setting) -> Gate:
 
 
 def _likelihood(bound: float, setting: Setting) -> Gate:
+    """Where the policy finds its own action less likely than the bound, in nats a joint."""
     learner = setting.policies[0]
     learner.require_likelihood()
 
@@ -106,7 +111,10 @@ def _likelihood(bound: float, setting: Setting) -> Gate:
 
 
 def _safety(bound: float, setting: Setting) -> Gate:
-    """To know where they differ, the expert labels every state; its label is kept where they do."""
+    """Where expert and learner differ by more than the bound (Zhang & Cho 2017).
+
+    To know where, the expert labels every state; its label is kept where they do.
+    """
 
     def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
         labels = [turn.label or turn.peek() for turn in turns]
@@ -116,39 +124,23 @@ def _safety(bound: float, setting: Setting) -> Gate:
     return gate
 
 
-RULES = {
-    "every": Rule("in every state (Ross et al. 2011)", _every),
-    "one": Rule("once an episode, at a drawn step (with one episode a round: Stagger, Li & Zhang 2025)", _one),
-    "probability": Rule(
-        "probability:0.1, at each step by chance; more than 0, at most 1", _probability, (math.ulp(0.0), 1.0)
-    ),
-    "ensemble": Rule(
-        "ensemble:0.2, where policies that differ by their seed disagree by more (Menda et al. 2019); 0 or more",
-        _ensemble,
-        (0.0, math.inf),
-    ),
-    "likelihood": Rule(
-        "likelihood:-2, where the policy finds its own action less likely, in nats a joint; a finite number",
-        _likelihood,
-        (-math.inf, math.inf),
-    ),
-    "safety": Rule(
-        "safety:0.5, where expert and learner differ by more (Zhang & Cho 2017); 0 or more", _safety, (0.0, math.inf)
-    ),
+RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | None]] = {  # with the bound's limits
+    "every": (_every, None),
+    "one": (_one, None),
+    "probability": (_probability, (1e-6, 1.0)),
+    "ensemble": (_ensemble, (0.0, math.inf)),
+    "likelihood": (_likelihood, (-math.inf, math.inf)),
+    "safety": (_safety, (0.0, math.inf)),
 }
 
 
 def parse_query(text: str) -> Query:
     """Return a rule as it is written; `UnknownName` for its kind, `UsageError` for a wrong or missing bound."""
     kind, colon, bound = text.partition(":")
-    if kind not in RULES or (RULES[kind].limits is None and not colon):
-        return Query(kind)
-    if RULES[kind].limits is None:
-        raise UsageError(f"query is {text!r}; expected {kind} alone")
     try:
-        return Query(kind, float(bound))
+        return Query(kind, float(bound) if colon else None)
     except ValueError:
-        raise UsageError(f"query is {text!r}; expected {kind}:NUMBER ({RULES[kind].words})") from None
+        raise UsageError(f"query is {text!r}; expected {kind}:NUMBER") from None
 
 
 def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:

@@ -71,7 +71,7 @@ class RayPool:
         reference.future().add_done_callback(lambda answer: self._settle(future, answer, journal))
         return future
 
-    def close(self, in_order: bool) -> None:
+    def close(self) -> None:
         """Cancel what runs; a cluster that was started here ends."""
         for reference in list(self._running.values()):
             ray.cancel(reference, force=True)

@@ -2,18 +2,25 @@
 
 Each seed of a job gives one episode, the same one wherever and however often it runs. So a worker that dies costs
 nothing but time: what it had not finished runs again, each seed alone, so that the one that kills its worker is known.
+
+Processes are forked from a server that has imported what they need and nothing else: they share neither OpenGL nor
+threads, and the import of torch, seconds of work, is paid once. They end with the process that started them, also if
+that was killed.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
+import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from types import TracebackType
+from itertools import islice
+from multiprocessing import forkserver, resource_tracker
 from typing import TYPE_CHECKING, Literal, Union
 
-from manip_il.child_processes import kill_pool, open_pool, start_server
 from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError, UsageError
@@ -26,7 +33,7 @@ MAX_DEATHS = 3  # of workers that ran one seed alone, before it is left out; so 
 Backend = Literal["local", "ray"]
 Seeds = tuple[int, ...]
 Pool = Union["LocalPool", "RayPool"]
-_EVERY_JOB, _LEARNED_JOB = ("manip_il.collect.job",), ("manip_il.collect.job", "manip_il.learn.policy")
+_CONTEXT = multiprocessing.get_context("forkserver")
 
 
 class Engine:
@@ -59,21 +66,19 @@ class Engine:
             for episodes in self._results(self._pool, job, wanted, journal):
                 yield from episodes
         except BaseException:
-            self._close(in_order=False)  # nobody takes the episodes that still run
+            self._close()  # nobody takes the episodes that still run
             raise
 
     def warm_up(self, learned: bool) -> None:
         """Begin to start what workers need, and return at once. learned: whether policies will drive."""
         if self._backend == "local" and self.workers != 1:
-            start_server(_LEARNED_JOB if learned else _EVERY_JOB)
+            start_server(learned)
 
     def __enter__(self) -> Engine:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close(in_order=kind is None)
+    def __exit__(self, *error: object) -> None:
+        self._close()
 
     def _open(self) -> Pool:
         if self._backend == "local":
@@ -82,9 +87,9 @@ class Engine:
 
         return RayPool(self.workers)
 
-    def _close(self, in_order: bool) -> None:
+    def _close(self) -> None:
         if self._pool is not None:
-            self._pool.close(in_order)
+            self._pool.close()
             self._pool = None
 
     def _results(
@@ -120,27 +125,92 @@ class Engine:
 
 
 class LocalPool:
-    """Processes of this machine."""
+    """Processes of this machine; new ones if one has died."""
 
     def __init__(self, count: int):
         self.count = count
         self._pool: ProcessPoolExecutor | None = None
 
     def submit(self, job: RolloutJob, seeds: Seeds, journal: Journal | None) -> Future[list[Episode]]:
-        """Start some seeds of a job, in new processes if one had died."""
-        if self._pool is None:
-            self._pool = open_pool(self.count, _LEARNED_JOB if job.policy else _EVERY_JOB)
+        """Start some seeds of a job."""
+        self._pool = self._pool or open_pool(self.count, learned=job.policy is not None)
         try:
             return self._pool.submit(run_task, job, seeds, journal)
         except BrokenExecutor:
-            self.close(in_order=False)
+            self.close()
             return self.submit(job, seeds, journal)
 
-    def close(self, in_order: bool) -> None:
-        """End all processes; those still at work are killed unless all is `in_order`."""
+    def close(self) -> None:
+        """End all processes, whatever they are doing."""
         if self._pool is not None:
-            self._pool.shutdown() if in_order else kill_pool(self._pool)
+            kill_pool(self._pool)
             self._pool = None
+
+
+def map_in_order[T, R](function: Callable[[T], R], items: Iterable[T], workers: int) -> Generator[tuple[T, R]]:
+    """Yield each item with its result, in order; at most `workers` + 1 of them wait in memory.
+
+    One worker is this process. Items and results are pickled for others. Raises `ManipError` if a worker dies.
+    """
+    if workers == 1:
+        yield from ((item, function(item)) for item in items)
+        return
+    pool, items = open_pool(workers), iter(items)
+    try:
+        waiting = deque((item, pool.submit(function, item)) for item in islice(items, workers + 1))
+        while waiting:
+            item, result = waiting.popleft()
+            yield item, result.result()
+            waiting.extend((item, pool.submit(function, item)) for item in islice(items, 1))
+    except BrokenExecutor as error:
+        raise ManipError("a worker died (out of memory?); fewer --workers need less") from error
+    finally:
+        kill_pool(pool)
+
+
+def open_pool(workers: int, *, learned: bool = False) -> ProcessPoolExecutor:
+    """Return a pool of so many processes, which are started as they are needed. learned: as in `start_server`."""
+    start_server(learned)
+    return ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=_end_with_parent)
+
+
+def kill_pool(pool: ProcessPoolExecutor) -> None:
+    """End a pool's processes, whatever they are doing."""
+    for process in list((pool._processes or {}).values()):  # pyright: ignore[reportPrivateUsage]  # public from 3.14 on
+        process.kill()
+    pool.shutdown(cancel_futures=True)
+
+
+def start_server(learned: bool) -> None:
+    """Start the server that workers are forked from, in the background; once a process.
+
+    It imports jobs, and policies if workers are to be `learned`. It has the environment variables of this moment, but
+    one thread for arithmetic.
+    """
+    _CONTEXT.set_forkserver_preload(["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])])
+    threads = os.environ.get("OMP_NUM_THREADS")
+    resource_tracker.ensure_running()  # first, as its own start would undo the mask
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process alone
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if threads is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = threads
+
+
+def _end_with_parent() -> None:
+    """End this worker when the process that started it ends."""
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
+        os._exit(1)
 
 
 def run_seeds(job: RolloutJob, seeds: Sequence[int], journal: Journal | None) -> Iterator[Episode]:

@@ -12,7 +12,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from manip_il import checks
-from manip_il.errors import FolderBusyError, FolderExistsError, ManipError
+from manip_il.errors import FolderExistsError, ManipError
 
 PARTIAL = ".partial"  # suffix of what is not finished
 _REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # of a disk, which reading never gives
@@ -74,7 +74,7 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
 def exclusive(folder: Path) -> Generator[None]:
     """Hold `folder`, which need not exist, for this process; others see a file `.<name>.lock` beside it.
 
-    If nothing may be written beside it (a container's volume), it is not held. Raises `FolderBusyError`, with the
+    If nothing may be written beside it (a container's volume), it is not held. Raises `ManipError`, with the
     holder's process id, if another process holds it. The kernel lets go of what a killed process held.
     """
     path = folder.absolute().with_name(f".{folder.absolute().name}.lock")
@@ -92,7 +92,7 @@ def exclusive(folder: Path) -> Generator[None]:
 def _hold(folder: Path, path: Path) -> int | None:
     """Return the lock file, open and locked; None if it may not be written."""
     try:
-        handle = checks.open_regular(path, os.O_RDWR | os.O_CREAT)
+        handle = checks.without_link(str(path), os.O_RDWR | os.O_CREAT)
     except OSError as error:
         if folder.is_dir() and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
             return None
@@ -100,7 +100,8 @@ def _hold(folder: Path, path: Path) -> int | None:
     if not _try_lock(handle):
         holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
         os.close(handle)
-        raise FolderBusyError(folder, holder or "unknown")
+        busy = f"{folder} is in use by process {holder or 'unknown'}"
+        raise ManipError(f"{busy}; wait until that is done, or choose another folder")
     os.ftruncate(handle, 0)
     os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
     return handle

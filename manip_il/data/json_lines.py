@@ -27,7 +27,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 def append_line(path: Path, record: Record) -> None:
     """Add a record, in place of a last line that was cut short; a number that is not finite is null."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(checks.open_regular(path, os.O_RDWR | os.O_CREAT), "rb+") as file:
+    with open(path, "ab+", opener=checks.without_link) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 1, 0))
         if file.read(1) not in (b"", b"\n"):
@@ -38,7 +38,7 @@ def append_line(path: Path, record: Record) -> None:
 
 
 def _record(what: str, line: bytes) -> dict[str, Any]:
-    return checks.mapping(what, checks.parse_json(what, line, nan_is_none=True))
+    return checks.mapping(what, checks.parse_json(what, line))
 
 
 def _finite(record: Record) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def read_statistics(root: Path) -> Statistics:
     """Read `meta/stats.json`; statistics of pictures are (channels, 1, 1). Raises `ManipError` for what is none."""
     path = root / STATS
     with reading(path):
-        found = checks.read_json(path, "a dataset's statistics", nan_is_none=True)
+        found = checks.read_json(path, "a dataset's statistics")
         return {
             key: {name: np.atleast_1d(np.asarray(values, np.float64)) for name, values in table.items()}
             for key, table in found.items()

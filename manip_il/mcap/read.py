@@ -31,7 +31,7 @@ _CHANNELS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}  # of raw pictu
 
 def read_topics(path: Path) -> list[str]:
     """Return the topics that a file's summary lists, or none if it has no summary."""
-    with open(checks.open_regular(path), "rb") as stream:
+    with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     return sorted({channel.topic for channel in summary.channels.values()} if summary else ())
 
@@ -45,7 +45,7 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, in
     if find_spec(_ROS2):
         factories.insert(0, importlib.import_module(f"{_ROS2}.decoder").DecoderFactory())
     try:
-        with open(checks.open_regular(path), "rb") as stream:
+        with path.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True, decoder_factories=factories)
             for _, channel, message, content in reader.iter_decoded_messages(topics):
                 yield channel.topic, message.log_time, content

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.checks import open_regular
+from manip_il.checks import without_link
 from manip_il.robots import HERE, ROBOTS
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.meeting import CLEARANCE, Body
@@ -143,7 +143,7 @@ def reach_of(robot: Robot) -> Reach:
 def kept_reach(robot: Robot) -> Reach | None:
     """Return a robot's map from where it is kept; None where it is not."""
     path = _place(robot)
-    with contextlib.suppress(*_BROKEN), open(open_regular(path), "rb") as file, np.load(file) as kept:
+    with contextlib.suppress(*_BROKEN), np.load(path) as kept:
         return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
     return None
 
@@ -162,7 +162,7 @@ def keep_reach(robot: Robot, reach: Reach) -> None:
     partial = path.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(open_regular(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "wb") as file:
+        with open(partial, "wb", opener=without_link) as file:
             np.savez_compressed(file, origin=reach.origin, errors=reach.errors.astype(np.float32))
         partial.replace(path)
 

@@ -46,7 +46,7 @@ class File:
     @classmethod
     def of(cls, path: Path) -> File:
         """Return a file's size and sha256."""
-        with open(checks.open_regular(path), "rb") as file:
+        with path.open("rb") as file:
             return cls(os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
 
     def fits(self, path: Path) -> bool:

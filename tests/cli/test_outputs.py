@@ -105,7 +105,6 @@ def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monk
 
 
 SAMPLE = Path(__file__).resolve().parents[2] / "datasets" / "sample"
-STUDY = "common: {task.type: reach}\narms: {cloning: {method: cloning}, dagger: {}}\ntraining_seeds: 1\n"
 COMMANDS = {
     "eval": ["--policy.type=expert", "--robot.type=fetch", "--task.type=reach", "--workers=1"],
     "dagger": [],
@@ -121,7 +120,6 @@ def here(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     make_eval(tmp_path / "left.json", [True, False])
     make_eval(tmp_path / "right.json", [False, False], seed=4_000_002)
-    (tmp_path / "study.yaml").write_text(STUDY)
     return tmp_path
 
 
@@ -156,7 +154,7 @@ def test_where_nothing_may_be_written_beside_it_a_folder_is_taken_unheld(tmp_pat
     def refused(*_: object) -> int:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("manip_il.checks.open_regular", refused)
+    monkeypatch.setattr("manip_il.checks.without_link", refused)
     with exclusive(folder):
         assert [path.name for path in tmp_path.rglob("*")] == ["volume"]
     with pytest.raises(PermissionError), exclusive(tmp_path / "new"):

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from kept import label_all
 
-from manip_il.child_processes import map_in_order
 from manip_il.collect.edits import (
     Source,
     Target,
@@ -28,6 +26,7 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.scenes import CHUNK, Scenes
+from manip_il.collect.workers import map_in_order
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
@@ -136,23 +135,6 @@ def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path
             exact = render_states(ENV, cameras, episode.columns[schema.SIM_STATE])
             for key in spec.image_keys:  # but for what the video's compression costs
                 assert np.abs(episode.columns[key].astype(int) - exact[key]).mean() < 4
-
-
-@pytest.mark.gl
-@pytest.mark.parametrize(
-    "edit", [partial(render_dataset, cameras=SMALL), relabel_dataset, partial(redraw_dataset, scenes=Scenes(SMALL, 3))]
-)
-def test_what_was_there_goes_only_once_the_new_dataset_is_whole(demos, tmp_path, edit):
-    target = write(Dataset.open(demos).read_episodes(), tmp_path / "target", ENV)
-    before = digests(target)
-
-    def stop() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        edit(open_source(demos), target=Target(target, replace=True, on_piece=stop))
-    assert digests(target) == before
-    assert [path.name for path in tmp_path.iterdir()] == ["target"]
 
 
 def edit_own_file(part: str, **entries: object) -> Callable[[Path], None]:

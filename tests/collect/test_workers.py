@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,14 +22,23 @@ from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.collect.record import journal_of
-from manip_il.collect.workers import Engine, split
+from manip_il.collect.workers import Engine, map_in_order
 from manip_il.data.journal import list_seeds
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
+from ..faults.child import living
+
 SEEDS = stream_seeds("certificate", 8)
 JOB = RolloutJob(EnvConfig("fetch", "reach"), hold=3)
+PROGRAM = """
+import os, time
+from manip_il.collect.workers import open_pool
+pool = open_pool(1)
+print(pool.submit(os.getpid).result(), flush=True)
+pool.submit(time.sleep, 3600).result()
+"""
 both_backends = pytest.mark.parametrize("backend", ["local", "ray"])
 
 
@@ -58,16 +73,6 @@ def engine(backend: str, request: pytest.FixtureRequest) -> Iterator[Engine]:
         request.getfixturevalue("cluster")
     with Engine(2, backend) as two:
         yield two
-
-
-@pytest.mark.parametrize(("seeds", "workers"), [(1, 2), (7, 2), (200, 3)])
-def test_every_seed_is_in_one_task_and_no_worker_idles(seeds: int, workers: int):
-    for job in (JOB, replace(JOB, driver=PolicyDriver((Path("x"),)))):
-        tasks = split(job, range(seeds), workers)
-        assert [seed for task in tasks for seed in task] == list(range(seeds))
-        assert len(tasks) >= min(seeds, workers)
-    with pytest.raises(UsageError, match="workers is 0"):
-        Engine(0)
 
 
 @pytest.mark.slow
@@ -112,7 +117,7 @@ def test_what_a_worker_raises_arrives_as_one_line_and_the_engine_goes_on(engine:
     with pytest.raises(ManipError, match="unknown robot 'nobody'"):
         list(engine.run(replace(JOB, env=replace(JOB.env, robot="nobody")), SEEDS))
     (tmp_path / "file").write_text("")
-    with pytest.raises(ManipError, match="cannot write") as caught:
+    with pytest.raises(ManipError, match="Not a directory") as caught:
         list(engine.run(JOB, SEEDS, journal_of(tmp_path / "file" / "journals", JOB)))
     assert "\n" not in str(caught.value)
     assert len(list(engine.run(JOB, SEEDS[:2]))) == 2
@@ -136,3 +141,32 @@ def test_nodes_come_and_go(cluster, tmp_path, expected):
 def test_a_node_with_another_version_is_one_line(cluster):
     with pytest.raises(ManipError, match=r"has manip_il .*, not 0\.0\.0"):
         run_there("0.0.0", JOB, SEEDS[:1], None)
+
+
+@pytest.mark.slow
+def test_a_worker_ignores_ctrl_c_and_ends_with_its_parent():
+    command = [sys.executable, "-c", PROGRAM]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        os.kill(child, signal.SIGINT)
+        time.sleep(0.5)
+        assert child in living(parent.pid)
+        parent.kill()
+        parent.wait()
+        ends = time.monotonic() + 60
+        while child in living(parent.pid):
+            assert time.monotonic() < ends
+            time.sleep(0.02)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(parent.pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_results_come_in_the_order_of_the_items_and_a_death_is_told():
+    for workers in (1, 2):
+        assert list(map_in_order(abs, range(-9, 0), workers)) == [(item, -item) for item in range(-9, 0)]
+    with pytest.raises(ManipError, match="a worker died"):
+        list(map_in_order(os._exit, [1], 2))

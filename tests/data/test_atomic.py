@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.data.atomic import exclusive, new_folder, write_file, writing
-from manip_il.errors import FolderBusyError, FolderExistsError, ManipError
+from manip_il.errors import FolderExistsError, ManipError
 
 
 def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
@@ -70,7 +70,7 @@ def test_a_killed_writers_folder_is_removed_by_the_next_and_no_other(tmp_path):
 
 def test_a_second_writer_is_refused_by_the_firsts_process_id(tmp_path):
     writer = start("exclusive", tmp_path / "root")
-    with pytest.raises(FolderBusyError, match=f"in use by process {writer.pid}"), exclusive(tmp_path / "root"):
+    with pytest.raises(ManipError, match=f"in use by process {writer.pid}"), exclusive(tmp_path / "root"):
         pass
     kill(writer)
     for _ in range(2):
