@@ -7,9 +7,10 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from manip_il import checks
+from manip_il.data.atomic import writing
 
 Record = Mapping[str, Any]
 
@@ -26,15 +27,21 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 def append_line(path: Path, record: Record) -> None:
     """Add a record, in place of a last line that was cut short; a number that is not finite is null."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "ab+", opener=checks.without_link) as file:
+    line = json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n"
+    with writing(path), _open(path) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 1, 0))
         if file.read(1) not in (b"", b"\n"):
             file.seek(0)
             file.truncate(file.read().rfind(b"\n") + 1)
         file.seek(0, os.SEEK_END)
-        file.write(json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n")
+        file.write(line)
+        file.flush()  # here, where a full disk is named
+
+
+def _open(path: Path) -> BinaryIO:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return open(path, "ab+", opener=checks.without_link)
 
 
 def _record(what: str, line: bytes) -> dict[str, Any]:

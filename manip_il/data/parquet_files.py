@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Feature, Info, reading
 from manip_il.data.statistics import Statistics
@@ -203,7 +204,11 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
             stop=numbers("dataset_to_index"),
             tasks=[texts or [] for texts in tasks],
             clips={feature.key: clips(feature.key) for feature in info.of_dtype("video")},
-            drawn={number: json.loads(text or "{}") for number, text in zip(index.tolist(), drawn, strict=True)},
+            drawn={
+                number: checks.mapping(layout.DRAWN, json.loads(text))
+                for number, text in zip(index.tolist(), drawn, strict=True)
+                if text
+            },
         )
 
 

@@ -37,6 +37,7 @@ JOINT_TARGETS = (OPENINGS, SERVOS)
 LEROBOT_TYPES = {"so_follower": "so101"}  # robots of another name here, by their `robot_type`
 VERSION = 2  # of these columns and what they mean: 2 has progress, whole states and named phases
 MOST_FPS = 10_000  # control steps a second
+_LARGEST_SIZE = 1_000_000  # of a state [numbers] or a side of a picture [pixels]
 _MAY_LACK = ("object", "robot_type", "video", "keypoints")  # of a spec as JSON
 
 
@@ -69,6 +70,8 @@ class RobotTaskSpec:
         checks.name("robot", self.robot)
         checks.name("task", self.task)
         checks.whole("fps", self.fps, 1, MOST_FPS)
+        for size in (self.sim_state_size, *self.image_size):
+            checks.whole("a size", size, 0, _LARGEST_SIZE)
         for camera in self.cameras:
             checks.name("a camera", camera)
         if len(set(self.cameras)) < len(self.cameras):
