@@ -17,6 +17,7 @@ import numpy as np
 from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 from threadpoolctl import threadpool_info
 
+_HASH = 12  # characters that tell two hashes apart
 _LONGEST = 80  # characters of a value in a warning
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 _MEANING = {
@@ -63,7 +64,8 @@ def compare_fingerprints(
     for key in dict.fromkeys([*left, *right]):
         ours, theirs = left.get(key, "nothing"), right.get(key, "nothing")
         if ours != theirs:
-            sides = f"{left_name} has {str(ours)[:_LONGEST]}, {right_name} has {str(theirs)[:_LONGEST]}"
+            most = _HASH if key.endswith("_sha256") else _LONGEST
+            sides = f"{left_name} has {str(ours)[:most]}, {right_name} has {str(theirs)[:most]}"
             warnings.append(f"{_MEANING.get(key, key)} differs: {sides}")
     return warnings
 
