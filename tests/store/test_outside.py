@@ -73,6 +73,7 @@ def test_a_hub_that_names_a_path_or_a_commit_outside_the_folder(hub: Hub, tmp_pa
         assert not content(tmp_path)
 
 
+@pytest.mark.slow  # a bare machine has no sshd
 @pytest.mark.parametrize(
     ("url", "code", "says"),
     [
