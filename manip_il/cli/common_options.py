@@ -160,7 +160,7 @@ def own_robot(robot: str, suffix: str = "") -> str:
 
 
 def policy_help(words: Iterable[str]) -> str:
-    """Return the options of the policy that `--policy.type=` in a command's words names; nothing where none does."""
+    """Return the options of the policy that `--policy.type=` in a command's words names; nothing if none does."""
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     if not kind:
         return ""

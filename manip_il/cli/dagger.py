@@ -54,7 +54,13 @@ class DaggerOptions:
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
     first: ClassVar[tuple[str, ...]] = (
-        *("robot.type", "task.type", "demonstrations", "rounds", "episodes_per_round", "policy", "output_dir"),
+        "robot.type",
+        "task.type",
+        "demonstrations",
+        "rounds",
+        "episodes_per_round",
+        "policy",
+        "output_dir",
         "resume",
     )
     env: Given = common.env_given()

@@ -54,7 +54,7 @@ class BuildOptions:
         require_output(self.dataset, overwrite=self.overwrite)
 
     def run(self) -> None:
-        """Build the dataset; `ManipError` where a journal could not be read."""
+        """Build the dataset; `ManipError` if a journal could not be read."""
         from manip_il.data.build import build
 
         with exclusive(self.dataset):

@@ -68,7 +68,14 @@ class EvalOptions:
 
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     first: ClassVar[tuple[str, ...]] = (
-        *("policy.path", "policy.type", "eval.n_episodes", "suite", "robot.type", "task.type", "output_dir", "replay"),
+        "policy.path",
+        "policy.type",
+        "eval.n_episodes",
+        "suite",
+        "robot.type",
+        "task.type",
+        "output_dir",
+        "replay",
         "resume",
     )
     evaluation: list[Path] = option(

@@ -56,7 +56,7 @@ class ExportOptions:
         say(f"exported: {output} ({len(exported.data):,} bytes)")
 
     def _find(self, output: Path) -> Path:
-        """Return the policy; raise, before anything heavy is imported, where it cannot be exported, or not to there."""
+        """Return the policy; raise, before anything heavy is imported, if it cannot be exported, or not to there."""
         if output.is_dir():
             raise UsageError(f"--output is {output}, a folder; expected a file such as {output}/policy.onnx")
         if output.exists() and not self.overwrite:

@@ -48,7 +48,7 @@ def check_backend(backend: str | None) -> None:
 
 
 def check_temporary_folder() -> None:
-    """Raise `ManipError` where no temporary file can be made."""
+    """Raise `ManipError` if no temporary file can be made."""
     try:
         with tempfile.TemporaryFile() as file:
             file.write(b"x")
@@ -63,7 +63,7 @@ def check_temporary_folder() -> None:
 
 
 def check_shared_memory() -> None:
-    """Raise `ManipError` where processes cannot share a lock, which lies in /dev/shm."""
+    """Raise `ManipError` if processes cannot share a lock, which lies in /dev/shm."""
     try:
         multiprocessing.get_context("spawn").Lock()
     except (OSError, ImportError) as error:
@@ -110,7 +110,7 @@ def _renderer() -> str:
 
 
 def describe_torch() -> str:
-    """Return Torch's version, and how many graphics cards CUDA's driver sees; `ManipError` where torch is missing.
+    """Return Torch's version, and how many graphics cards CUDA's driver sees; `ManipError` if torch is missing.
 
     Torch itself is not imported: it would double the memory of a health check.
     """

@@ -57,7 +57,7 @@ def require_file(path: Path, what: str) -> None:
 
 
 def _inside(root: Path) -> str:
-    """Name the datasets in a folder that is none itself, where it holds some."""
+    """Name the datasets in a folder that is none itself, if it holds some."""
     found = sorted(path.parents[1].name for path in root.glob("*/meta/info.json")) if root.is_dir() else []
     return f"; it holds the datasets {', '.join(found[:3])}{' ...' if len(found) > 3 else ''}" if found else ""
 
@@ -185,10 +185,10 @@ def check_space(policy: Path, space: str | None) -> None:
 def check_policy(
     checkpoint: Checkpoint, env: EnvConfig, *, draw: bool = True, trust: bool = False
 ) -> CameraConfig | None:
-    """Return the cameras whose pictures the policy takes, if any; warn where it was trained on something else.
+    """Return the cameras whose pictures the policy takes, if any; warn if it was trained on something else.
 
     draw: make its first pictures here, to see that they can be made. trust: see `LearnedPolicy.load`. Raises
-    `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what
+    `MismatchError` unless the policy can drive `env`, `RenderError` if there is no OpenGL for its pictures, and what
     `LearnedPolicy.load` raises.
     """
     from manip_il.collect.environments import env_spec

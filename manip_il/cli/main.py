@@ -174,7 +174,7 @@ def _dispatch(words: list[str]) -> None:
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
-    """A command's name, of one word or two, and the words behind it; a group's name where only help is asked for."""
+    """A command's name, of one word or two, and the words behind it; a group's name if only help is asked for."""
     name, of_two = words[0], " ".join(words[:2])
     if found := next((RENAMED[old] for old in (of_two, name) if old in RENAMED), ""):
         raise UsageError(f"{of_two if of_two in RENAMED else name!r} has a new name: {PROGRAM} {found}")

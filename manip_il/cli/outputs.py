@@ -89,9 +89,9 @@ def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
 
 
 def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise where `prepare_output` would fail; nothing is changed.
+    """Raise if `prepare_output` would fail; nothing is changed.
 
-    `FolderExistsError` where the folder holds something, and `UsageError` where `overwrite` would delete what this
+    `FolderExistsError` if the folder holds something, and `UsageError` if `overwrite` would delete what this
     program did not make.
     """
     if resume and overwrite:
@@ -148,14 +148,14 @@ def check_same_options(folder: Path, options: Any) -> None:
 
 
 def atomic_write(path: Path, content: str | bytes) -> None:
-    """Write a whole file or nothing, and its folder where that is missing. Raises what `write_file` raises."""
+    """Write a whole file or nothing, and its folder if that is missing. Raises what `write_file` raises."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, content.encode() if isinstance(content, str) else content)
 
 
 def require_ours(folder: Path) -> None:
-    """Raise `UsageError` where replacing `folder` would delete what this program did not make."""
+    """Raise `UsageError` if replacing `folder` would delete what this program did not make."""
     real = folder.resolve()
     if folder.is_symlink():
         raise UsageError(f"{folder} is a link to {real}; --overwrite=true deletes no links, name the folder itself")

@@ -226,7 +226,7 @@ def _decode_said(option_type: Any, said: _Said) -> Any:
 def unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
     """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
 
-    kind: `option`, or which file's key. dashes: before the names. command: empty where none is known.
+    kind: `option`, or which file's key. dashes: before the names. command: empty if none is known.
     """
     if name in known and known[name].is_open:
         return UsageError(f"{dashes}{name} is a group of options; expected {dashes}{name}.NAME=VALUE")

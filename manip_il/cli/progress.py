@@ -150,7 +150,7 @@ def _fields_text(fields: dict[str, object]) -> str:
 class Stages:
     """One progress bar at a time; use as a context manager. A stop request takes effect at the next step.
 
-    kept: what is safe on disk, for the message to the user, also where the work fails.
+    kept: what is safe on disk, for the message to the user, also if the work fails.
     """
 
     def __init__(self, kept: str):
@@ -203,14 +203,14 @@ class Stages:
         self.check()
 
     def log(self, record: dict[str, Any]) -> None:
-        """Show a fit's metrics at a step; {} where there are none."""
+        """Show a fit's metrics at a step; {} if there are none."""
         if record:
             self._bar.advance(record["step"] - self._done, loss=record["loss"])
             self._done = record["step"]
         self.check()
 
     def check(self) -> None:
-        """Raise `Interrupted` where the user has asked to stop."""
+        """Raise `Interrupted` if the user has asked to stop."""
         if self._stop.requested:
             raise Interrupted(self.kept)
 

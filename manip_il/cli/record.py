@@ -56,7 +56,13 @@ class RecordOptions:
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
     first: ClassVar[tuple[str, ...]] = (
-        *("robot.type", "task.type", "dataset.root", "dataset.num_episodes", "cameras", "seed", "resume"),
+        "robot.type",
+        "task.type",
+        "dataset.root",
+        "dataset.num_episodes",
+        "cameras",
+        "seed",
+        "resume",
     )
     env: Given = common.env_given()
     dataset: DatasetGroup = field(default_factory=DatasetGroup)

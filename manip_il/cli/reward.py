@@ -154,7 +154,7 @@ class AskOptions:
     example: ClassVar[str] = "manip-il reward ask pairs.json --output=ask.html"
     pairs: Path = option(MISSING, _PAIRS, positional=True, check=_require_pairs)
     output: Path = option(Path("ask.html"), "the page")
-    robot: Path | None = option(None, "the YAML of the sources' robot, where that does not ship")
+    robot: Path | None = option(None, "the YAML of the sources' robot, if that does not ship")
     overwrite: bool = option(False, "replace an existing file")
 
     def check(self) -> None:

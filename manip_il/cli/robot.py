@@ -107,8 +107,8 @@ class RobotCheckOptions:
     """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
 
     Joints and gripper as they move, pictures of the arm with its frame and cameras, where it reaches, and the expert at
-    every task, as it is and with a tenth of the steps random; and what to change where something does not work. Exits
-    with 1 where a task cannot be done.
+    every task, as it is and with a tenth of the steps random; and what to change if something does not work. Exits
+    with 1 if a task cannot be done.
     """
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
@@ -128,7 +128,7 @@ class RobotCheckOptions:
         sweep(get_robot(self.robot))
 
     def run(self) -> None:
-        """Measure, print the tables, write the page. Raises `ManipError` where a task cannot be done."""
+        """Measure, print the tables, write the page. Raises `ManipError` if a task cannot be done."""
         from manip_il.evaluation.robot_check import FILE_NAME
         from manip_il.evaluation.robot_page import check_report, looks
 

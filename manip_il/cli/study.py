@@ -161,7 +161,7 @@ class Study:
 def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
     """Return the expert's tests in every arm's task, arm -> name of the test -> trial.
 
-    Without those that change nothing there, such as another object where there is none. Raises `ManipError` for names.
+    Without those that change nothing there, such as another object if there is none. Raises `ManipError` for names.
     """
     return {
         name: {test: trial for test, one in plan.experts.items() if (trial := expert_trial(env, one)) is not None}
@@ -170,7 +170,7 @@ def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
 
 
 def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
-    """Return a test in an arm's environment; None where it would change nothing."""
+    """Return a test in an arm's environment; None if it would change nothing."""
     from manip_il.evaluation.suites import varied
     from manip_il.evaluation.trial import Trial
     from manip_il.robots.table import get_robot  # here, as help needs no simulator

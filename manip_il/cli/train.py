@@ -54,7 +54,14 @@ class TrainOptions:
         "manip-il train --dataset.root=datasets/demos --policy.type=act --policy.chunk_size=16 --output_dir=runs/act"
     )
     first: ClassVar[tuple[str, ...]] = (
-        *("dataset.root", "policy", "observation", "action_space", "steps", "batch_size", "output_dir", "resume"),
+        "dataset.root",
+        "policy",
+        "observation",
+        "action_space",
+        "steps",
+        "batch_size",
+        "output_dir",
+        "resume",
     )
     dataset: SourceGroup
     redraw: int = option(
@@ -130,7 +137,7 @@ class TrainOptions:
             raise UsageError("--redraw is not for processes that were started together; redraw by manip-il data redraw")
 
     def _frame_weights(self, lerobot: LeRobotFit, dataset: Dataset) -> NDArray[np.float64] | None:
-        """Return how often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
+        """Return how often each frame is drawn, relative to the others, (N,); None if all are drawn alike."""
         if self.weights is None:
             return None
         from manip_il.learn.weights import rabc_weights
@@ -142,7 +149,7 @@ class TrainOptions:
         return weights
 
     def _redrawn(self, held: contextlib.ExitStack) -> Path:
-        """The dataset of redrawn scenes in the run's folder, which is held from here on; made where it is not there."""
+        """The dataset of redrawn scenes in the run's folder, which is held from here on; made if it is not there."""
         from manip_il.collect.edits import open_source
 
         source, target = self.dataset.root[0], self.output.output_dir / "redrawn"

@@ -49,9 +49,7 @@ class ViewOptions:
     """
 
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
-    first: ClassVar[tuple[str, ...]] = (
-        *("policy.path", "policy.type", "robot.type", "task.type", "n_episodes", "output"),
-    )
+    first: ClassVar[tuple[str, ...]] = ("policy.path", "policy.type", "robot.type", "task.type", "n_episodes", "output")
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = common.env_given(of_policy=True)
     suite: str = common.suite_option()
@@ -98,7 +96,7 @@ class ViewOptions:
         return stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)
 
     def _check_sliders(self) -> None:
-        """Raise `UsageError` where nobody can move sliders."""
+        """Raise `UsageError` if nobody can move sliders."""
         from manip_il.sim.window import DISPLAYS, has_display
 
         if self.output is not None:
@@ -110,7 +108,7 @@ class ViewOptions:
             )
 
     def _job(self) -> RolloutJob:
-        """Return the episodes to show; without pictures where no policy looks at any and a window is open."""
+        """Return the episodes to show; without pictures if no policy looks at any and a window is open."""
         from manip_il.collect.job import RolloutJob
         from manip_il.evaluation.suites import suite_conditions
         from manip_il.mdp import LONGEST_EPISODE
@@ -130,7 +128,7 @@ class ViewOptions:
         return self.output is None and has_display()
 
     def _cameras(self, env: EnvConfig) -> CameraConfig | None:
-        """Return cameras for people, with shadows where nobody waits; None, with a warning, without OpenGL."""
+        """Return cameras for people, with shadows if nobody waits; None, with a warning, without OpenGL."""
         from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
         from manip_il.sim.env import ManipEnv
 
