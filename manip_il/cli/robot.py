@@ -156,7 +156,7 @@ class RobotCheckOptions:
 
         print_table(joint_table(found))
         say(motors_line(found))
-        say(f"The gripper opens to {1000 * found.opening:.1f} mm. {home_line(found)}")
+        say(home_line(found))
         print_table(task_table(found))
         say(verdict(found))
         for line in advice(found):

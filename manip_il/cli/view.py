@@ -18,8 +18,7 @@ from manip_il.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.evaluation.rerun_log import RerunLog
-    from manip_il.evaluation.watch import WindowScreen
+    from manip_il.evaluation.watch import RerunLog, WindowScreen
     from manip_il.sim.config import CameraConfig, EnvConfig
     from manip_il.sim.env import ManipEnv
 
@@ -141,8 +140,7 @@ class ViewOptions:
         return cameras
 
     def _screen(self, env: ManipEnv) -> WindowScreen | RerunLog:
-        from manip_il.evaluation.rerun_log import RerunLog
-        from manip_il.evaluation.watch import WindowScreen
+        from manip_il.evaluation.watch import RerunLog, WindowScreen
 
         if self._in_a_window:
             return WindowScreen(env, sliders=self.policy.type == "sliders")

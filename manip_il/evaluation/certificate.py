@@ -10,14 +10,14 @@ as here, is a lower bound of u.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from manip_il.evaluation.figures import Bar, Figure, drawing, rates_figure, to_figure
+from manip_il.evaluation.figures import Bar, rates_figure
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import write_json
@@ -251,7 +251,6 @@ def certificate_report(certificate: Certificate, command: str, config: Mapping[s
         "horizon. Left out: the perturbation changed nothing, or found no place."
     )
     cost_note = "The cost of an action: control steps until solved after it, less those of the undisturbed episode."
-    figure = costs_figure(certificate.of("action"), certificate.settings["control_hz"])
     return Report(
         title=f"Certificate of the expert: {name}",
         verdict=f"The expert on {name} recovers from {changed}.",
@@ -259,20 +258,8 @@ def certificate_report(certificate: Certificate, command: str, config: Mapping[s
         command=command,
         sections=(
             Section("Results", figures=(rates_figure(bars),), tables=(recoveries,), notes=(note,)),
-            Section("What one wrong action costs", figures=(figure,), tables=(costs,), notes=(cost_note,)),
+            Section("What one wrong action costs", tables=(costs,), notes=(cost_note,)),
         ),
         config=config,
         fingerprint=certificate.fingerprint,
     )
-
-
-def costs_figure(rows: Sequence[Row], control_hz: int) -> Figure:
-    """Draw the share of wrong actions of each kind that cost at most so many steps."""
-    with drawing(1, size=(4.2, 3.0)) as (drawn, axes):
-        axis = axes[0, 0]
-        for row, style in zip(rows, ("-", "--", ":", "-."), strict=False):
-            if row.every_gap:
-                axis.ecdf(row.every_gap, label=row.words, ls=style, lw=1.8)
-        axis.set(xlabel=f"cost [control steps of 1/{control_hz} s]", ylabel="share of actions", ylim=(0, 1.02))
-        drawn.legend(loc="outside upper left")
-        return to_figure(drawn, "Share of wrong actions that cost at most so many control steps, by kind")

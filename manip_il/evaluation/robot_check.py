@@ -19,7 +19,6 @@ from manip_il.evaluation.episodes import EpisodeResult
 from manip_il.evaluation.results import EvalResult, write_json
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
-from manip_il.robots.gripper import sweep
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
@@ -115,18 +114,17 @@ class TaskCheck:
 class RobotCheck:
     """A robot as it was measured. name: as it was given.
 
-    openings: of the gripper by command of its first joint [m] or [rad], rising [m]. overlaps: pairs of links at home,
-    and in any posture. table, leaning: shares of points on the table of the workspace that the hand gets to, upright,
-    or leaning. half_width: the widest at which a share of `ENOUGH` of the table is reached [m]; 0 if there is none.
+    opening: the widest of the gripper [m]. overlaps: pairs of links at home, and in any posture. table: share of points
+    on the table of the workspace that the hand, pointing down, gets to. half_width: the widest at which a share of
+    `ENOUGH` of the table is reached [m]; 0 if there is none.
     """
 
     name: str
     robot: Robot
     joints: tuple[JointFacts, ...]
-    openings: Mapping[float, float]
+    opening: float
     overlaps: tuple[Pair, ...]
     table: float
-    leaning: float
     half_width: float
     tasks: tuple[TaskCheck, ...]
 
@@ -135,21 +133,15 @@ class RobotCheck:
         """Tasks that cannot be done."""
         return tuple(task for task in self.tasks if not task.done)
 
-    @property
-    def opening(self) -> float:
-        """The widest of the gripper [m]."""
-        return max(self.openings.values())
-
     def write(self, path: Path) -> None:
         """Write all figures as JSON."""
-        gripper = {"commands": list(self.openings), "openings": list(self.openings.values())}
         facts = {
             "robot": self.name,
             "hand": self.robot.hand,
             "joints": [dataclasses.asdict(joint) for joint in self.joints],
-            "gripper": {"joints": self.robot.gripper.joints, **gripper},
+            "gripper": {"joints": self.robot.gripper.joints, "opening": self.opening},
             "home_overlaps": self.overlaps,
-            "reach": {name: getattr(self, name) for name in ("table", "leaning", "half_width")},
+            "reach": {name: getattr(self, name) for name in ("table", "half_width")},
             "tasks": [task.to_json() for task in self.tasks],
         }
         write_json(path, facts, indent=2)
@@ -168,7 +160,7 @@ def check_robot(
     if episodes:
         checked = [_with_episodes(name, task, episodes, engine, on_result) for task in checked]
     return RobotCheck(
-        name, robot, arm_facts(scene), openings(robot), overlaps, *reach_facts(robot), tasks=tuple(checked)
+        name, robot, arm_facts(scene), scene.gripper.most, overlaps, *reach_facts(robot), tasks=tuple(checked)
     )
 
 
@@ -210,37 +202,27 @@ def widths(task: Task) -> dict[str, float]:
     return found
 
 
-def openings(robot: Robot) -> dict[float, float]:
-    """Return the measured openings of a robot's gripper by the command of its first joint."""
-    measured, config = sweep(robot), robot.gripper
-    commands = config.closed[0] + measured.shares * (config.open[0] - config.closed[0])
-    return dict(zip(commands.tolist(), measured.openings.tolist(), strict=True))
+def reach_facts(robot: Robot) -> tuple[float, float]:
+    """Return `table` and `half_width` of a `RobotCheck`; takes seconds if the map is not kept yet."""
+    reach, ((x, y), half_width) = reach_of(robot), (robot.workspace.centre, robot.workspace.half_width)
 
+    def share(half: float) -> float:
+        steps = np.linspace(-half, half, _ACROSS).tolist()
+        return float(np.mean([reach.has((x + dx, y + dy, LOW)) for dx in steps for dy in steps]))
 
-def reach_facts(robot: Robot) -> tuple[float, float, float]:
-    """Return `table`, `leaning` and `half_width` of a `RobotCheck`; takes seconds if the map is not kept yet."""
-    reach, space = reach_of(robot), robot.workspace
-    halves = np.arange(space.half_width, 0.0, -_NARROWER).tolist()
-    enough = next((half for half in halves if _share(robot, reach.has, half) >= ENOUGH), 0.0)
-    table, leaning = (_share(robot, test, space.half_width) for test in (reach.has, reach.leaning))
-    return table, leaning, round(enough, 3)
+    narrower = np.arange(half_width, 0.0, -_NARROWER).tolist()
+    return share(half_width), round(next((half for half in narrower if share(half) >= ENOUGH), 0.0), 3)
 
 
 def reach_map(robot: Robot, room: float, cells: int = 60) -> tuple[F64, tuple[float, float, float, float]]:
-    """Return where the hand gets to on the table: 1 upright, 0.5 leaning, 0 not, (y, x), and the map's extent [m].
+    """Return where the hand, pointing down, gets to on the table, 1 or 0, (y, x), and the map's extent [m].
 
     room: around the workspace [m]. The extent is left, right, bottom, top.
     """
     reach, (x, y), half = reach_of(robot), robot.workspace.centre, robot.workspace.half_width + room
     offsets = ((np.arange(cells) + 0.5) / cells * 2 - 1) * half
-    rows = [[(x + dx, y + dy, LOW) for dx in offsets] for dy in offsets]
-    reached = [[(reach.has(at) + reach.leaning(at)) / 2 for at in row] for row in rows]
+    reached = [[float(reach.has((x + dx, y + dy, LOW))) for dx in offsets] for dy in offsets]
     return np.array(reached), (x - half, x + half, y - half, y + half)
-
-
-def _share(robot: Robot, test: Callable[[tuple[float, float, float]], bool], half: float) -> float:
-    (x, y), steps = robot.workspace.centre, np.linspace(-half, half, _ACROSS).tolist()
-    return float(np.mean([test((x + dx, y + dy, LOW)) for dx in steps for dy in steps]))
 
 
 def arm_facts(scene: Scene) -> tuple[JointFacts, ...]:

@@ -42,9 +42,8 @@ def check_report(
         home_line(check),
     )
     reaches = (
-        f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table, "
-        f"leaning to {100 * check.leaning:.0f} %. Dark: upright, pale: leaning. Circles: objects at "
-        "the start, squares: goals, and what stands there.",
+        f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table: where "
+        "it is green. Circles: objects at the start, squares: goals, and what stands there.",
     )
     return Report(
         title=f"{check.robot.name}: robot check",
@@ -57,7 +56,6 @@ def check_report(
             Section("At home in its scene", lead, stills=tuple(pictures), notes=home),
             Section("Where it reaches, and where tasks begin", figures=start_figures(check), notes=reaches),
             Section("Joints, base to hand", tables=(joint_table(check),), notes=(motors_line(check),)),
-            Section("Gripper", figures=(hand_figure(check),)),
         ),
     )
 
@@ -100,11 +98,12 @@ def task_table(check: RobotCheck) -> Table:
 
 
 def home_line(check: RobotCheck) -> str:
-    """Return in a sentence whether the robot is free at home."""
+    """Return in sentences how wide the gripper opens, and whether the robot is free at home."""
+    opens = f"The gripper opens to {1000 * check.opening:.1f} mm."
     if not check.overlaps:
-        return "At home no part of the robot touches another or the table."
+        return f"{opens} At home no part of the robot touches another or the table."
     pairs = ", ".join(f"{one} and {other}" for one, other in check.overlaps)
-    return f"At home these overlap, as in every posture: {pairs}."
+    return f"{opens} At home these overlap, as in every posture: {pairs}."
 
 
 def motors_line(check: RobotCheck) -> str:
@@ -134,7 +133,7 @@ def start_figures(check: RobotCheck) -> tuple[Figure, ...]:
     for task in check.tasks:
         with drawing(1, size=(3.0, 3.0)) as (drawn, axes):
             axis, words = axes[0, 0], f"{task.found} of {task.drawn} starts" if task.drawn else "no scene"
-            axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=2, interpolation="nearest")
+            axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmax=2, interpolation="nearest")
             axis.plot(*zip(*((x + a * half, y + b * half) for a, b in _SQUARE), strict=True), color="#1d2126", lw=1)
             for places, style in ((task.goals, "s"), (task.objects, "o")):
                 if places:
@@ -149,25 +148,6 @@ def start_figures(check: RobotCheck) -> tuple[Figure, ...]:
 
 
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
-
-
-def hand_figure(check: RobotCheck) -> Figure:
-    """Draw the opening over the command, and how wide the tasks' objects are."""
-    names: dict[float, list[str]] = {}
-    for task in check.tasks:
-        for width in {round(width, 4) for width in task.widths.values()}:
-            names.setdefault(width, []).append(task.name)
-    with drawing(1, size=(4.4, 3.2)) as (drawn, axes):
-        axis = axes[0, 0]
-        axis.plot(list(check.openings), [1000 * one for one in check.openings.values()], color=DAGGER, lw=2)
-        for width, tasks in sorted(names.items()):
-            words = plain(f"{1000 * width:.0f} mm: {', '.join(tasks)}")
-            colour = EXPERT if width < check.opening else CLONING
-            axis.axhline(1000 * width, color=colour, ls="--", lw=1, label=words)
-        axis.set(xlabel=f"command of {plain(check.robot.gripper.joints[0])}", ylabel="opening [mm]", ylim=(0, None))
-        if names:
-            drawn.legend(loc="outside lower left")
-        return to_figure(drawn, "Opening of the gripper over its command, and the width of what tasks grasp")
 
 
 def advice(check: RobotCheck) -> tuple[str, ...]:

@@ -14,8 +14,7 @@ from rerun.experimental import RrdReader
 from manip_il.cli.main import main
 from manip_il.collect.job import RolloutJob, run_steps
 from manip_il.data import schema
-from manip_il.evaluation.rerun_log import FRAME
-from manip_il.evaluation.watch import slider_actions
+from manip_il.evaluation.watch import FRAME, slider_actions
 from manip_il.mdp import Episode
 from manip_il.sim.config import CAMERAS, EnvConfig
 
@@ -75,7 +74,7 @@ def test_a_file_holds_every_step_as_it_was_simulated(tmp_path, no_opengl, capsys
     task = "seed 3000000: Move the hand to the green goal."
     assert events[:2] == [task, f"seed 3000000: solved, {steps[0]} steps"]
     assert len(events) == 4
-    assert {"/world/goal", f"/{schema.EXPERT_PHASE}"} <= entities(path)
+    assert f"/{schema.EXPERT_PHASE}" in entities(path)
     assert not any(schema.IMAGES in entity for entity in entities(path))
 
 

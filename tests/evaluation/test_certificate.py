@@ -87,7 +87,7 @@ def test_the_tables_and_the_page_show_the_numbers_and_who_was_not_solved():
     assert "The policy had solved 1 of 4 before" in page.text
     assert "Not solved, words of a: seeds 3." in page.text
     assert len(recoveries.rows) == 6
-    assert len(page.figures) == 2
+    assert len(page.figures) == 1
 
 
 @pytest.mark.parametrize("kind", ["random", "opposite", "gripper"])

@@ -18,7 +18,6 @@ from manip_il.evaluation.robot_check import (
     TaskCheck,
     arm_facts,
     check_starts,
-    openings,
     reach_facts,
     reach_map,
     widths,
@@ -26,6 +25,7 @@ from manip_il.evaluation.robot_check import (
 from manip_il.evaluation.robot_page import advice, check_report, task_table, verdict
 from manip_il.evaluation.tables import CLONING, EXPERT
 from manip_il.robots import reach
+from manip_il.robots.gripper import sweep
 from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
@@ -49,9 +49,9 @@ def test_every_joint_gets_to_its_target_and_stays(robot: str):
 
 @every_robot
 def test_a_hand_opens_with_its_command(robot: str):
-    found = openings(get_robot(robot))
-    assert (np.diff(list(found.values())) > 0).all()
-    assert max(found.values()) == build_scene(robot, "reach").gripper.most
+    openings = sweep(get_robot(robot)).openings
+    assert (np.diff(openings) > 0).all()
+    assert openings.max() == build_scene(robot, "reach").gripper.most
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -92,7 +92,7 @@ def test_shares_of_a_workspace_are_those_of_its_points(own: Robot, monkeypatch: 
     errors = np.zeros((41, 41, 21))
     errors[29:] = 1.0  # nothing is reached beyond x = 0.4, the workspace's centre, but for a cell
     monkeypatch.setattr(robot_check, "reach_of", lambda robot: Reach(np.array([-1.0, -1.0, 0.0]), errors))
-    table, _, half_width = reach_facts(own)
+    table, half_width = reach_facts(own)
     assert table == pytest.approx(0.5, abs=0.05)
     assert half_width == 0
     shown, (left, right, *_) = reach_map(own, 0.1)
@@ -115,7 +115,7 @@ def test_starts_are_drawn_until_a_few_find_no_place(own: Robot, monkeypatch: pyt
 
 def a_check(own: Robot, *tasks: TaskCheck, table: float = 1.0, half_width: float = 0.12) -> RobotCheck:
     joint = JointFacts("lift", False, (-1.0, 1.0), 0.0, 200.0, 10.0, 50.0, 0.1, 0.02)
-    return RobotCheck("own.yaml", own, (joint,), openings(own), (), table, 1.0, half_width, tasks)
+    return RobotCheck("own.yaml", own, (joint,), 0.09, (), table, half_width, tasks)
 
 
 def evaluation(solved: int) -> EvalResult:
