@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -157,20 +157,3 @@ def require_pictures(env: Given, cameras: Iterable[str]) -> None:
 def own_robot(robot: str, suffix: str = "") -> str:
     """Return the option, after a space, that a next command needs for a robot that does not ship; else nothing."""
     return "" if robot in (*ROBOTS, stock.ROBOT) else f" --robot.type={robot}{suffix}"
-
-
-def policy_help(words: Iterable[str]) -> str:
-    """Return the options of the policy that `--policy.type=` in a command's words names; nothing if none does."""
-    kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
-    if not kind:
-        return ""
-    from manip_il.learn.lerobot_config import option_lines
-
-    lines = table({left: f"[{right}]" for left, right in option_lines(kind)})
-    return f"\n\noptions of {kind}:\n{lines}"
-
-
-def table(rows: Mapping[str, str]) -> str:
-    """Return lines of help: a name, and what it means."""
-    width = max(map(len, rows)) + 2
-    return "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows.items())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_given, require_dataset, round_policy
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import CONFIG_FILE, REPORT_FILE, ResumableOutput, atomic_write
+from manip_il.cli.outputs import CONFIG_FILE, REPORT_FILE, ResumableOutput
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say, say_policy
 from manip_il.data.json_lines import append_line, read_lines
@@ -152,19 +151,15 @@ class DaggerOptions:
 
         return observation or Checkpoint.open(start).observation, cameras or policy_cameras(start)
 
-    @classmethod
-    def more_help(cls, words: Sequence[str]) -> str:
-        """Return the options of the policy that `--policy.type` names."""
-        return common.policy_help(words)
-
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
     """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
     from manip_il.algorithms.imitation import run_algorithm
     from manip_il.collect.environments import env_fingerprint
+    from manip_il.evaluation.results import write_json
 
     fingerprint = env_fingerprint(config.env, config.cameras)
-    atomic_write(folder / FINGERPRINT_FILE, json.dumps(fingerprint, indent=1) + "\n")
+    write_json(folder / FINGERPRINT_FILE, fingerprint)
     results: list[RoundResult] = []
     for result in run_algorithm(config, folder, engine, stages.watch()):
         stages.close()

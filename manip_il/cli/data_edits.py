@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_dataset, require_folder
 from manip_il.cli.options import Given
-from manip_il.cli.outputs import prepare_output, require_output
-from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.outputs import check_output, prepare_output
+from manip_il.cli.progress import Progress, say, warn
 from manip_il.cli.record import left_out, require_repo_id
 from manip_il.data.atomic import exclusive
 from manip_il.errors import ManipError, UsageError
@@ -32,7 +32,7 @@ def _require_target(source: Path, target: Path, *, overwrite: bool) -> None:
     inside, outside = source.resolve(), target.resolve()
     if inside.is_relative_to(outside) or outside.is_relative_to(inside):
         raise UsageError(f"TARGET {target} overlaps SOURCE {source}; expected a folder of its own")
-    require_output(target, overwrite=overwrite)
+    check_output(target, overwrite=overwrite)
 
 
 @dataclass
@@ -51,7 +51,7 @@ class BuildOptions:
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
-        require_output(self.dataset, overwrite=self.overwrite)
+        check_output(self.dataset, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Build the dataset; `ManipError` if a journal could not be read."""
@@ -93,7 +93,7 @@ class MergeOptions:
         from manip_il.data.build import local_id, merge_datasets
 
         with exclusive(self.output):
-            prepare_output(self.output, resume=False, overwrite=self.overwrite)
+            prepare_output(self.output, overwrite=self.overwrite)
             info = merge_datasets(self.datasets, self.output, repo_id=local_id(self.output.absolute().name))
         say(f"merged {info.episodes:,} episodes, {info.frames:,} frames")
         say(f"dataset: {self.output}")
@@ -128,7 +128,7 @@ class RenderOptions:
         cameras = _cameras(self.cameras, self.image, self.look)
         source, workers = open_source(self.source, self.robot), self.workers or default_workers()
         warn(*source.warnings)
-        with exclusive(self.target), progress(source.dataset.info.episodes, f"render {self.source}") as bar:
+        with exclusive(self.target), Progress(source.dataset.info.episodes, f"render {self.source}") as bar:
             info = render_dataset(source, cameras, Target(self.target, workers, self.overwrite, bar.advance))
         say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames: {_pictures_text(cameras)}")
         say(f"dataset: {self.target}")
@@ -163,7 +163,7 @@ class RelabelOptions:
         target, workers = self._target(), self.workers or default_workers()
         source = open_source(self.dataset, self.robot)
         warn(*source.warnings)
-        with exclusive(target), progress(source.dataset.info.episodes, f"relabel {self.dataset}") as bar:
+        with exclusive(target), Progress(source.dataset.info.episodes, f"relabel {self.dataset}") as bar:
             changed = relabel_dataset(source, Target(target, workers, self.overwrite, bar.advance))
         info, what = source.dataset.info, "all labels are as they were"
         if changed:
@@ -224,7 +224,7 @@ class RedrawOptions:
         warn(*source.warnings)
         conditions, workers = varied(self.vary, source.env, sees=True), self.workers or default_workers()
         scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
-        with exclusive(self.target), progress(self.frames, f"redraw {self._dataset()}") as bar:
+        with exclusive(self.target), Progress(self.frames, f"redraw {self._dataset()}") as bar:
             target = Target(self.target, workers, self.overwrite, lambda: bar.advance(CHUNK))
             info = redraw_dataset(source, scenes, target)
         left, drawn = self.frames - info.episodes, f"{info.episodes:,} scenes, {info.frames:,} frames"

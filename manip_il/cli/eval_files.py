@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from manip_il.cli.inputs import open_driver
-from manip_il.cli.outputs import atomic_write
 from manip_il.cli.progress import say, warn
 from manip_il.collect.environments import env_fingerprint
 from manip_il.collect.job import RolloutJob
+from manip_il.data.atomic import write_file
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.film import Shot, run_states
@@ -36,7 +36,7 @@ def replay(file: Path, seed: int, policy: Path | None, video: Path | None, *, tr
     episode = run_states(job, seed)
     say(_text(before))
     if video is not None:
-        atomic_write(video, Shot.of(job, episode).film().mp4)
+        write_file(video, Shot.of(job, episode).film().mp4)
         say(f"video: {video}")
     if differences := replay_differences(before, episode_result(job, episode)):
         raise ManipError(

@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from manip_il.cli.outputs import atomic_write
 from manip_il.cli.progress import say, warn
+from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
@@ -46,7 +46,7 @@ class ExportOptions:
 
         write = export_onnx if self.format == "onnx" else export_torchscript
         exported = write(path, policy_sha256(path))
-        atomic_write(output, exported.data)
+        write_file(output, exported.data)
         if "robot" not in exported.metadata:
             warn(f"{path} was written by another tool: the file does not say robot, task, control rate and names")
         say(f"largest difference from {path} over random observations: {exported.difference:.1e}")

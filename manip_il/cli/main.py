@@ -11,17 +11,13 @@ import inspect
 import os
 import select
 import sys
-import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING
-from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from manip_il import __version__
 from manip_il.cli import progress
-from manip_il.cli.common_options import table
-from manip_il.cli.interrupt import Interrupted, resume_command
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import check_values, parse
 from manip_il.errors import ManipError, UnknownName, UsageError, printable
@@ -114,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _dispatch(words)
         sys.stdout.flush()  # here, where a reader that has gone away can still be answered
     except (Exception, KeyboardInterrupt) as error:
-        if isinstance(error, BrokenPipeError) and _stdout_is_gone():
+        if isinstance(error, BrokenPipeError) and _stdout_is_gone():  # and not the pipe to a worker
             # Python flushes once more at exit, and would complain there.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return EXIT_BROKEN_PIPE
@@ -125,16 +121,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def script() -> NoReturn:
-    """Run `main` and exit; after Ctrl-C without waiting for threads that still send or receive.
-
-    Nothing is lost by that: what every command writes outlives a kill.
-    """
-    code = main()
-    busy = any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
-    if code == EXIT_INTERRUPTED and busy:
-        sys.stderr.flush()
-        os._exit(code)
-    sys.exit(code)
+    """Run `main` and exit."""
+    sys.exit(main())
 
 
 def load(name: str) -> type:
@@ -196,7 +184,7 @@ def _report(error: BaseException, words: list[str]) -> int:
     """Say on standard error what happened, in one line; return the exit code."""
     code = 1
     if isinstance(error, KeyboardInterrupt):
-        text, code = f"interrupted{_how_to_go_on(error, words)}", EXIT_INTERRUPTED
+        text, code = f"interrupted{f'; {error}' if error.args else ''}", EXIT_INTERRUPTED
     elif isinstance(error, ManipError):
         text, code = f"error: {error}", error.exit_code
     elif isinstance(error, OSError) and error.strerror and error.filename:
@@ -208,20 +196,6 @@ def _report(error: BaseException, words: list[str]) -> int:
         line = f"{line[: LONGEST_LINE - 500]} ... {line[-400:]}"
     print(f"{PROGRAM}: {line}", file=sys.stderr, flush=True)
     return code
-
-
-def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
-    if isinstance(error, Interrupted):
-        return f"; kept: {error.kept}; continue with: {resume_command(words)}"
-    try:
-        name, rest = _split(words)
-        options: Any = parse(load(name), rest)
-    except (Exception, KeyboardInterrupt):  # stopped while it was loading, or stopped once more
-        return ""
-    values = {one.name: one.value(options) for one in options_of(type(options))}
-    if "resume" not in values or not values.get("output_dir", Path()).exists():  # nothing to resume
-        return ""
-    return f"; finished work is kept; continue with: {resume_command(words)}"
 
 
 def _clean(text: str, words: list[str]) -> str:
@@ -240,7 +214,7 @@ def _help() -> str:
     return (
         f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
         "Robot-arm imitation learning without teleoperation.\n\n"
-        f"commands:\n{table(single | groups)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
+        f"commands:\n{_table(single | groups)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
         f"example: {PROGRAM} demo --output_dir=runs/demo"
     )
@@ -248,13 +222,13 @@ def _help() -> str:
 
 def _group_help(group: str) -> str:
     rows = {name: COMMANDS[name].summary for name in _inside(group)}
-    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{table(rows)}"
+    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
     """Help of one command: the options that people use first (`first`), or with `--help=all` every option.
 
-    words: all that was given, as some have help for a choice, too (`more_help`).
+    words: all that was given: `--policy.type=act` lists the options of that policy, too.
     """
     options = options_of(cls)
     first = () if HELP_ALL in words else getattr(cls, "first", ())
@@ -265,11 +239,28 @@ def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
     rows["--config_path=FILE.yaml"] = "read options from YAML; those on the command line win"
     if rest:
         rows[HELP_ALL] = f"list the other {rest} options, too"
-    more = cls.more_help(words) if hasattr(cls, "more_help") else ""
+    more = _policy_help(words) if any(one.is_open for one in options) else ""
     return (
         f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{inspect.getdoc(cls)}\n\n"
-        f"options:\n{table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {cls.example}"
+        f"options:\n{_table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {cls.example}"
     )
+
+
+def _policy_help(words: Sequence[str]) -> str:
+    """The options of the policy that `--policy.type=` in a command's words names; nothing if none does."""
+    kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
+    if not kind:
+        return ""
+    from manip_il.learn.lerobot_config import option_lines
+
+    lines = _table({left: f"[{right}]" for left, right in option_lines(kind)})
+    return f"\n\noptions of {kind}:\n{lines}"
+
+
+def _table(rows: Mapping[str, str]) -> str:
+    """Lines of help: a name, and what it means."""
+    width = max(map(len, rows)) + 2
+    return "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows.items())
 
 
 def _row(option: Option) -> tuple[str, str]:
@@ -284,13 +275,10 @@ def _row(option: Option) -> tuple[str, str]:
 
 
 def _stdout_is_gone() -> bool:
-    """Whether nobody reads our output any more: a broken pipe to a worker is a real error."""
-    try:
-        poll = select.poll()
-        poll.register(sys.stdout.fileno(), select.POLLOUT)
-        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
-    except (OSError, ValueError):
-        return False
+    """Whether nobody reads our output any more."""
+    poll = select.poll()
+    poll.register(sys.stdout, select.POLLOUT)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 if __name__ == "__main__":

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from manip_il.cli.inputs import require_dataset, require_file
-from manip_il.cli.outputs import prepare_output, require_output, save_options
-from manip_il.cli.progress import progress, say
+from manip_il.cli.outputs import check_output, prepare_output, save_options
+from manip_il.cli.progress import Progress, say
 from manip_il.data.atomic import new_folder
 from manip_il.errors import UsageError
 from manip_il.option import option
@@ -30,7 +30,7 @@ class McapExportOptions:
         """Refuse what the paths show to be wrong."""
         if self.dataset.resolve().is_relative_to(self.out.resolve()):
             raise UsageError(f"{self.out} holds the dataset itself; expected another folder for the files")
-        require_output(self.out, overwrite=self.overwrite)
+        check_output(self.out, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
@@ -38,8 +38,8 @@ class McapExportOptions:
         from manip_il.mcap.export import MAPPING, export_dataset, left_out
 
         dataset = Dataset.open(self.dataset)
-        prepare_output(self.out, resume=False, overwrite=self.overwrite)
-        with new_folder(self.out) as folder, progress(dataset.info.episodes, "export") as bar:
+        prepare_output(self.out, overwrite=self.overwrite)
+        with new_folder(self.out) as folder, Progress(dataset.info.episodes, "export") as bar:
             for _ in export_dataset(dataset, folder):
                 bar.advance()
             save_options(folder, self)
@@ -84,7 +84,7 @@ class McapImportOptions:
         mapping = load_mapping(self.mapping)
         paths = list_files(self.source)
         frames = 0
-        with progress(len(paths), "import") as bar:
+        with Progress(len(paths), "import") as bar:
             for count in import_files(paths, self.dataset, mapping):
                 bar.advance()
                 frames += count

@@ -1,25 +1,23 @@
-"""Output folders and files that a kill cannot leave half-written."""
+"""Output folders: what a command may begin to write to, what it may replace, and the options that are kept there."""
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from manip_il import checks
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
-from manip_il.cli.progress import say
-from manip_il.data.atomic import PARTIAL, exclusive, write_file, writing
+from manip_il.data.atomic import PARTIAL, exclusive, write_file
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, UsageError
 from manip_il.option import option
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
-_MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a folder
+# Files by which a folder of ours is known. Any LeRobot dataset has meta/info.json; only ours has both actions.
+_MARKS = {CONFIG_FILE: CONFIG_HEADER, "meta/info.json": '"executed_action"', "eval.json": '"fingerprint"'}
 
 
 @dataclass
@@ -28,16 +26,16 @@ class Output:
 
     output_dir: Path = option(MISSING, "folder of what is written", free=True)
     overwrite: bool = option(False, "replace what is there", free=True)
-    _resumes: ClassVar[bool] = False
 
     @property
     def goes_on(self) -> bool:
         """Whether what is there is continued."""
-        return False
+        return getattr(self, "resume", False)
 
     def check(self) -> None:
-        """Raise `UsageError` if a command cannot begin to write; say so if there is nothing to resume."""
-        require_output(self.output_dir, resume=self.goes_on, overwrite=self.overwrite, resumable=self._resumes)
+        """Raise `UsageError` if a command cannot begin to write."""
+        resumable = hasattr(self, "resume")
+        check_output(self.output_dir, resume=self.goes_on, overwrite=self.overwrite, resumable=resumable)
 
     @contextmanager
     def open(self, options: Any) -> Generator[Path]:
@@ -66,33 +64,28 @@ class ResumableOutput(Output):
     """Folder of a command that can be continued."""
 
     resume: bool = option(False, "continue what was interrupted", free=True)
-    _resumes: ClassVar[bool] = True
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether what is there is continued."""
-        return self.resume
 
 
-def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
+def prepare_output(folder: Path, *, resume: bool = False, overwrite: bool = False) -> None:
     """Make sure that `folder` may be written to; on return it is absent or empty, unless `resume`.
 
-    It is not created, as LeRobot's writers insist on doing so themselves. What a killed writer left of a file is
-    removed: call it while the folder is held (`exclusive`). Raises what `check_output` raises.
+    What a killed writer left of a file is removed: call it while the folder is held (`exclusive`). Raises what
+    `check_output` raises.
     """
-    check_output(folder, resume=resume, overwrite=overwrite)
+    check_output(folder, resume=resume, overwrite=overwrite, resumable=True)
     for path in folder.rglob(f".*{PARTIAL}") if resume else ():
         if path.is_file():  # a folder has a lock of its own, and is removed by the next writer
             path.unlink()
-    if overwrite and folder.exists() and any(folder.iterdir()):
-        _delete(folder)
+    if overwrite and folder.is_dir():
+        # The marks first, so that a kill leaves nothing that could be continued; not the folder: it may be a mount.
+        for path in sorted(folder.iterdir(), key=lambda path: not any(one.startswith(path.name) for one in _MARKS)):
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise if `prepare_output` would fail; nothing is changed.
+def check_output(folder: Path, *, resume: bool = False, overwrite: bool = False, resumable: bool = False) -> None:
+    """Raise `UsageError` if `prepare_output` would fail; nothing is changed.
 
-    `FolderExistsError` if the folder holds something, and `UsageError` if `overwrite` would delete what this
-    program did not make.
+    `FolderExistsError` if the folder holds something that could be continued (resumable).
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
@@ -102,29 +95,17 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
         raise UsageError(f"{folder} is a file; expected a folder")
     if resume or not folder.exists() or not any(folder.iterdir()):
         return
-    if not overwrite:
+    if overwrite:
+        require_ours(folder)
+    elif resumable:
         raise FolderExistsError(folder)
-    require_ours(folder)
-
-
-def require_output(folder: Path, *, resume: bool = False, overwrite: bool = False, resumable: bool = False) -> None:
-    """Raise `UsageError` if a command cannot begin to write to `folder`; say so if there is nothing to resume in it.
-
-    resumable: whether the command could go on with what is there.
-    """
-    try:
-        check_output(folder, resume=resume, overwrite=overwrite)
-    except FolderExistsError:
-        if resumable:
-            raise
-        raise UsageError(f"{folder} exists already; replace it with --overwrite=true") from None
-    if resume and not (folder.is_dir() and any(folder.iterdir())):
-        say(f"nothing to resume in {folder}: starting from the beginning")
+    else:
+        raise UsageError(f"{folder} exists already; replace it with --overwrite=true")
 
 
 def save_options(folder: Path, options: Any) -> None:
     """Write the resolved options to `folder/config.yaml`."""
-    atomic_write(folder / CONFIG_FILE, dump_yaml(options))
+    write_file(folder / CONFIG_FILE, dump_yaml(options).encode())
 
 
 def check_same_options(folder: Path, options: Any) -> None:
@@ -147,13 +128,6 @@ def check_same_options(folder: Path, options: Any) -> None:
             raise MismatchError(f"--{known.name}", str(path), was, "the command line", now)
 
 
-def atomic_write(path: Path, content: str | bytes) -> None:
-    """Write a whole file or nothing, and its folder if that is missing. Raises what `write_file` raises."""
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, content.encode() if isinstance(content, str) else content)
-
-
 def require_ours(folder: Path) -> None:
     """Raise `UsageError` if replacing `folder` would delete what this program did not make."""
     real = folder.resolve()
@@ -164,38 +138,9 @@ def require_ours(folder: Path) -> None:
             raise UsageError(f"{folder} is or contains {name}; --overwrite=true will not delete it")
     if next(real.rglob(".git"), None) is not None:
         raise UsageError(f"{folder} holds a git checkout; --overwrite=true will not delete it")
-    if not _is_ours(real):
+    files = {real / name: mark.encode() for name, mark in _MARKS.items() if (real / name).is_file()}
+    if not any(mark in path.read_bytes() for path, mark in files.items()):
         raise UsageError(
             f"{folder} holds something that manip-il did not make (no config.yaml, meta/info.json or eval.json of its "
             "own); choose another folder, or delete it by hand"
         )
-
-
-def _is_ours(folder: Path) -> bool:
-    config = folder / CONFIG_FILE
-    if config.is_file() and config.read_bytes().startswith(CONFIG_HEADER.encode()):
-        return True
-    # Any LeRobot dataset has meta/info.json; only ours has both actions.
-    files = (folder / "meta" / "info.json", folder / "eval.json")
-    info, result = ((_record(path.read_bytes()) or {}) if path.is_file() else {} for path in files)
-    features = info.get("features")
-    is_dataset = isinstance(features, dict) and {"executed_action", "sim_state"} <= features.keys()
-    return is_dataset or {"success_rate", "fingerprint"} <= result.keys()
-
-
-def _delete(folder: Path) -> None:
-    if folder.is_mount():  # in a container: it can be emptied, not renamed; the mark of ours is deleted last
-        for path in sorted(folder.iterdir(), key=lambda path: path.name in _MARKS):
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-        return
-    # Renamed first: after a kill in between, no folder is left that has files but not the mark of ours.
-    doomed = folder.with_name(f".{folder.name}.deleting.{os.getpid()}")
-    folder.rename(doomed)
-    shutil.rmtree(doomed)
-
-
-def _record(line: bytes) -> dict[str, Any] | None:
-    try:
-        return checks.mapping("a record", checks.parse_json("a record", line))
-    except ManipError:
-        return None

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import time
-from collections.abc import Generator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any
 
-from manip_il.cli.interrupt import Interrupted, StopRequest
 from manip_il.errors import ManipError, UsageError, printable
 
 if TYPE_CHECKING:
@@ -19,15 +18,9 @@ if TYPE_CHECKING:
     from manip_il.mdp import Episode
 
 INTERVAL = 5.0  # [s] between plain lines
+_STOPPING = b"\nstopping after the step in hand (Ctrl-C again to stop at once)\n"
 
 _quiet = False
-
-
-class Progress:
-    """Display of work under way; of this class itself, none."""
-
-    def advance(self, n: int = 1, **fields: object) -> None:
-        """Add `n` steps; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
 
 
 def set_quiet(quiet: bool) -> None:
@@ -36,14 +29,15 @@ def set_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
-def is_quiet() -> bool:
-    """Return whether progress is switched off."""
-    return _quiet
+def has_bars() -> bool:
+    """Return whether bars may be shown: on a terminal, unless progress is switched off."""
+    return sys.stderr.isatty() and not _quiet
 
 
-def say(line: str) -> None:
-    """Print a line of normal output, on standard output."""
-    print(printable(line), flush=True)
+def say(*lines: str) -> None:
+    """Print lines of normal output, on standard output."""
+    for line in lines:
+        print(printable(line), flush=True)
 
 
 def say_policy(policy: Path, validation: EvalResult, test: str, remedies: str) -> None:
@@ -54,12 +48,10 @@ def say_policy(policy: Path, validation: EvalResult, test: str, remedies: str) -
     from manip_il.evaluation.failures import evaluation_verdict
 
     if validation.success.successes:
-        say(f"best policy: {policy}")
-        say(f"next: {test}")
-        return
-    say(evaluation_verdict(validation))
-    say(f"try in a new run: {remedies}")
-    say(f"failures by phase, with films: {test}")
+        say(f"best policy: {policy}", f"next: {test}")
+    else:
+        say(evaluation_verdict(validation), f"try in a new run: {remedies}")
+        say(f"failures by phase, with films: {test}")
 
 
 def warn(*lines: str) -> None:
@@ -68,151 +60,145 @@ def warn(*lines: str) -> None:
         print(f"manip-il: warning: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 
 
-@contextmanager
-def progress(total: int | None, description: str) -> Generator[Progress]:
-    """Show the progress of `total` steps (None if the number is unknown) while the `with` lasts."""
-    if _quiet:
-        yield Progress()
-    elif sys.stderr.isatty():
-        with _bar(total, description) as bar:
-            yield bar
-    else:
-        lines = _Lines(total, description)
-        try:
-            yield lines
-        finally:
-            lines.finish()
+class Progress:
+    """Progress of `total` steps, None if the number is unknown; use as a context manager.
 
-
-class _Lines(Progress):
-    """Lines at most every `INTERVAL`, and one at the end: `record: 12/50 (3.4/s, success 0.92)`."""
+    A bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing of no steps, or if progress is
+    switched off.
+    """
 
     def __init__(self, total: int | None, description: str):
         self._total, self._description = total, description
-        self._done = 0
-        self._fields: dict[str, object] = {}
+        self._done, self._fields = 0, dict[str, object]()
         self._start = self._printed = time.monotonic()
-        self._fresh = True  # advanced since the last line
+        self._bar = _bar(total, description) if total != 0 and has_bars() else None
+
+    def __enter__(self) -> Progress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        else:
+            self._print()
 
     def advance(self, n: int = 1, **fields: object) -> None:
+        """Add `n` steps; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
         self._done += n
         self._fields |= fields
-        self._fresh = True
-        now = time.monotonic()
-        if now - self._printed >= INTERVAL:
-            self._print(now)
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=self._done, details=self._details())
+        elif time.monotonic() - self._printed >= INTERVAL:
+            self._print()
 
-    def finish(self) -> None:
-        if self._fresh:
-            self._print(time.monotonic())
+    def _print(self) -> None:
+        self._printed = time.monotonic()
+        count = self._done if self._total is None else f"{self._done}/{self._total}"
+        rate = f"{self._done / max(self._printed - self._start, 1e-9):.3g}/s"
+        if self._total != 0 and not _quiet:
+            details = ", ".join(filter(None, [rate, self._details()]))
+            print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
 
-    def _print(self, now: float) -> None:
-        self._printed, self._fresh = now, False
-        count = "/".join(str(number) for number in (self._done, self._total) if number is not None)
-        rate = self._done / max(now - self._start, 1e-9)
-        details = ", ".join(filter(None, [f"{rate:.3g}/s", _fields_text(self._fields)]))
-        print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
-
-
-class _Bar(Progress):
-    def __init__(self, bar: Any, task: Any):
-        self._bar, self._task = bar, task
-        self._fields: dict[str, object] = {}
-
-    def advance(self, n: int = 1, **fields: object) -> None:
-        self._fields |= fields
-        self._bar.update(self._task, advance=n, details=_fields_text(self._fields))
+    def _details(self) -> str:
+        texts = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in self._fields.items()}
+        return ", ".join(f"{name} {text}" for name, text in texts.items())
 
 
-@contextmanager
-def _bar(total: int | None, description: str) -> Generator[_Bar]:
-    from rich import progress as rich_progress
+def _bar(total: int | None, description: str) -> Any:
+    from rich import progress
     from rich.console import Console
 
     columns = (
-        rich_progress.TextColumn("{task.description}", markup=False),
-        rich_progress.BarColumn(),
-        rich_progress.MofNCompleteColumn(),
-        rich_progress.TimeRemainingColumn(),
-        rich_progress.TextColumn("{task.fields[details]}", markup=False),
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[details]}", markup=False),
     )
     # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
-    with rich_progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as bar:
-        yield _Bar(bar, bar.add_task(description, total=total, details=""))
-
-
-def _fields_text(fields: dict[str, object]) -> str:
-    return ", ".join(
-        f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in fields.items()
-    )
+    bar = progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty())
+    bar.add_task(description, total=total, details="")
+    return bar
 
 
 class Stages:
-    """One progress bar at a time; use as a context manager. A stop request takes effect at the next step.
+    """One `Progress` at a time; use as a context manager.
 
-    kept: what is safe on disk, for the message to the user, also if the work fails.
+    The first Ctrl-C or SIGTERM stops the work after the step in hand, the second at once. kept: what is safe on disk,
+    for the message to the user, also if the work fails.
     """
 
     def __init__(self, kept: str):
         self.kept = kept
-        self._stop = StopRequest()
-        self._open = ExitStack()
-        self._bar = Progress()
+        self._stopping = False
+        self._handlers: dict[int, Any] = {}
+        self._bar: Progress | None = None
         self._done = self._solved = 0
 
     def __enter__(self) -> Stages:
-        self._stop.__enter__()
+        self._handlers = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-        self._stop.__exit__(kind, error, trace)
-        if isinstance(error, ManipError) and not isinstance(error, UsageError):
-            error.args = (f"{error}; kept: {self.kept}; continue with --resume=true",)
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        if isinstance(error, ManipError | KeyboardInterrupt) and not isinstance(error, UsageError):
+            said = f"{error}; " if error.args else ""
+            error.args = (f"{said}kept: {self.kept}; continue with --resume=true",)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self._stopping:
+            raise KeyboardInterrupt
+        self._stopping = True
+        os.write(2, _STOPPING)  # print() may not be entered twice, and a signal can come inside one
 
     def start(self, description: str, total: int) -> None:
         """Close the bar of the stage before and open one of `total` episodes or steps."""
         self.close()
         self.check()
         self._done = self._solved = 0
-        self._bar = self._open.enter_context(progress(total, description))
+        self._bar = Progress(total, description).__enter__()
 
     def close(self) -> None:
         """Close the bar."""
-        self._open.close()
-        self._bar = Progress()
+        if self._bar is not None:
+            self._bar.__exit__()
+            self._bar = None
+
+    def _advance(self, n: int = 1, **fields: object) -> None:
+        self._done += n
+        if self._bar is not None:
+            self._bar.advance(n, **fields)
+        self.check()
 
     def episode(self, episode: Episode | EpisodeResult) -> None:
         """Count an episode that has ended."""
-        self._done += 1
         self._solved += episode.success
-        self._bar.advance(success=self._solved / self._done)
-        self.check()
+        self._advance(success=self._solved / (self._done + 1))
 
     def step(self) -> None:
         """Count a step that is done."""
-        self._bar.advance()
-        self.check()
+        self._advance()
 
     def reach(self, step: int, **fields: object) -> None:
         """Show that a stage has reached a step, and what `fields` say of it."""
-        self._bar.advance(step - self._done, **fields)
-        self._done = step
-        self.check()
+        self._advance(step - self._done, **fields)
 
     def log(self, record: dict[str, Any]) -> None:
         """Show a fit's metrics at a step; {} if there are none."""
         if record:
-            self._bar.advance(record["step"] - self._done, loss=record["loss"])
-            self._done = record["step"]
+            self.reach(record["step"], loss=record["loss"])
         self.check()
 
     def check(self) -> None:
-        """Raise `Interrupted` if the user has asked to stop."""
-        if self._stop.requested:
-            raise Interrupted(self.kept)
+        """Raise `KeyboardInterrupt` if the user has asked to stop."""
+        if self._stopping:
+            raise KeyboardInterrupt
 
     def watch(self) -> Watch:
         """Return the callbacks that a run of an algorithm reports to."""

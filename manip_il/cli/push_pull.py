@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.outputs import require_ours
-from manip_il.cli.progress import is_quiet, say
+from manip_il.cli.progress import has_bars, say
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.option import option
 
@@ -42,7 +41,7 @@ class PushOptions:
 
         from manip_il.store.transfer import open_remote, push
 
-        remote = open_remote(self.remote, private=self.private, quiet=is_quiet() or not sys.stderr.isatty())
+        remote = open_remote(self.remote, private=self.private, quiet=not has_bars())
         plan = push(self.source, remote, journals=self.journals, dry_run=self.dry_run)
         sizes = {path: plan.manifest.files[path].size for path in plan.upload}
         for path, size in sizes.items() if self.dry_run else ():
@@ -84,7 +83,7 @@ class PullOptions:
 
         from manip_il.store.transfer import open_remote, pull
 
-        remote = open_remote(self.remote, revision=self.revision, quiet=is_quiet() or not sys.stderr.isatty())
+        remote = open_remote(self.remote, revision=self.revision, quiet=not has_bars())
         try:
             manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
         except FolderExistsError:

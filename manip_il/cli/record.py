@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from manip_il import checks
 from manip_il.cli import common_options as common
 from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import check_output, check_same_options, prepare_output, require_output, save_options
+from manip_il.cli.outputs import check_output, check_same_options, prepare_output, save_options
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
@@ -79,7 +79,7 @@ class RecordOptions:
         root, journals = self._folders()
         check_output(root, resume=self.resume, overwrite=self.overwrite)
         if not (self.resume and root.is_dir() and any(root.iterdir())):
-            require_output(journals, resume=self.resume, overwrite=self.overwrite, resumable=True)
+            check_output(journals, resume=self.resume, overwrite=self.overwrite, resumable=True)
         common.require_pictures(self.env, self.cameras)
         self._job()
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.inputs import load_reward, require_dataset, require_file, require_folder
 from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output, atomic_write
-from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.outputs import REPORT_FILE, Output
+from manip_il.cli.progress import Progress, say, warn
+from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import option
 
@@ -80,7 +81,7 @@ class IrlOptions:
         from manip_il.seeding import rng_for, stream_base
 
         dataset, begin, timings = Dataset.open(self.dataset), time.monotonic(), dict[str, float]()
-        with progress(dataset.info.episodes, f"irl {self.dataset}") as bar:
+        with Progress(dataset.info.episodes, f"irl {self.dataset}") as bar:
             carried = read_carried(self.dataset, bar.advance)
         timings["reading"] = time.monotonic() - begin
         begin, rng = time.monotonic(), rng_for(stream_base("training", self.seed), "irl")
@@ -167,10 +168,10 @@ class AskOptions:
         from manip_il.preferences.pairs import Pairs, read_clips
 
         clips = read_clips(Pairs.read(self.pairs))
-        with progress(len(clips.pairs), "render") as bar:
+        with Progress(len(clips.pairs), "render") as bar:
             films = render_films(clips, str(self.robot) if self.robot else None, bar.advance)
         page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
-        atomic_write(self.output, page)
+        write_file(self.output, page.encode())
         say(f"{len(clips.pairs):,} pairs, {len(page) / 1e6:.1f} MB: {self.output}")
         say("open it in a browser, compare, and save the answers as preferences.json")
         say(f"next: manip-il reward fit {self.pairs} preferences.json --output_dir=runs/reward")
@@ -250,7 +251,7 @@ class FitOptions:
         pairs = [Pairs.read(path) for path in (self.pairs, *self.more_pairs)]
         given = [Preferences.read(path, pairs) for path in self.answers]
         begin, answers, clips = time.monotonic(), join_answers(given), read_clips(join_pairs(pairs))
-        with progress(None, f"fit {len(answers.better):,} answers") as bar:
+        with Progress(None, f"fit {len(answers.better):,} answers") as bar:
             shape = shape_for(clips.frames[0].spec, self.members)
             found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.advance)
         timings = {"fit": time.monotonic() - begin}

@@ -13,7 +13,7 @@ from manip_il.cli import common_options as common
 from manip_il.cli.inputs import open_driver, require_file, require_folder
 from manip_il.cli.options import Given, command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output
-from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.progress import Progress, say, warn
 from manip_il.errors import ManipError, RenderError, UnknownName, UsageError
 from manip_il.option import option
 from manip_il.tasks import NAMES
@@ -134,7 +134,7 @@ class RobotCheckOptions:
 
         tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
         with self.output.open(self) as folder:
-            with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
+            with Progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
                 found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
             found.write(folder / FILE_NAME)
             try:
@@ -204,7 +204,7 @@ class CertifyOptions:
         policy = find_policy(self.policy.path) if self.policy.path else None
         engine, count = self.engine.open(), count_episodes(env, self.cases, policy)
         with self.output.open(self) as folder:
-            with progress(count, f"certify {env.robot} {env.task}") as bar, engine:
+            with Progress(count, f"certify {env.robot} {env.task}") as bar, engine:
                 advance = bar.advance
                 certificate = certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)
             certificate.write(folder / FILE_NAME)

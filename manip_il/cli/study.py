@@ -11,7 +11,7 @@ from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.inputs import check_policies
 from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, atomic_write
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.study_file import (
     ArmOptions,
@@ -23,6 +23,7 @@ from manip_il.cli.study_file import (
     with_start_cost,
     with_start_policy,
 )
+from manip_il.data.atomic import write_file
 from manip_il.errors import NoEffect
 from manip_il.seeding import stream_seeds
 
@@ -60,7 +61,7 @@ class Study:
             self._learn(plan)
             study = self._test(plan, experts)
             write_json(folder / FILE_NAME, study.to_json())
-            atomic_write(folder / TABLE_FILE, table_markdown(study))
+            write_file(folder / TABLE_FILE, table_markdown(study).encode())
             self._report(plan, study, options)
         for table in study.tables():
             print_table(table)

@@ -17,8 +17,8 @@ from manip_il.cli.common_options import TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.learning import AirlOptions, GailOptions, GivenGroup, PpoOptions
 from manip_il.cli.options import Open, to_plain
-from manip_il.cli.outputs import atomic_write
 from manip_il.cli.parsing import check_values, dump_yaml, from_layers, from_yaml
+from manip_il.data.atomic import write_file
 from manip_il.data.json_lines import read_lines
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.option import option
@@ -146,7 +146,7 @@ def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
 
 def keep_file(folder: Path, file: StudyFile) -> None:
     """Write the study's file beside its runs."""
-    atomic_write(folder / STUDY_FILE, dump_yaml(file))
+    write_file(folder / STUDY_FILE, dump_yaml(file).encode())
 
 
 def check_same_file(folder: Path, file: StudyFile) -> None:

@@ -11,7 +11,7 @@ from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import Output
-from manip_il.cli.progress import progress, say
+from manip_il.cli.progress import Progress, say
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class TheoryOptions:
                 shift = self._shift(self.source)
                 timings["the run"] = time.monotonic() - begin
             begin, curves = time.monotonic(), []
-            with progress(6 * len(PROCESSES), "theorems") as bar:
+            with Progress(6 * len(PROCESSES), "theorems") as bar:
                 for curve in all_curves():
                     curves.append(curve)
                     bar.advance()
@@ -80,7 +80,7 @@ class TheoryOptions:
         rounds = find_rounds(run)
         env = common_env(read_arm(run).members, lambda _: common.env_config({}))
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
-        with progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
+        with Progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.advance())
             gaps = certificate.actions.gaps
             u = gaps.largest if gaps else 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -14,7 +13,7 @@ from manip_il.cli.data_edits import RedrawOptions
 from manip_il.cli.inputs import dataset_differences, require_dataset, require_file, start_policy
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput, check_same_options, prepare_output, save_options
-from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
+from manip_il.cli.progress import Progress, Stages, say, set_quiet, warn
 from manip_il.data.atomic import exclusive
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig, check_weights
@@ -189,34 +188,17 @@ class TrainOptions:
         from manip_il.learn.train import Trainer
 
         folder = self.output.output_dir
-        with self._decoding(sources) as on_frames:
-            trainer = Trainer(sources, config, folder, resume=self.output.resume, on_frames=on_frames, weights=weights)
+        pictures = sum(len(one) * len(one.cameras) for one in sources.datasets) if config.takes_images else 0
+        with Progress(pictures, "decode pictures, once") as bar:
+            trainer = Trainer(
+                sources, config, folder, resume=self.output.resume, on_frames=bar.advance, weights=weights
+            )
         if _is_first_process():
             save_options(folder, self)  # now that what can be wrong has been found
         steps = config.steps_per_checkpoint
         with Stages(f"every finished checkpoint in {folder} (one every {steps:,} steps)") as stages:
             stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
             return trainer.fit(stages.log)
-
-    @contextlib.contextmanager
-    def _decoding(self, sources: Sources) -> Iterator[Callable[[int], None]]:
-        """Yield a callback for the number of pictures just decoded; a bar is displayed from the first one on."""
-        with contextlib.ExitStack() as stack:
-            bar = None
-
-            def decoded(frames: int) -> None:
-                nonlocal bar
-                if bar is None:
-                    total = sum(len(one) * len(one.cameras) for one in sources.datasets)
-                    bar = stack.enter_context(progress(total, "decode pictures, once"))
-                bar.advance(frames)
-
-            yield decoded
-
-    @classmethod
-    def more_help(cls, words: Sequence[str]) -> str:
-        """Return the options of the policy that `--policy.type` names."""
-        return common.policy_help(words)
 
 
 def _is_first_process() -> bool:

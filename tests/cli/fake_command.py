@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from manip_il.cli.interrupt import Interrupted, StopRequest
-from manip_il.cli.progress import say
+from manip_il.cli.progress import Stages, say
 from manip_il.errors import ManipError, UsageError
 
 
@@ -45,10 +44,9 @@ class FakeOptions:
                 for _ in range(100_000):
                     say("line")
             case "stop":
-                with StopRequest() as stop:
+                with Stages("1 of 50 episodes in x") as stages:
                     os.kill(os.getpid(), signal.SIGTERM)
-                    if stop.requested:
-                        raise Interrupted(kept="1 of 50 episodes in x")
+                    stages.check()
             case "interrupt":
                 raise KeyboardInterrupt
             case "foreign_pipe":

@@ -108,7 +108,7 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
     err = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     assert "kept: every finished episode" in err
-    assert err.rstrip().endswith("--workers=1 --resume=true")
+    assert err.rstrip().endswith("continue with --resume=true")
 
 
 def test_a_dataset_that_is_there_is_refused_or_replaced(demos, tmp_path, error):

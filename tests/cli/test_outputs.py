@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.outputs import CONFIG_FILE, atomic_write, check_same_options, prepare_output
+from manip_il.cli.outputs import CONFIG_FILE, check_same_options, prepare_output
 from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
-from manip_il.data.atomic import exclusive
+from manip_il.data.atomic import exclusive, write_file
 from manip_il.errors import FolderExistsError, UsageError
 
 from .made_runs import make_eval
@@ -21,31 +21,31 @@ from .made_runs import make_eval
 @pytest.fixture
 def ours(tmp_path):
     folder = tmp_path / "run"
-    atomic_write(folder / "config.yaml", f"{CONFIG_HEADER} 0: resolved\n")
+    write_file(folder / "config.yaml", f"{CONFIG_HEADER} 0: resolved\n".encode())
     return folder
 
 
 def overwrite(folder: Path) -> None:
-    prepare_output(folder, resume=False, overwrite=True)
+    prepare_output(folder, overwrite=True)
 
 
 def test_a_new_or_empty_folder_is_fine_and_a_full_one_is_refused_with_the_ways_on(ours, tmp_path):
-    prepare_output(tmp_path / "new", resume=False, overwrite=False)
-    prepare_output(tmp_path / "new", resume=True, overwrite=False)
+    prepare_output(tmp_path / "new")
+    prepare_output(tmp_path / "new", resume=True)
     (tmp_path / "empty").mkdir()
-    prepare_output(tmp_path / "empty", resume=False, overwrite=False)
+    prepare_output(tmp_path / "empty")
     with pytest.raises(FolderExistsError, match=r"--resume=true.*--overwrite=true"):
-        prepare_output(ours, resume=False, overwrite=False)
+        prepare_output(ours)
     with pytest.raises(UsageError, match="contradict"):
         prepare_output(ours, resume=True, overwrite=True)
     (tmp_path / "x").touch()
     with pytest.raises(UsageError, match="is a file"):
-        prepare_output(tmp_path / "x", resume=True, overwrite=False)
+        prepare_output(tmp_path / "x", resume=True)
 
 
 def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
     (ours / ".fingerprint.json.x.partial").touch()
-    prepare_output(ours, resume=True, overwrite=False)
+    prepare_output(ours, resume=True)
     assert [path.name for path in ours.iterdir()] == ["config.yaml"]
 
 
@@ -72,10 +72,10 @@ def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(t
     ],
 )
 def test_overwrite_deletes_what_this_program_made_and_nothing_else(tmp_path, name, content, is_ours):
-    atomic_write(tmp_path / "run" / name, content)
+    write_file(tmp_path / "run" / name, content.encode())
     if is_ours:
         overwrite(tmp_path / "run")
-        assert list(tmp_path.iterdir()) == []
+        assert list((tmp_path / "run").iterdir()) == []
     else:
         with pytest.raises(UsageError, match="did not make"):
             overwrite(tmp_path / "run")
@@ -126,7 +126,7 @@ def here(tmp_path, monkeypatch) -> Path:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_folder_that_holds_something_is_refused(command, here, error):
     words = [command, *COMMANDS[command], f"--output_dir={here / 'full'}"]
-    atomic_write(here / "full" / "thesis.tex", "years of work")
+    write_file(here / "full" / "thesis.tex", b"years of work")
     assert main(words) == 2
     assert "full exists already; " in error()
     assert main([*words, "--overwrite=true"]) == 2

