@@ -214,8 +214,8 @@ class EvalOptions:
 
     def _job(self, engine: Engine, episodes: int) -> RolloutJob:
         from manip_il.collect.job import RolloutJob
+        from manip_il.evaluation.runner import episode_hold
         from manip_il.evaluation.suites import suite_conditions
-        from manip_il.evaluation.trial import episode_hold
 
         if episodes > 1:
             engine.warm_up(learned=self.policy.path is not None)  # while the policy is checked here

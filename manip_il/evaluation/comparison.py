@@ -10,9 +10,15 @@ from typing import Any
 
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.arm import Arm, require_pair
-from manip_il.evaluation.intervals import CONFIDENCE, mean_interval
+from manip_il.evaluation.intervals import (
+    CONFIDENCE,
+    PairedComparison,
+    format_p,
+    format_points,
+    mean_interval,
+    sign_flip_exact,
+)
 from manip_il.evaluation.results import EvalResult, compare_results
-from manip_il.evaluation.significance import PairedComparison, format_p, format_points, sign_flip_exact
 
 FILE_NAME = "compare.json"
 _OF_PAIR = ("both", "only_left", "only_right", "neither", "difference", "interval", "p_value")

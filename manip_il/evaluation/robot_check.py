@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import UsageError
-from manip_il.evaluation.episodes import EpisodeResult
-from manip_il.evaluation.results import EvalResult, write_json
+from manip_il.evaluation.results import EpisodeResult, EvalResult, write_json
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.robots.reach import reach_of

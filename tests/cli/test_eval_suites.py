@@ -121,7 +121,7 @@ def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys, error):
     assert Path("ab/report.html").is_file()
     capsys.readouterr()
     assert main(["eval", "a", "whole", "--output_dir=c"]) == 1
-    assert "seed 4000000 is in a and in whole" in error()
+    assert "every episode needs its own seed" in error()
     assert not Path("c").exists()
 
 

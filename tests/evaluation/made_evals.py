@@ -11,10 +11,9 @@ import numpy as np
 
 from manip_il.evaluation.arm import Arm, Member
 from manip_il.evaluation.comparison import Comparison
-from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.film import encode_mp4, encode_picture
 from manip_il.evaluation.report import Film
-from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.rounds import History, Rule, history
 
 from .test_rounds import records

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from manip_il.evaluation import robot_check
-from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
-from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.robot_check import (
     JointFacts,
     RobotCheck,
