@@ -34,6 +34,7 @@ class MeasuredPolicyGroup:
 
     path: Path | None = common.policy_option()
     type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
+    device: str = option("cpu", "where the checkpoint acts: cpu or cuda")
 
 
 @dataclass
@@ -221,7 +222,12 @@ class EvalOptions:
             engine.warm_up(learned=self.policy.path is not None)  # while the policy is checked here
         local = self.engine.engine == "local"
         env, driver, cameras = open_driver(
-            self.policy.path, self.policy.type or "expert", self.env, draw=local, trust=self.trust
+            self.policy.path,
+            self.policy.type or "expert",
+            self.env,
+            draw=local,
+            trust=self.trust,
+            device=self.policy.device,
         )
         conditions = suite_conditions(self.suite, env, sees=cameras is not None)
         job = RolloutJob(env, driver, episode_hold(env, self.eval.hold), label="last", conditions=conditions)

@@ -152,11 +152,12 @@ def open_driver(
     draw: bool = True,
     trust: bool = False,
     quiet: bool = False,
+    device: str = "cpu",
 ) -> tuple[EnvConfig, Driver, CameraConfig | None]:
     """Return what drives, checked, the environment that it drives, and the cameras whose pictures it takes.
 
     policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or what was given of it:
-    the rest is as the policy has it. draw, trust: see `check_policy`. quiet: do not say which pictures it takes.
+    the rest is as the policy has it. draw, trust, device: see `check_policy`. quiet: do not say which pictures it takes.
     """
     from manip_il.collect.drivers import PolicyDriver, driver_of
     from manip_il.learn.checkpoint import Checkpoint
@@ -165,10 +166,10 @@ def open_driver(
         return env_config(env) if isinstance(env, dict) else env, driver_of(kind), None
     checkpoint = Checkpoint.open(path := find_policy(policy))
     config = env_config(env, checkpoint.origin) if isinstance(env, dict) else env
-    cameras = check_policy(checkpoint, config, draw=draw, trust=trust)
+    cameras = check_policy(checkpoint, config, draw=draw, trust=trust, device=device)
     if cameras is not None and not quiet:
         say(_observation_text(cameras, checkpoint))
-    return config, PolicyDriver((path,), trust=trust), cameras
+    return config, PolicyDriver((path,), trust=trust, device=device), cameras
 
 
 def check_space(policy: Path, space: str | None) -> None:
@@ -183,11 +184,11 @@ def check_space(policy: Path, space: str | None) -> None:
 
 
 def check_policy(
-    checkpoint: Checkpoint, env: EnvConfig, *, draw: bool = True, trust: bool = False
+    checkpoint: Checkpoint, env: EnvConfig, *, draw: bool = True, trust: bool = False, device: str = "cpu"
 ) -> CameraConfig | None:
     """Return the cameras whose pictures the policy takes, if any; warn if it was trained on something else.
 
-    draw: make its first pictures here, to see that they can be made. trust: see `LearnedPolicy.load`. Raises
+    draw: make its first pictures here, to see that they can be made. trust, device: see `LearnedPolicy.load`. Raises
     `MismatchError` unless the policy can drive `env`, `RenderError` if there is no OpenGL for its pictures, and what
     `LearnedPolicy.load` raises.
     """
@@ -199,7 +200,7 @@ def check_policy(
     spec = env_spec(env, cameras)
     checkpoint.check_fits(spec)
     warn(*_differences(checkpoint, env, cameras))
-    policy = LearnedPolicy.load(checkpoint, task=spec.instruction, trust=trust)
+    policy = LearnedPolicy.load(checkpoint, device, spec.instruction, trust=trust)
     # One action now finds what else does not fit before a worker does.
     observation = _first_observation(env, cameras, draw)
     images = {camera: picture[None] for camera, picture in observation.images.items()}
