@@ -157,7 +157,8 @@ def open_driver(
     """Return what drives, checked, the environment that it drives, and the cameras whose pictures it takes.
 
     policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or what was given of it:
-    the rest is as the policy has it. draw, trust, device: see `check_policy`. quiet: do not say which pictures it takes.
+    the rest is as the policy has it. draw, trust, device: see `check_policy`. quiet: do not say what pictures it
+    takes.
     """
     from manip_il.collect.drivers import PolicyDriver, driver_of
     from manip_il.learn.checkpoint import Checkpoint
