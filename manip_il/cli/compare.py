@@ -150,7 +150,7 @@ class CompareOptions:
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
         trial = Trial.of(common_env(members, self._policy_env), seeds, self.suite, policies.values(), self.trust)
-        check_policies(policies, trial, self.output.output_dir, self.engine.engine)
+        check_policies(policies, trial)
         return trial
 
     def _policy_env(self, policy: Path) -> EnvConfig:

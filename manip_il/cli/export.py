@@ -31,7 +31,7 @@ class ExportOptions:
         MISSING,
         "a run, a checkpoint or a pretrained_model folder",
         positional=True,
-        check=lambda path: find_policy(path),
+        check=find_policy,
     )
     format: Literal["onnx", "torchscript"] = option("onnx", "for onnxruntime and others, or for torch alone")
     output: Path | None = option(None, "the file; by default policy.onnx or policy.pt")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il import checks
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import open_driver, require_file, require_folder
+from manip_il.cli.inputs import exists, open_driver
 from manip_il.cli.options import Given, command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output
 from manip_il.cli.progress import Progress, say, warn
@@ -25,10 +25,6 @@ SUFFIXES = (".yaml", ".yml")
 PAGE = "check.html"
 
 
-def _require_model(path: Path) -> None:
-    require_file(path, "an MJCF")
-
-
 @dataclass
 class RobotNewOptions:
     """Write a first YAML for an arm's MJCF: hand, fingers and workspace as they look on the model.
@@ -39,8 +35,8 @@ class RobotNewOptions:
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"
-    model: Path = option(MISSING, "the arm's MJCF", positional=True, check=_require_model)
-    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", check=_require_model)
+    model: Path = option(MISSING, "the arm's MJCF", positional=True, check=exists("an MJCF"))
+    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", check=exists("an MJCF"))
     output: Path | None = option(None, "the YAML; by default beside the model, with its name")
     overwrite: bool = option(False, "replace an existing file")
 
@@ -50,7 +46,7 @@ class RobotNewOptions:
         if target.suffix not in SUFFIXES:
             raise UsageError(f"--output is {target}; expected a file, NAME.yaml")
         checks.name(f"the name of {target}, which will be the robot's,", target.stem)
-        require_folder(target.parent, f"the folder of {target}")
+        exists(f"the folder of {target}")(target.parent)
         if target.exists() and not self.overwrite:
             raise UsageError(f"{target} exists already; choose another --output, or give --overwrite")
 
@@ -199,8 +195,7 @@ class CertifyOptions:
         from manip_il.evaluation.policy_folder import find_policy
         from manip_il.evaluation.tables import print_table
 
-        local = self.engine.engine == "local"
-        env, *_ = open_driver(self.policy.path, "expert", self.env, draw=local, trust=self.trust, quiet=True)
+        env, *_ = open_driver(self.policy.path, "expert", self.env, trust=self.trust)
         policy = find_policy(self.policy.path) if self.policy.path else None
         engine, count = self.engine.open(), count_episodes(env, self.cases, policy)
         with self.output.open(self) as folder:

@@ -129,7 +129,7 @@ class Study:
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
         trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self._trust)
-        check_policies(policies, trial, self._root, self._engine.engine)
+        check_policies(policies, trial)
         return trial
 
     def _member(self, plan: Plan, name: str, seed: int) -> Member:
