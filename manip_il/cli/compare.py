@@ -47,8 +47,8 @@ class CompareOptions:
 
     One YAML in place of two sides is a study: every arm is run with several training seeds, all are tested on the same
     unseen seeds, and compared. It holds `common` and `arms` (options of manip-il dagger), training_seeds, eval,
-    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json, table.md and
-    report.html the results.
+    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json and report.html the
+    results.
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"

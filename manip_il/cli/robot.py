@@ -102,9 +102,8 @@ def _require_task(task: str) -> None:
 class RobotCheckOptions:
     """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
 
-    Joints and gripper as they move, pictures of the arm with its frame and cameras, where it reaches, and the expert at
-    every task, as it is and with a tenth of the steps random; and what to change if something does not work. Exits
-    with 1 if a task cannot be done.
+    Pictures of the arm with its frame and cameras, where it reaches, and the expert at every task, as it is and with a
+    tenth of the steps random; and what to change if something does not work. Exits with 1 if a task cannot be done.
     """
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
@@ -125,6 +124,7 @@ class RobotCheckOptions:
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` if a task cannot be done."""
+        from manip_il.evaluation.results import write_json
         from manip_il.evaluation.robot_check import FILE_NAME
         from manip_il.evaluation.robot_page import check_report, looks
 
@@ -132,7 +132,7 @@ class RobotCheckOptions:
         with self.output.open(self) as folder:
             with Progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
                 found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
-            found.write(folder / FILE_NAME)
+            write_json(folder / FILE_NAME, found.to_json(), indent=2)
             try:
                 pictures, no_pictures = looks(self.robot), ""
             except RenderError as error:
@@ -147,11 +147,9 @@ class RobotCheckOptions:
             raise ManipError(f"{self.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
 
     def _say(self, found: RobotCheck) -> None:
-        from manip_il.evaluation.robot_page import advice, home_line, joint_table, motors_line, task_table, verdict
+        from manip_il.evaluation.robot_page import advice, home_line, task_table, verdict
         from manip_il.evaluation.tables import print_table
 
-        print_table(joint_table(found))
-        say(motors_line(found))
         say(home_line(found))
         print_table(task_table(found))
         say(verdict(found))

@@ -28,7 +28,7 @@ def compare_report(
     counts = ((pair.n, pair.both, pair.only_right, pair.only_left, pair.neither) for pair in comparison.pairs)
     n, both, only_right, only_left, neither = map(sum, zip(*counts, strict=True))
     over = f" of {len(comparison.pairs)} training seeds" if len(comparison.pairs) > 1 else ""
-    a, b = comparison.names
+    names = a, b = comparison.left.name, comparison.right.name
     paired = (
         f"Of {n:,} paired episodes{over} both solved {both:,}, only {b} {only_right:,}, only {a} {only_left:,}, and "
         f"neither {neither:,}."
@@ -38,7 +38,7 @@ def compare_report(
     tables = tuple(filter(None, (comparison_table(comparison), condition_table(comparison))))
     note = f"Both ran the same {first.success.n:,} test episodes.{disturbed_note(first)}"
     return Report(
-        title=f"{' against '.join(comparison.names)}: {first.robot} {first.task}",
+        title=f"{' against '.join(names)}: {first.robot} {first.task}",
         verdict=comparison.verdict,
         facts=(paired, *facts),
         command=command,
@@ -48,7 +48,7 @@ def compare_report(
             *curve_sections(curves),
         ),
         config=config or {},
-        fingerprint=left if left == right else dict(zip(comparison.names, (left, right), strict=True)),
+        fingerprint=left if left == right else dict(zip(names, (left, right), strict=True)),
     )
 
 
@@ -96,7 +96,8 @@ def condition_table(comparison: Comparison) -> Table | None:
         left, right = (fmean(m.test.by_condition[name].success.rate for m in arm.members) for arm in comparison.arms)
         cells = (format_percent(left), format_percent(right), f"{100 * (right - left):+.1f} points")
         rows.append((name or NO_CONDITION, f"{part.success.n:,}", *cells))
-    return Table(("condition", "episodes", *comparison.names, "difference"), tuple(rows)) if len(parts) > 1 else None
+    head = ("condition", "episodes", comparison.left.name, comparison.right.name, "difference")
+    return Table(head, tuple(rows)) if len(parts) > 1 else None
 
 
 def arm_colours(study: Study) -> dict[str, str]:
