@@ -131,7 +131,6 @@ class Settings:
     episodes: int = 16
     episode_steps: int = 200
     log_std: float = -0.5
-    reward_form: str = "logit"
     demonstrations: int = 20
     ppo: PPOConfig = field(default_factory=PPOConfig)
     discount: float = 0.9

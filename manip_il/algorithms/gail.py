@@ -9,7 +9,7 @@ from manip_il.learn.discriminators import GailDiscriminator
 
 def gail(run: LearningRun, c: LearningConfig) -> Iterator[Iteration]:
     """Yield every iteration: roll out the learner, fit the discriminator, improve the learner by its reward."""
-    d = run.keep(lambda actor: GailDiscriminator(c.discriminator, actor, c.reward_form))
+    d = run.keep(lambda actor: GailDiscriminator(c.discriminator, actor))
     for i in run.iterations():
         learner = run.rollouts(i)
         run.discriminate(d, learner)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from manip_il.errors import UsageError
-from manip_il.learn.adversarial_config import REWARDS, DiscriminatorConfig, PPOConfig
+from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import option
 from manip_il.sim.config import EnvConfig
 
@@ -40,7 +40,6 @@ class LearningConfig:
     warmup: int | None = option(
         None, "iterations in which critic and discriminator learn alone; by default 0, or 10 with --init"
     )
-    reward_form: str = option("logit", ", ".join(REWARDS))
     ppo: PPOConfig = field(default_factory=PPOConfig)
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     validation_every: int = option(20_000, "steps from one validation to the next")

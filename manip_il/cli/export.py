@@ -14,7 +14,6 @@ from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
 EXPORTABLE = ("mlp", "cnn")
-SUFFIXES = {"onnx": ".onnx", "torchscript": ".pt"}
 ONNX_PACKAGES = ("onnx", "onnxruntime")
 
 
@@ -26,26 +25,24 @@ class ExportOptions:
     run and compared with the checkpoint before it is written. docs/export.md shows how to run it.
     """
 
-    example: ClassVar[str] = "manip-il export runs/dagger --format=onnx --output=policy.onnx"
+    example: ClassVar[str] = "manip-il export runs/dagger --output=policy.onnx"
     policy: Path = option(
         MISSING,
         "a run, a checkpoint or a pretrained_model folder",
         positional=True,
-        check=find_policy,
+        check=lambda path: find_policy(path),
     )
-    format: Literal["onnx", "torchscript"] = option("onnx", "for onnxruntime and others, or for torch alone")
-    output: Path | None = option(None, "the file; by default policy.onnx or policy.pt")
+    format: Literal["onnx"] = option("onnx", "for onnxruntime and others")
+    output: Path = option(Path("policy.onnx"), "the file")
     overwrite: bool = option(False, "replace an existing file")
 
     def run(self) -> None:
         """Export, compare, write."""
-        output = self.output or Path(f"policy{SUFFIXES[self.format]}")
-        path = self._find(output)
-        from manip_il.learn.export import export_onnx, export_torchscript
+        output, path = self.output, self._find(self.output)
+        from manip_il.learn.export import export_onnx
         from manip_il.learn.policy_files import policy_sha256
 
-        write = export_onnx if self.format == "onnx" else export_torchscript
-        exported = write(path, policy_sha256(path))
+        exported = export_onnx(path, policy_sha256(path))
         write_file(output, exported.data)
         if "robot" not in exported.metadata:
             warn(f"{path} was written by another tool: the file does not say robot, task, control rate and names")
@@ -69,6 +66,6 @@ class ExportOptions:
         kind = read_config(path)["type"]
         if kind not in EXPORTABLE:
             raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
-        if self.format == "onnx" and (missing := [name for name in ONNX_PACKAGES if find_spec(name) is None]):
-            raise ManipError(f"--format=onnx needs {' and '.join(missing)}: pip install 'manip_il[export]'")
+        if missing := [name for name in ONNX_PACKAGES if find_spec(name) is None]:
+            raise ManipError(f"an ONNX file needs {' and '.join(missing)}: pip install 'manip_il[export]'")
         return path

@@ -45,7 +45,7 @@ COMMANDS = {
     "view": Command("view:ViewOptions", "watch a robot at its task, in a window or a browser"),
     "push": Command("push_pull:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": Command("push_pull:PullOptions", "download a dataset or policy, every file verified"),
-    "export": Command("export:ExportOptions", "export a policy as ONNX or TorchScript"),
+    "export": Command("export:ExportOptions", "export a policy as ONNX"),
     "theory": Command("theory:TheoryOptions", "compare the proven bounds with your own run"),
     "data check": Command("data_check:CheckOptions", "find what is wrong with a dataset, of any origin"),
     "data repair": Command("data_check:RepairOptions", "repair a dataset, from its journals or its own data"),
@@ -153,8 +153,6 @@ def _dispatch(words: list[str]) -> None:
         check_values(options)
         if hasattr(options, "check"):
             options.check()
-        elif hasattr(getattr(options, "output", None), "check"):
-            options.output.check()
         from manip_il.errors import silence_ffmpeg_warning
         from manip_il.sim.gl import require_known_backend
 

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar, override
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,7 @@ from manip_il.robots.rotations import rotation_vector
 
 if TYPE_CHECKING:  # inverse kinematics takes a second to import
     from manip_il.robots.ik import ArmIK
+    from manip_il.robots.robot import Robot
 
 ARM, GRIPPER = slice(None, -1), -1  # of joint state and action, as every robot's `ActionSpace` orders them
 _POSITION, _ROTATION, _POSE = slice(0, 3), slice(3, 6), 6
@@ -54,113 +55,79 @@ Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
 @dataclass(frozen=True)
 class Conversion:
-    """The way from actions to targets of a space and back, row by row; this one's targets are the actions.
+    """The way from actions to targets of a space and back, row by row. robot: whose hand moves, of `ee_delta` alone.
 
-    All are (N, n) and of the dtype of the first.
+    Raises `UnknownName` for a space or robot, `UsageError` for an arm that has fewer joints than a pose has numbers.
     """
 
     space: str = JOINT_TARGET
-
-    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return the targets of joint targets and openings (N, n), measured from joint states (N, n)."""
-        return actions
-
-    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return joint targets [rad] and openings [m] (N, n) of targets (N, n)."""
-        return targets
-
-
-@dataclass(frozen=True)
-class JointDelta(Conversion):
-    """Joint targets minus measured joints [rad], and the opening [m]."""
-
-    space: str = JOINT_DELTA
-
-    @override
-    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return the arm's part of actions (N, n) less the measured joints."""
-        targets = actions.copy()
-        targets[:, ARM] -= states[:, ARM]
-        return targets
-
-    @override
-    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return the arm's part of targets (N, n) plus the measured joints."""
-        actions = targets.copy()
-        actions[:, ARM] += states[:, ARM]
-        return actions
-
-
-@dataclass(frozen=True)
-class HandDelta(Conversion):
-    """Motion of `ee` [m, rad] that a joint target means, and the gripper as it is; robot: a name in `ROBOTS`."""
-
-    space: str = EE_DELTA
     robot: str = ""
 
-    @override
+    def __post_init__(self) -> None:
+        if self.space not in ACTION_SPACES:
+            raise UnknownName("action space", self.space, ACTION_SPACES)
+        if self.space != EE_DELTA:
+            return
+        if self.robot not in ROBOTS:  # no path either: the name may be a downloaded checkpoint's
+            hint = f"{EE_DELTA} needs its kinematics; known: {', '.join(ROBOTS)}"
+            raise UnknownName("robot", self.robot, ROBOTS, hint)
+        if (joints := len(self._robot.joints)) < _POSE:
+            raise UsageError(
+                f"{EE_DELTA} has {_POSE} numbers, and the arm of {self.robot} {joints} joints; use {JOINT_DELTA}"
+            )
+
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return motions of the hand (N, n) of actions (N, n), by forward kinematics."""
-        ik, targets = _arm_ik(self.robot), np.zeros_like(actions)
+        """Return targets (N, n) of joint targets and openings (N, n), measured from joint states (N, n)."""
+        if self.space == JOINT_TARGET:
+            return actions
+        targets = actions.copy()
+        if self.space == JOINT_DELTA:
+            targets[:, ARM] -= states[:, ARM]
+            return targets
+        targets[:, ARM], ik = 0, _arm_ik(self.robot)
         for target, action, state in zip(targets, actions, states, strict=True):
             position, rotation = ik.ee_pose(self._to_radians(state[ARM]))
             wanted, turned = ik.ee_pose(self._to_radians(action[ARM]))
             target[_POSITION], target[_ROTATION] = wanted - position, rotation_vector(turned @ rotation.T)
-            target[GRIPPER] = action[GRIPPER]
         return targets
 
-    @override
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return actions (N, n) whose joints bring the hand to where targets (N, n) say, by inverse kinematics."""
-        actions, motions = targets.copy(), targets[:, :_POSE].astype(np.float64)
+        """Return joint targets [rad] and openings [m] (N, n) of targets (N, n), measured from joint states (N, n)."""
+        if self.space == JOINT_TARGET:
+            return targets
+        actions = targets.copy()
+        if self.space == JOINT_DELTA:
+            actions[:, ARM] += states[:, ARM]
+            return actions
+        motions = targets[:, :_POSE].astype(np.float64)
         joints = _arm_ik(self.robot).moved(self._to_radians(states[:, ARM]), motions)
-        actions[:, ARM] = np.degrees(joints) if self._in_degrees else joints
+        actions[:, ARM] = np.degrees(joints) if self._robot.lerobot is not None else joints
         return actions
-
-    @property
-    def _in_degrees(self) -> bool:
-        from manip_il.robots.table import get_robot
-
-        return get_robot(self.robot).lerobot is not None
 
     def _to_radians(self, joints: NDArray[Any]) -> NDArray[np.float64]:
         """Joints (..., n - 1) [rad] in double precision of an action's or a state's."""
-        return np.radians(joints, dtype=np.float64) if self._in_degrees else np.asarray(joints, np.float64)
+        in_degrees = self._robot.lerobot is not None
+        return np.radians(joints, dtype=np.float64) if in_degrees else np.asarray(joints, np.float64)
 
+    @property
+    def _robot(self) -> Robot:
+        from manip_il.robots.table import get_robot
 
-def conversion(space: str, robot: str) -> Conversion:
-    """Return the conversion of a space for a robot, which `ee_delta` alone needs.
-
-    Raises `UnknownName` for a space or robot, `UsageError` for an arm that has fewer joints than a pose has numbers.
-    """
-    if space not in ACTION_SPACES:
-        raise UnknownName("action space", space, ACTION_SPACES)
-    if space != EE_DELTA:
-        return Conversion() if space == JOINT_TARGET else JointDelta()
-    if robot not in ROBOTS:  # no path either: the name may be a downloaded checkpoint's
-        raise UnknownName("robot", robot, ROBOTS, f"{EE_DELTA} needs its kinematics; known: {', '.join(ROBOTS)}")
-    from manip_il.robots.table import get_robot
-
-    if (joints := len(get_robot(robot).joints)) < _POSE:
-        raise UsageError(f"{EE_DELTA} has {_POSE} numbers, and the arm of {robot} {joints} joints; use {JOINT_DELTA}")
-    return HandDelta(robot=robot)
+        return get_robot(self.robot)
 
 
 def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
     """Return the conversion of a space for data of `spec`.
 
     Raises `MismatchError` naming both sides if the data's actions are not joint targets of a robot that is known
-    here with these joints, if that matters, and what `conversion` raises.
+    here with these joints, if that matters, and what `Conversion` raises.
     """
-    found = conversion(space, spec.robot)
+    found = Conversion(space, spec.robot if space == EE_DELTA else "")
     if space != JOINT_TARGET and spec.action_meaning not in JOINT_TARGETS:
         needed = " or ".join(JOINT_TARGETS)
         raise MismatchError("meaning of the action", "the dataset", spec.action_meaning, space, needed)
-    if isinstance(found, HandDelta):
-        from manip_il.robots.table import get_robot
-
-        if (names := get_robot(spec.robot).joint_names) != spec.joint_names:
-            raise MismatchError("joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names)
+    if space == EE_DELTA and (names := found._robot.joint_names) != spec.joint_names:
+        raise MismatchError("joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names)
     return found
 
 

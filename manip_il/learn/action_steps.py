@@ -22,9 +22,9 @@ from lerobot.processor import (
 
 from manip_il.data.schema import STATE
 from manip_il.errors import ManipError
-from manip_il.learn.action_spaces import Conversion, HandDelta, conversion
+from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import DECODER, MEASURED
-from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
+from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET, OWN_SPACE
 
 Pipeline = PolicyProcessorPipeline[Any, Any]
 _NORMALISER = "normalizer_processor"
@@ -74,7 +74,7 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
                 f"output of one step and its observation, (B, n) both, not {given}"
             )
         rows = targets.detach().to("cpu", torch.float32).numpy()
-        actions = conversion(self.action_space, self.robot).decode(rows, states.to("cpu", torch.float32).numpy())
+        actions = Conversion(self.action_space, self.robot).decode(rows, states.to("cpu", torch.float32).numpy())
         return cast(EnvTransition, {**transition, TransitionKey.ACTION: torch.from_numpy(actions).to(targets)})
 
     def get_config(self) -> dict[str, Any]:
@@ -84,20 +84,14 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
 
 def is_in_processors(kind: str, found: Conversion) -> bool:
     """Return whether the processors of a policy type carry a conversion, rather than nothing or its network."""
-    return found.space != JOINT_TARGET and (kind not in OWN_SPACE or isinstance(found, HandDelta))
+    return found.space == EE_DELTA or (found.space == JOINT_DELTA and kind not in OWN_SPACE)
 
 
 def add_steps(before: Pipeline, after: Pipeline, found: Conversion) -> None:
-    """Add the steps of a conversion to a policy's pre- and postprocessor."""
-    measured = MeasuredJointsStep()
+    """Add the steps of a conversion to a policy's pre- and postprocessor, which will see converted actions alone."""
+    measured = MeasuredJointsStep(converted=True)
     names = [getattr(step, "_registry_name", "") for step in before.steps]
     place = names.index(_NORMALISER) if _NORMALISER in names else len(names)
     before.steps = [*before.steps[:place], measured, *before.steps[place:]]
-    robot = found.robot if isinstance(found, HandDelta) else ""
-    after.steps = [*after.steps, JointTargetsStep(relative_step=measured, action_space=found.space, robot=robot)]
-
-
-def expect_converted(before: Pipeline) -> None:
-    """Let a preprocessor take batches whose actions are in the policy's space already."""
-    for step in [step for step in before.steps if isinstance(step, MeasuredJointsStep)]:
-        cast(MeasuredJointsStep, step).converted = True
+    decoder = JointTargetsStep(relative_step=measured, action_space=found.space, robot=found.robot)
+    after.steps = [*after.steps, decoder]

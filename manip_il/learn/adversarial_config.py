@@ -5,11 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UsageError
 from manip_il.option import option
-
-REGULARISERS = ("gradient_penalty", "spectral_norm", "none")
-REWARDS = ("logit", "log_d", "minus_log_one_minus_d")
 
 
 @dataclass(frozen=True)
@@ -51,14 +48,13 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class DiscriminatorConfig:
-    """Options of a discriminator. Raises `UsageError` for a value out of range, `UnknownName` for a name."""
+    """Options of a discriminator. Raises `UsageError` for a value out of range."""
 
     width: int = option(128, "units in each of the two hidden layers")
     lr: float = option(1e-3, "learning rate")
     steps: int = option(10, "gradient steps an iteration")
     batch_size: int = option(256, "transitions of the expert in a step, and as many of the learner")
-    regulariser: str = option("gradient_penalty", ", ".join(REGULARISERS))
-    penalty: float = option(1.0, "weight of the gradient penalty")
+    penalty: float = option(1.0, "weight of the gradient penalty; 0: none")
 
     def __post_init__(self) -> None:
         for name in ("width", "steps", "batch_size"):
@@ -68,5 +64,3 @@ class DiscriminatorConfig:
             raise UsageError(f"discriminator.lr is {self.lr}; expected more than 0, less than 1")
         if not 0 <= self.penalty < math.inf:
             raise UsageError(f"discriminator.penalty is {self.penalty}; expected at least 0")
-        if self.regulariser not in REGULARISERS:
-            raise UnknownName("discriminator.regulariser", self.regulariser, REGULARISERS)

@@ -6,7 +6,7 @@ Ermon, Generative adversarial imitation learning, NeurIPS 2016). `AirlDiscrimina
     D = exp f / (exp f + pi(a | s)),    f(s, a, s') = g(s, a) + gamma h(s') - h(s)
 
 so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with adversarial inverse
-reinforcement learning, ICLR 2018, equations 4 and 7).
+reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log D - log(1 - D).
 """
 
 from __future__ import annotations
@@ -19,11 +19,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid
-from torch.nn.utils.parametrizations import spectral_norm
+from torch.nn.functional import binary_cross_entropy_with_logits
 
-from manip_il.errors import UnknownName, UsageError
-from manip_il.learn.adversarial_config import REWARDS, DiscriminatorConfig
+from manip_il.learn.adversarial_config import DiscriminatorConfig
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.transitions import F32, Transitions
 
@@ -58,17 +56,13 @@ class Discriminator(nn.Module, ABC):
     def logits(self, batch: Batch) -> Tensor:
         """Return log D - log(1 - D), (B,)."""
 
-    @abstractmethod
-    def rewards_of(self, logits: Tensor) -> Tensor:
-        """Return the learner's reward, (B,)."""
-
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
         """Return the reward of every transition, (N,), within +-10.
 
         log_probs: of its action for the learner, (N,), if the discriminator `asks_density`.
         """
         with torch.no_grad():
-            rewards = self.rewards_of(self.logits(self._encode(learner, log_probs)))
+            rewards = self.logits(self._encode(learner, log_probs))
         return rewards.clamp(-LARGEST_REWARD, LARGEST_REWARD).numpy().astype(np.float32)
 
     def fit(
@@ -90,7 +84,7 @@ class Discriminator(nn.Module, ABC):
         labels = torch.cat([torch.ones(len(expert[0])), torch.zeros(len(learner[0]))])
         loss = binary_cross_entropy_with_logits(logits, labels)
         total = loss
-        if self.config.regulariser == "gradient_penalty":
+        if self.config.penalty:
             total = loss + self.config.penalty * self._gradient_penalty(expert, learner, rng)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -110,18 +104,12 @@ class Discriminator(nn.Module, ABC):
 
     def perceptron(self, inputs: int) -> nn.Sequential:
         """Return two hidden layers and one number, (B, inputs) to (B, 1)."""
-        width, wrap = self.config.width, spectral_norm if self.config.regulariser == "spectral_norm" else _plain
+        width = self.config.width
         return nn.Sequential(
-            wrap(nn.Linear(inputs, width)),
-            nn.ReLU(),
-            wrap(nn.Linear(width, width)),
-            nn.ReLU(),
-            wrap(nn.Linear(width, 1)),
+            nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)
         )
 
     def _encode(self, rows: Transitions, log_probs: F32 | None) -> Batch:
-        if log_probs is None and self.asks_density:
-            raise UsageError(f"{type(self).__name__} needs the log-densities of actions; give log_probs")
         log_prob = torch.zeros(len(rows)) if log_probs is None else torch.from_numpy(log_probs)
         actions = torch.from_numpy(rows.actions) * self.free * (1.0 - torch.from_numpy(rows.states[:, -1:]))
         return self._state(rows.states), actions, self._state(rows.next_states), log_prob
@@ -133,13 +121,7 @@ class Discriminator(nn.Module, ABC):
 
 
 class GailDiscriminator(Discriminator):
-    """D(s, a). form: the reward, `logit` is log D - log(1 - D), `log_d` log D, the other -log(1 - D)."""
-
-    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, form: str = "logit") -> None:
-        if form not in REWARDS:
-            raise UnknownName("reward", form, REWARDS)
-        self._form = form
-        super().__init__(config, network)
+    """D(s, a)."""
 
     @override
     def build(self, e: int, n: int) -> None:
@@ -149,12 +131,6 @@ class GailDiscriminator(Discriminator):
     def logits(self, batch: Batch) -> Tensor:
         states, actions, _, _ = batch
         return self.d(torch.cat([states, actions], dim=1)).squeeze(1)
-
-    @override
-    def rewards_of(self, logits: Tensor) -> Tensor:
-        if self._form == "logit":
-            return logits
-        return logsigmoid(logits) if self._form == "log_d" else -logsigmoid(-logits)
 
 
 class AirlDiscriminator(Discriminator):
@@ -179,14 +155,6 @@ class AirlDiscriminator(Discriminator):
         states, actions, next_states, log_prob = batch
         g = self.g(torch.cat([states, actions], dim=1))
         return (g + self._gamma * self.h(next_states) - self.h(states)).squeeze(1) - log_prob
-
-    @override
-    def rewards_of(self, logits: Tensor) -> Tensor:
-        return logits
-
-
-def _plain(layer: nn.Linear) -> nn.Linear:
-    return layer
 
 
 def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:

@@ -1,4 +1,4 @@
-"""A policy in one file that runs without this package: ONNX, for onnxruntime, or TorchScript, for torch.
+"""A policy in one file that runs without this package: ONNX, for onnxruntime and others.
 
 Observations go in by LeRobot's names, raw; absolute actions come out. Everything between, units and clipping too, is
 in the file. What names, shapes and units mean is in its metadata.
@@ -10,11 +10,10 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, override
-from zipfile import ZipFile, ZipInfo
 
 import numpy as np
 import torch
@@ -30,7 +29,6 @@ from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 
-EXTRA_FILE = "manip_il.json"  # in a TorchScript file: its metadata
 TOLERANCE = 1e-5  # [rad] or [m], between the file's actions and the checkpoint's
 _OPSET = 17
 _ROWS = 64  # observations on which file and checkpoint are compared
@@ -38,7 +36,6 @@ _UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
 _UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
 
 Arrays = dict[str, NDArray[Any]]
-Run = Callable[[Arrays], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,7 @@ class Exported:
 
 
 class PolicyFunction(nn.Module):
-    """A policy as a function of one moment: observations by name in, absolute actions (B, n) out.
+    """A policy as a function of one moment: observations in the order of `inputs`, absolute actions (B, n) out.
 
     Joint state (B, n) and environment state (B, k) are float32, pictures uint8 (B, H, W, 3), as cameras give them.
     """
@@ -60,33 +57,18 @@ class PolicyFunction(nn.Module):
         super().__init__()
         self.numbers = [key for key in (STATE, ENVIRONMENT_STATE) if key in policy.checkpoint.numbers]
         self.cameras = sorted(IMAGES + camera for camera in policy.cameras)
+        self.inputs = [*self.numbers, *self.cameras]
         self.policy: Any = policy.module
         self.network: MLPNetwork = self.policy.model if self.cameras else self.policy
         self.requires_grad_(False).eval()
 
-    @property
-    def inputs(self) -> list[str]:
-        """The observations' names, in order."""
-        return [*self.numbers, *self.cameras]
-
-    @override
-    def forward(self, observation: dict[str, Tensor]) -> Tensor:
-        if not self.cameras:
-            return self.network.actions(torch.cat([observation[key] for key in self.numbers], dim=1))
-        pictures = {key: to_float(observation[key].permute(0, 3, 1, 2)) for key in self.cameras}
-        return self.network.actions(self.policy.network_inputs({**observation, **pictures}))
-
-
-class _InOrder(nn.Module):
-    """The same function of observations in the order of `PolicyFunction.inputs`, as ONNX wants it."""
-
-    def __init__(self, function: PolicyFunction) -> None:
-        super().__init__()
-        self.function = function
-
     @override
     def forward(self, *observations: Tensor) -> Tensor:
-        return self.function(dict(zip(self.function.inputs, observations, strict=True)))
+        batch = dict(zip(self.inputs, observations, strict=True))
+        if not self.cameras:
+            return self.network.actions(torch.cat(observations, dim=1))
+        pictures = {key: to_float(batch[key].permute(0, 3, 1, 2)) for key in self.cameras}
+        return self.network.actions(self.policy.network_inputs({**batch, **pictures}))
 
 
 def export_onnx(path: Path, policy_sha256: str) -> Exported:
@@ -97,14 +79,16 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
     import onnx
     import onnxruntime
 
-    policy, function, metadata = _load(path, policy_sha256)
-    example = _tensors(_observations(policy, function, rows=2))
+    policy = _load(path)
+    function = PolicyFunction(policy)
+    metadata = file_metadata(policy, function.inputs, policy_sha256)
+    example = _observations(policy, function, rows=2)
     content = io.BytesIO()
     with warnings.catch_warnings(action="ignore"):
         # The exporter that torch prefers needs two packages more, and gives the same graph.
         torch.onnx.export(
-            _InOrder(function),
-            tuple(example.values()),
+            function,
+            tuple(map(torch.from_numpy, example.values())),
             content,  # pyright: ignore[reportArgumentType]  # it takes what can be written to
             input_names=list(example),
             output_names=[ACTION],
@@ -119,42 +103,22 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
     onnx.checker.check_model(model, full_check=True)
     data = model.SerializeToString()
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    difference = _checked(path, policy, function, lambda observation: np.asarray(session.run(None, observation)[0]))
+    observation = _observations(policy, function, _ROWS)
+    difference = float(
+        np.abs(np.asarray(session.run(None, observation)[0]) - _actions(policy, function, observation)).max()
+    )
+    if not difference <= TOLERANCE:
+        raise ManipError(
+            f"{path}: the exported file's actions differ by up to {difference:.2g} from the checkpoint's; expected at "
+            f"most {TOLERANCE:g}, so nothing was written"
+        )
     return Exported(data, metadata, difference)
 
 
-def export_torchscript(path: Path, policy_sha256: str) -> Exported:
-    """Return the policy in a `pretrained_model` folder as TorchScript, a module of one dict of observations.
-
-    Raises what `export_onnx` raises.
-    """
-    policy, function, metadata = _load(path, policy_sha256)
-    content = io.BytesIO()
-    with warnings.catch_warnings(action="ignore"):  # torch has a younger format, to be read by the whole of torch alone
-        example = _tensors(_observations(policy, function, rows=2))
-        traced = torch.jit.trace(function, (example,), check_trace=False)
-        torch.jit.save(traced, content, _extra_files={EXTRA_FILE: json.dumps(metadata)})
-        data = _without_source_paths(content.getvalue())
-        loaded = torch.jit.load(io.BytesIO(data))
-    difference = _checked(path, policy, function, lambda observation: loaded(_tensors(observation)).numpy())
-    return Exported(data, metadata, difference)
-
-
-def _without_source_paths(archive: bytes) -> bytes:
-    """A TorchScript file without its debug records, which name this machine's files."""
-    content = io.BytesIO()
-    with ZipFile(io.BytesIO(archive)) as source, ZipFile(content, "w") as target:  # uncompressed, as torch wants it
-        for name in source.namelist():
-            if not name.endswith(".debug_pkl"):
-                target.writestr(ZipInfo(name), source.read(name))
-    return content.getvalue()
-
-
-def file_metadata(
-    policy: LearnedPolicy, config: Mapping[str, Any], inputs: Sequence[str], sha256: str
-) -> dict[str, Any]:
+def file_metadata(policy: LearnedPolicy, inputs: Sequence[str], sha256: str) -> dict[str, Any]:
     """Return a file's metadata: the policy, its robot and task, inputs and outputs; unknown entries are left out."""
     shared = ("robot", "robot"), ("task", "task"), ("control_rate_hz", "fps"), ("action_meaning", "action_meaning")
+    config = policy.checkpoint.config
     entries: dict[str, Any] = {
         **{key: getattr(policy.checkpoint.origin, name, None) for key, name in shared},
         "inputs": [_entry(policy, key) for key in inputs],
@@ -183,16 +147,15 @@ def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
     return {"name": key, "dtype": "float32", "shape": ["batch", size], **meanings}
 
 
-def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction, dict[str, Any]]:
+def _load(path: Path) -> LearnedPolicy:
+    """The policy of a folder; raises `ManipError` for one that no file can hold."""
     policy = LearnedPolicy.load(path)
-    config = policy.checkpoint.config
-    modes = config.get("normalization_mapping", {})
+    modes = policy.checkpoint.config.get("normalization_mapping", {})
     if any(mode != "IDENTITY" for mode in mapping(f"{path / CONFIG}: normalization_mapping", modes).values()):
         raise ManipError(f"{path / CONFIG}: normalization_mapping is {shorten(modes)}; expected IDENTITY for all")
     if policy.checkpoint.space == EE_DELTA:
         raise ManipError(f"{path} has learnt {EE_DELTA}, and a file holds no inverse kinematics; use {JOINT_DELTA}")
-    function = PolicyFunction(policy)
-    return policy, function, file_metadata(policy, config, function.inputs, policy_sha256)
+    return policy
 
 
 def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) -> Arrays:
@@ -209,20 +172,8 @@ def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) ->
     return dict(zip(function.numbers, parts, strict=True)) | pictures
 
 
-def _tensors(observation: Arrays) -> dict[str, Tensor]:
-    return {key: torch.from_numpy(values) for key, values in observation.items()}
-
-
-def _checked(path: Path, policy: LearnedPolicy, function: PolicyFunction, run: Run) -> float:
-    """The largest difference from the checkpoint's actions over random observations; `ManipError` if too large."""
-    observation = _observations(policy, function, _ROWS)
+def _actions(policy: LearnedPolicy, function: PolicyFunction, observation: Arrays) -> NDArray[np.float64]:
+    """What the checkpoint does, (B, n)."""
     images = {key.removeprefix(IMAGES): observation[key] for key in function.cameras}
-    states = observation[STATE]
-    around = observation.get(ENVIRONMENT_STATE, np.empty((_ROWS, 0), np.float32))
-    difference = float(np.abs(run(observation) - policy.act(states, around, images)).max())
-    if not difference <= TOLERANCE:
-        raise ManipError(
-            f"{path}: the exported file's actions differ by up to {difference:.2g} from the checkpoint's; expected at "
-            f"most {TOLERANCE:g}, so nothing was written"
-        )
-    return difference
+    around = observation.get(ENVIRONMENT_STATE, np.empty((len(observation[STATE]), 0), np.float32))
+    return policy.act(observation[STATE], around, images)

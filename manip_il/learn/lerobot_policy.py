@@ -19,8 +19,8 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError, UnknownName
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.action_steps import add_steps, expect_converted  # known here, they are known to what is loaded
-from manip_il.learn.checkpoint import CONFIG, PROCESSORS, Checkpoint
+from manip_il.learn.action_steps import add_steps  # known here, they are known to what is loaded
+from manip_il.learn.checkpoint import CONFIG, MEASURED, PROCESSORS, Checkpoint
 from manip_il.learn.lerobot_config import policy_class, policy_types
 from manip_il.learn.names import MLP
 from manip_il.learn.network import warm_start
@@ -90,15 +90,14 @@ def build_processors(
         before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
         if conversion is not None:
             add_steps(before, after, conversion)
-    else:
-        opened = Checkpoint.open(checkpoint)
-        opened.require_processors()
-        opened.require_trust(trust)
-        device = {_DEVICE_STEP: {"device": config.device}}
-        with readable_state(checkpoint):
-            before, after = make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=device)
-    expect_converted(before)
-    return before, after
+        return before, after
+    opened = Checkpoint.open(checkpoint)
+    opened.require_processors()
+    opened.require_trust(trust)
+    converted = {} if conversion is None else {MEASURED: {"converted": True}}
+    overrides = {_DEVICE_STEP: {"device": config.device}, **converted}
+    with readable_state(checkpoint):
+        return make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=overrides)
 
 
 def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

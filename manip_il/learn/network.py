@@ -7,8 +7,9 @@ importing LeRobot.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,6 +68,11 @@ class Shape:
         if not checks.number("clamp", self.clamp, 0.0) > 0:
             raise ManipError(f"clamp is {self.clamp}; expected more than 0")
         checks.number("sigma", self.sigma, 0.0)
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Shape:
+        """Return the shape in a policy's `config.json`; what an older one does not say is the default."""
+        return cls(**{one.name: config[one.name] for one in fields(cls) if one.name in config})
 
 
 Statistics = Mapping[str, Tensor]  # by the names of `MLPNetwork`'s buffers

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
-from manip_il.learn.action_spaces import conversion
+from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.losses import LIKELIHOODS
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
@@ -150,19 +149,18 @@ class _Perceptron:
     """The mlp: no memory, and one call for all rows, whose actions do not depend on each other."""
 
     def __init__(self, checkpoint: Checkpoint, device: str):
-        self._device, config = device, checkpoint.config
+        self._device = device
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in checkpoint.numbers]
         width = sum(checkpoint.numbers[key] for key in self._keys)
-        try:  # what an older one does not say is the default
-            shape = Shape(**{one.name: config[one.name] for one in fields(Shape) if one.name in config})
-            self.module = MLPNetwork(width, checkpoint.action, shape)
+        try:
+            self.module = MLPNetwork(width, checkpoint.action, Shape.of(checkpoint.config))
             self.module.load_state_dict(read_weights(checkpoint.path))
         except (TypeError, RuntimeError) as error:
             line = checks.one_line(error)
             raise ManipError(f"{checkpoint.path}: weights and {CONFIG} do not match: {line}") from error
         self.module.to(device).eval()
         space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # every other is the network's own
-        self._conversion = conversion(space, checkpoint.robot)
+        self._conversion = Conversion(space, checkpoint.robot)
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row (B, n).

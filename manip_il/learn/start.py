@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
@@ -14,9 +13,7 @@ from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for
 from manip_il.learn.action_steps import add_steps, is_in_processors
 from manip_il.learn.checkpoint import Checkpoint
-from manip_il.learn.fit_config import ActionSpace, FitConfig
-from manip_il.learn.lerobot_config import LeRobotFit
-from manip_il.learn.mlp import MLPPolicy
+from manip_il.learn.mlp import MLPConfig, MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
 from manip_il.learn.network import fit_statistics, read_weights
 from manip_il.learn.transitions import F32
@@ -53,10 +50,17 @@ def start_policy(
 
     A clone keeps its own units, and acts as it did.
     """
-    options = None if start is None else Checkpoint.open(start).mlp_options
-    settings = {**(options or {"type": MLP}), "loss": _GAUSSIAN}
-    fit = FitConfig(policy=settings, action_space=cast(ActionSpace, space), seed=seed)
-    policy = _new_policy(LeRobotFit(fit, spec.action_meaning), spec)
+    options = (None if start is None else Checkpoint.open(start).mlp_options) or {}
+    options |= {"loss": _GAUSSIAN, "action_space": space}
+    config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
+    n, k = len(spec.joint_names), len(spec.environment_state_names)
+    config.input_features = {STATE: PolicyFeature(type=FeatureType.STATE, shape=(n,))}
+    if k:
+        config.input_features[ENVIRONMENT_STATE] = PolicyFeature(type=FeatureType.ENV, shape=(k,))
+    config.output_features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n,))}
+    with torch.random.fork_rng(devices=[]):  # torch initialises layers from its global generator: lend it one
+        torch.manual_seed(seed)
+        policy = MLPPolicy(config)
     if start is not None:
         policy.model.load_state_dict({**policy.model.state_dict(), **read_weights(start)})
     elif rows is not None:
@@ -65,19 +69,6 @@ def start_policy(
     else:
         raise UsageError("no demonstrations and no policy to begin with; give --dataset.root=DIR or --init=RUN")
     return policy
-
-
-def _new_policy(lerobot: LeRobotFit, spec: RobotTaskSpec) -> MLPPolicy:
-    """An mlp for data of `spec`, with weights drawn from the fit's seed."""
-    n, k = len(spec.joint_names), len(spec.environment_state_names)
-    config = lerobot.policy
-    config.input_features = {STATE: PolicyFeature(type=FeatureType.STATE, shape=(n,))}
-    if k:
-        config.input_features[ENVIRONMENT_STATE] = PolicyFeature(type=FeatureType.ENV, shape=(k,))
-    config.output_features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n,))}
-    with torch.random.fork_rng(devices=[]):  # torch initialises layers from its global generator: lend it one
-        torch.manual_seed(lerobot.config.seed)
-        return MLPPolicy(config)  # pyright: ignore[reportArgumentType]
 
 
 def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:

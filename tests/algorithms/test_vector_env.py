@@ -9,12 +9,12 @@ from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.collect.environments import make_expert
 from manip_il.collect.rollout import Turn
 from manip_il.errors import MismatchError
-from manip_il.learn.action_spaces import conversion
+from manip_il.learn.action_spaces import Conversion
 from manip_il.sim.config import EnvConfig
 from manip_il.sim.env import ManipEnv
 
 ENV = EnvConfig("fetch", "reach")
-HAND = conversion("ee_delta", "fetch")
+HAND = Conversion("ee_delta", "fetch")
 
 
 def up(height: float) -> np.ndarray:

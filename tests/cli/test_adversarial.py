@@ -27,7 +27,11 @@ SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
         (f"--dataset.root={SAMPLE} --init=nowhere", "no policy in nowhere", 2),
         (f"--dataset.root={SAMPLE} --steps=0", "steps is 0; expected at least 1", 2),
         (f"--dataset.root={SAMPLE} --ppo.gamma=2", "ppo.gamma is 2.0; expected 0 to 1", 2),
-        (f"--dataset.root={SAMPLE} --discriminator.regulariser=l2", "unknown discriminator.regulariser 'l2'", 2),
+        (
+            f"--dataset.root={SAMPLE} --discriminator.penalty=-1",
+            "discriminator.penalty is -1.0; expected at least 0",
+            2,
+        ),
         (f"--dataset.root={SAMPLE} --seed=-1", "seed is -1", 2),
     ],
 )

@@ -16,9 +16,9 @@ from lerobot.policies.factory import make_policy, make_policy_config, make_pre_p
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.action_spaces import Conversion, conversion, conversion_for
+from manip_il.learn.action_spaces import Conversion, conversion_for
 from manip_il.learn.checkpoint import META_FILE
-from manip_il.learn.export import export_torchscript
+from manip_il.learn.export import export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.learn.policy import LearnedPolicy
@@ -86,8 +86,8 @@ def trainer_of(sources: Sources, folder: Path, settings: Any, space: str | None,
 @pytest.mark.parametrize("space", [JOINT_TARGET, JOINT_DELTA])
 def test_joint_spaces_lose_nothing(robot, space):
     actions, states = moves(robot, 20)
-    there = conversion(space, robot).encode(actions, states)
-    np.testing.assert_allclose(conversion(space, robot).decode(there, states), actions, rtol=0, atol=1e-15)
+    there = Conversion(space, robot).encode(actions, states)
+    np.testing.assert_allclose(Conversion(space, robot).decode(there, states), actions, rtol=0, atol=1e-15)
     measured = states[:, :-1] if space == JOINT_DELTA else 0.0
     np.testing.assert_array_equal(there[:, :-1], actions[:, :-1] - measured)
     np.testing.assert_array_equal(there[:, -1], actions[:, -1])
@@ -96,7 +96,7 @@ def test_joint_spaces_lose_nothing(robot, space):
 @every_large_robot
 def test_a_hand_motion_reaches_the_hands_pose_again_but_not_the_joints(robot):
     actions, states = moves(robot, 20)
-    hand = conversion(EE_DELTA, robot)
+    hand = Conversion(EE_DELTA, robot)
     there = hand.encode(actions, states)
     back = hand.decode(there, states)
     np.testing.assert_allclose(poses(robot, back), poses(robot, actions), rtol=0, atol=1e-8)
@@ -109,7 +109,7 @@ def test_a_hand_motion_reaches_the_hands_pose_again_but_not_the_joints(robot):
 @every_large_robot
 def test_a_hand_motion_is_in_the_worlds_axes_and_a_far_one_is_approached(robot):
     _, states = moves(robot, 1)
-    hand, targets = conversion(EE_DELTA, robot), np.zeros((1, states.shape[1]))
+    hand, targets = Conversion(EE_DELTA, robot), np.zeros((1, states.shape[1]))
     targets[0, 1] = 0.01
     moved = poses(robot, hand.decode(targets, states)) - poses(robot, states)
     np.testing.assert_allclose(moved[0], [0, 0.01, *[0] * 10], atol=1e-8)
@@ -142,7 +142,7 @@ def test_lerobots_own_code_carries_each_space(table, sources, tmp_path, space, s
     before(
         {STATE: states, "observation.environment_state": torch.from_numpy(table["observation.environment_state"][:5])}
     )
-    found = conversion(space, "panda")
+    found = Conversion(space, "panda")
     learnt = found.encode(table[ACTION], table[STATE])
     middle = after(torch.zeros(5, 8)).numpy()  # of the normalised targets, of whatever kind
     centre = learnt.mean(0) if settings is ACT else (learnt.max(0) + learnt.min(0)) / 2
@@ -154,7 +154,7 @@ def test_lerobots_own_code_carries_each_space(table, sources, tmp_path, space, s
 @pytest.mark.parametrize("space", [JOINT_DELTA, EE_DELTA])
 def test_every_action_of_a_plan_is_measured_from_its_own_frame(table, sources, tmp_path, space):
     trainer = trainer_of(sources, tmp_path / "run", ACT, space)
-    targets = conversion(space, "panda").encode(table[ACTION], table[STATE])
+    targets = Conversion(space, "panda").encode(table[ACTION], table[STATE])
     batch = trainer.data.samples.batch(np.array([3, 10]))
     np.testing.assert_array_equal(batch[ACTION][0], targets[3:7])
     np.testing.assert_array_equal(batch[ACTION][1], targets[[10, 11, 11, 11]])  # the episode ends
@@ -184,7 +184,7 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
     with pytest.raises(MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"):
         trainer_of(sources, tmp_path / "other", {"path": str(path)}, JOINT_DELTA)
     with pytest.raises(ManipError, match="holds no inverse kinematics; use joint_delta"):
-        export_torchscript(path, "")
+        export_onnx(path, "")
     meta = path / META_FILE
     meta.write_text(json.dumps(json.loads(meta.read_text()) | {"action_space": JOINT_TARGET}))
     with pytest.raises(MismatchError, match=r"manip_il\.json has joint_target, config\.json has ee_delta"):
@@ -231,7 +231,7 @@ def test_a_hand_moves_alike_whatever_units_its_joints_have(monkeypatch: pytest.M
     panda = get_robot("panda")
     names = tuple(f"{name}.pos" for name in panda.joint_names)
     actions, states = moves("panda", 5)
-    plain = conversion(EE_DELTA, "panda")
+    plain = Conversion(EE_DELTA, "panda")
     wanted = plain.encode(actions, states)
     in_degrees = np.array([180 / np.pi] * len(panda.joints) + [1.0])
     with monkeypatch.context() as patch:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
 
 import numpy as np
 import onnx
@@ -24,7 +22,7 @@ from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
 from manip_il.errors import ManipError
 from manip_il.learn import export
 from manip_il.learn.checkpoint import Origin
-from manip_il.learn.export import EXTRA_FILE, TOLERANCE, Exported, export_onnx, export_torchscript
+from manip_il.learn.export import TOLERANCE, export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
@@ -35,7 +33,6 @@ from .tiny_policies import edit_config, write_checkpoint
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 SIDES = (48, 64)  # height and width of pictures
-WRITERS = {"onnx": export_onnx, "torchscript": export_torchscript}
 Observation = dict[str, NDArray[Any]]
 
 
@@ -88,24 +85,16 @@ def lerobot_actions(checkpoint: Path, observation: Observation) -> NDArray[np.fl
         return after(policy.select_action(before(batch))).numpy()
 
 
-def run(kind: str, exported: Exported, observation: Observation) -> NDArray[np.float32]:
-    """The file's actions, its own inputs taken from an observation."""
-    taken = {one["name"]: observation[one["name"]] for one in exported.metadata["inputs"]}
-    if kind == "onnx":
-        return np.asarray(onnxruntime.InferenceSession(exported.data).run(["action"], taken)[0])
-    module = torch.jit.load(io.BytesIO(exported.data))
-    return module({key: torch.from_numpy(values) for key, values in taken.items()}).numpy()
-
-
 def check_equal(checkpoint: Path, observations: list[Observation]) -> None:
-    for kind, write in WRITERS.items():
-        exported = write(checkpoint, "")
-        for observation in observations:
-            expected = lerobot_actions(checkpoint, observation)
-            actions = run(kind, exported, observation)
-            assert actions.dtype == np.float32
-            assert actions.shape == expected.shape
-            assert np.abs(actions - expected).max() <= TOLERANCE
+    exported = export_onnx(checkpoint, "")
+    session = onnxruntime.InferenceSession(exported.data)
+    for observation in observations:
+        expected = lerobot_actions(checkpoint, observation)
+        taken = {one["name"]: observation[one["name"]] for one in exported.metadata["inputs"]}
+        actions = np.asarray(session.run(["action"], taken)[0])
+        assert actions.dtype == np.float32
+        assert actions.shape == expected.shape
+        assert np.abs(actions - expected).max() <= TOLERANCE
 
 
 def test_an_mlp_acts_as_its_checkpoint_on_real_and_random_observations(mlp):
@@ -122,24 +111,18 @@ def test_a_cnn_acts_as_its_checkpoint_whatever_the_number_of_pictures(observatio
     check_equal(checkpoint, [drawn(spec, 1, pictures=True), drawn(spec, 21, pictures=True)])
 
 
-def metadata_in(kind: str, data: bytes) -> dict[str, Any]:
-    if kind == "onnx":
-        told = {one.key: one.value for one in onnx.load_model_from_string(data).metadata_props}
-        told |= {key: json.loads(told[key]) for key in ("inputs", "outputs", "control_rate_hz")}
-        session = onnxruntime.InferenceSession(data)
-        for declared, of in ((session.get_inputs(), "inputs"), (session.get_outputs(), "outputs")):
-            assert [(one.name, one.shape) for one in declared] == [(one["name"], one["shape"]) for one in told[of]]
-        return told
-    files = {EXTRA_FILE: ""}
-    torch.jit.load(io.BytesIO(data), _extra_files=files)
-    return json.loads(files[EXTRA_FILE])
+def metadata_in(data: bytes) -> dict[str, Any]:
+    told = {one.key: one.value for one in onnx.load_model_from_string(data).metadata_props}
+    told |= {key: json.loads(told[key]) for key in ("inputs", "outputs", "control_rate_hz")}
+    session = onnxruntime.InferenceSession(data)
+    for declared, of in ((session.get_inputs(), "inputs"), (session.get_outputs(), "outputs")):
+        assert [(one.name, one.shape) for one in declared] == [(one["name"], one["shape"]) for one in told[of]]
+    return told
 
 
-@pytest.mark.parametrize("kind", WRITERS)
-def test_the_metadata_name_every_number_with_its_unit(kind, tmp_path):
+def test_the_metadata_name_every_number_with_its_unit(tmp_path):
     spec, _ = sample()
-    checkpoint = write_cnn(tmp_path / "cnn", spec, "both")
-    told = metadata_in(kind, WRITERS[kind](checkpoint, "abc").data)
+    told = metadata_in(export_onnx(write_cnn(tmp_path / "cnn", spec, "both"), "abc").data)
     assert {key: value for key, value in told.items() if key not in ("inputs", "outputs")} == {
         "robot": "panda",
         "task": "pick_place",
@@ -163,25 +146,21 @@ def test_the_metadata_name_every_number_with_its_unit(kind, tmp_path):
     ]
 
 
-def test_a_checkpoint_of_another_tool_gives_what_it_knows_and_no_file_of_this_machine(spec, tmp_path):
-    exported = export_torchscript(write_checkpoint(tmp_path / "mlp", "mlp", spec), "")
+def test_a_checkpoint_of_another_tool_gives_what_it_knows(spec, tmp_path):
+    exported = export_onnx(write_checkpoint(tmp_path / "mlp", "mlp", spec), "")
     assert "robot" not in exported.metadata
     assert "names" not in exported.metadata["inputs"][0]
     assert exported.metadata["inputs"][0]["shape"] == ["batch", 4]
-    with ZipFile(io.BytesIO(exported.data)) as archive:
-        for name in archive.namelist():
-            assert str(Path(export.__file__).parent).encode() not in archive.read(name), name
 
 
 def test_normalisation_outside_the_network_is_refused(spec, tmp_path):
     checkpoint = write_checkpoint(tmp_path / "mlp", "mlp", spec)
     edit_config(checkpoint, normalization_mapping={"STATE": "MEAN_STD", "ACTION": "IDENTITY"})
     with pytest.raises(ManipError, match=r"normalization_mapping is .*MEAN_STD.*; expected IDENTITY"):
-        export_torchscript(checkpoint, "")
+        export_onnx(checkpoint, "")
 
 
-@pytest.mark.parametrize("kind", WRITERS)
-def test_a_file_that_acts_otherwise_is_refused(kind, spec, tmp_path, monkeypatch):
+def test_a_file_that_acts_otherwise_is_refused(spec, tmp_path, monkeypatch):
     checkpoint = write_checkpoint(tmp_path / "mlp", "mlp", spec)
     other = write_checkpoint(tmp_path / "other", "mlp", spec)
     weights = load_file(other / "model.safetensors")
@@ -190,4 +169,4 @@ def test_a_file_that_acts_otherwise_is_refused(kind, spec, tmp_path, monkeypatch
     policy, make = LearnedPolicy.load(other), export.PolicyFunction
     monkeypatch.setattr(export, "PolicyFunction", lambda _: make(policy))
     with pytest.raises(ManipError, match=r"differ by up to 2e-05 from the checkpoint's; expected at most 1e-05"):
-        WRITERS[kind](checkpoint, "")
+        export_onnx(checkpoint, "")
