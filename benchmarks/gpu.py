@@ -105,7 +105,7 @@ def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
     policy = make_policy(config, ds_meta=meta).train()
     before, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
     optimizer: Any = ours.lerobot.optimizer().build(policy.get_optim_params())
-    accelerator = Accelerator(mixed_precision="fp16" if config.use_amp else "no")
+    accelerator = Accelerator(mixed_precision=ours.accelerator.mixed_precision)
     policy, optimizer = accelerator.prepare(policy, optimizer)
     while True:
         for batch in loader:

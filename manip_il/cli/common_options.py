@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, given
 from manip_il.errors import UsageError
+from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
@@ -41,10 +41,6 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
     Raises `UnknownName` for a robot or task, `UsageError` for another value.
     """
     from manip_il.data.dataset import UNKNOWN_TASK
-    from manip_il.robots.table import get_robot
-    from manip_il.sim.scene import build_scene
-    from manip_il.tasks.reward import Reward
-    from manip_il.tasks.table import get_task
 
     values = {name: value for name, value in env.items() if value is not None}
     if origin is not None:
@@ -53,18 +49,10 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
         values = of_policy | values
         if values.get("task") == origin.task:
             values.setdefault("object", origin.object)
-    robot, task = values.get("robot", EnvConfig.robot), values.get("task", EnvConfig.task)
-    if robot != stock.ROBOT:
-        if task in stock.STOCK:
-            raise UsageError(f"--task.type={task} is with --robot.type={robot}; expected {stock.ROBOT}")
-        get_robot(robot)
-        get_task(task)
-    if values.get("reward"):  # as its numbers: a file that it came from may change
-        values["reward"] = Reward.parse(values["reward"]).numbers
-    config = EnvConfig(**values)
-    if config.object:
-        build_scene(robot, task, config.object)  # which finds an object that is too wide
-    return config
+    robot, task = values.get("robot", EnvConfig.robot), values.get("task")
+    if robot != stock.ROBOT and task in stock.STOCK:
+        raise UsageError(f"--task.type={task} is with --robot.type={robot}; expected {stock.ROBOT}")
+    return EnvConfig(**values)
 
 
 def camera_config(
@@ -133,25 +121,13 @@ def suite_option() -> Any:
 
 def policy_option() -> Any:
     """Return the field of a policy's path."""
-    return option(None, "a checkpoint or a run", check=_require_policy)
+    return option(None, "a checkpoint or a run", check=find_policy)
 
 
 def _require_suite(suite: str) -> None:
     from manip_il.evaluation.suites import require_suite  # here, as help needs no numpy
 
     require_suite(suite)
-
-
-def _require_policy(path: Path) -> None:
-    from manip_il.evaluation.policy_folder import find_policy
-
-    find_policy(path)
-
-
-def require_pictures(env: Given, cameras: Iterable[str]) -> None:
-    """Raise `UsageError` for cameras of a robot whose environments have none."""
-    if (names := [*cameras]) and env.get("robot") == stock.ROBOT:
-        raise UsageError(f"--cameras is {','.join(names)}; {stock.ROBOT} has no cameras here, leave it out")
 
 
 def own_robot(robot: str, suffix: str = "") -> str:

@@ -47,8 +47,8 @@ class CompareOptions:
 
     One YAML in place of two sides is a study: every arm is run with several training seeds, all are tested on the same
     unseen seeds, and compared. It holds `common` and `arms` (options of manip-il dagger), training_seeds, eval,
-    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json, table.md and
-    report.html the results.
+    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json and report.html the
+    results.
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
@@ -150,7 +150,7 @@ class CompareOptions:
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
         trial = Trial.of(common_env(members, self._policy_env), seeds, self.suite, policies.values(), self.trust)
-        check_policies(policies, trial, self.output.output_dir, self.engine.engine)
+        check_policies(policies, trial)
         return trial
 
     def _policy_env(self, policy: Path) -> EnvConfig:

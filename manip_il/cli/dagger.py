@@ -84,7 +84,6 @@ class DaggerOptions:
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        common.require_pictures(self.env, self.cameras)
         self.output.check()
         if self.dataset.root:
             check_weights(self.dataset.root, ())

@@ -7,20 +7,14 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from manip_il.cli.inputs import dataset_differences, require_folder
+from manip_il.cli.inputs import dataset_differences, exists
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError
-from manip_il.evaluation.policy_folder import hub_hint
 from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
-
-
-def _require_dataset_folder(root: Path) -> None:
-    """Raise `UsageError` unless there is such a folder; what it holds is for the check."""
-    require_folder(root, f"the folder of a LeRobot dataset{hub_hint(root, 'datasets/')}")
 
 
 @dataclass
@@ -31,7 +25,9 @@ class CheckOptions:
     """
 
     example: ClassVar[str] = "manip-il data check datasets/demos"
-    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True, check=_require_dataset_folder)
+    dataset: Path = option(
+        MISSING, "folder of a LeRobot v3.0 dataset", positional=True, check=exists("the folder of a LeRobot dataset")
+    )
 
     def run(self) -> None:
         """Examine, and say the verdict; raises `NotWhole` after errors."""
@@ -47,7 +43,9 @@ class RepairOptions:
     """
 
     example: ClassVar[str] = "manip-il data repair datasets/demos"
-    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True, check=_require_dataset_folder)
+    dataset: Path = option(
+        MISSING, "folder of a LeRobot v3.0 dataset", positional=True, check=exists("the folder of a LeRobot dataset")
+    )
 
     def run(self) -> None:
         """Examine, repair, examine again, and say the verdict; raises `NotWhole` if something stays wrong."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import require_dataset, require_folder
+from manip_il.cli.inputs import exists, require_dataset
 from manip_il.cli.options import Given
 from manip_il.cli.outputs import check_output, prepare_output
 from manip_il.cli.progress import Progress, say, warn
@@ -21,10 +21,6 @@ if TYPE_CHECKING:
     from manip_il.sim.config import CameraConfig
 
 _RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
-
-
-def _require_journals(path: Path) -> None:
-    require_folder(path, "one of episode-*.mcap files")
 
 
 def _require_target(source: Path, target: Path, *, overwrite: bool) -> None:
@@ -44,7 +40,9 @@ class BuildOptions:
     """
 
     example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
-    journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True, check=_require_journals)
+    journals: Path = option(
+        MISSING, "folder of episode-*.mcap files", positional=True, check=exists("a folder of episode-*.mcap files")
+    )
     dataset: Path = option(MISSING, "folder of the dataset", positional=True)
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded", check=require_repo_id)
     overwrite: bool = option(False, "replace an existing dataset")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from manip_il.cli.inputs import open_driver
 from manip_il.cli.progress import say, warn
@@ -34,7 +34,7 @@ def replay(file: Path, seed: int, policy: Path | None, video: Path | None, *, tr
         raise UsageError(f"--replay is {seed}; {file} has the seeds {min(by_seed)} to {max(by_seed)}")
     before, job = by_seed[seed], _job(result, file, policy, trust)
     episode = run_states(job, seed)
-    say(_text(before))
+    say(*_lines(before))
     if video is not None:
         write_file(video, Shot.of(job, episode).film().mp4)
         say(f"video: {video}")
@@ -61,8 +61,8 @@ def _job(result: EvalResult, file: Path, policy: Path | None, trust: bool) -> Ro
     settings = result.settings
     env = settings.env(result.robot, result.task)
     is_policy = result.policy not in NO_FILES or bool(result.policy_sha256) or policy is not None
-    path = _find(result, file, policy) if is_policy else None
-    _, driver, cameras = open_driver(path, result.policy, env, trust=trust, quiet=True)
+    path = find_policy(policy or Path(result.policy)) if is_policy else None
+    _, driver, cameras = open_driver(path, result.policy, env, trust=trust)
     if path is not None and result.policy_sha256 not in ("", policy_sha256(path)):
         warn(f"{path} is not the policy of {file}: its files differ")
     here = env_fingerprint(env, cameras)
@@ -70,30 +70,11 @@ def _job(result: EvalResult, file: Path, policy: Path | None, trust: bool) -> Ro
     return RolloutJob(env, driver, settings.hold, label="last", conditions=settings.conditions)
 
 
-def _find(result: EvalResult, file: Path, policy: Path | None) -> Path:
-    try:
-        return find_policy(policy or Path(result.policy))
-    except UsageError:
-        if policy is not None:
-            raise
-        raise UsageError(
-            f"{file} is of {result.policy}, which is not here (paths are relative to where eval ran); "
-            "give --policy.path=DIR"
-        ) from None
-
-
-def _text(result: EpisodeResult) -> str:
+def _lines(result: EpisodeResult) -> list[str]:
     """Seed, condition and outcome, and a line for each number that was drawn."""
-    first = result.detail.get("steps_to_success")
-    solved = f"success after {first} steps" if first is not None else "success" if result.success else "failure"
+    outcome = "success" if result.success else "failure"
+    if result.detail.get("steps_to_success") is not None:
+        outcome += f" after {result.detail['steps_to_success']} steps"
     ended = "at the goal at the end" if result.success_at_end else f"ended in phase {result.phase_at_end}"
-    lines = [f"seed {result.seed}, {result.detail.get('condition', 'nominal')}: {solved}, {ended}"]
-    return "\n".join(lines + [f"  {name}: {_short(value)}" for name, value in result.detail.get("drawn", {}).items()])
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_short, value))
-    if isinstance(value, dict):
-        return "; ".join(f"{name} {_short(one)}" for name, one in value.items())
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    first = f"seed {result.seed}, {result.detail.get('condition', 'nominal')}: {outcome}, {ended}"
+    return [first, *(f"  {name}: {json.dumps(value)}" for name, value in result.detail.get("drawn", {}).items())]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean, pstdev
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import check_space, open_driver, require_eval
+from manip_il.cli.inputs import open_driver, require_eval
 from manip_il.cli.options import Given, command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
@@ -20,7 +20,6 @@ from manip_il.stock.table import ROBOT
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.collect.workers import Engine
     from manip_il.evaluation.report import Film
     from manip_il.evaluation.results import EvalResult
 
@@ -34,6 +33,7 @@ class MeasuredPolicyGroup:
 
     path: Path | None = common.policy_option()
     type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
+    device: str = option("cpu", "where the checkpoint acts: cpu or cuda")
 
 
 @dataclass
@@ -82,9 +82,6 @@ class EvalOptions:
         list, "evaluations that are there: one, with --replay, or several to merge", positional=True, check=require_eval
     )
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
-    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option(
-        None, "refuse a policy that learnt in another; by default what its checkpoint says", free=True
-    )
     env: Given = common.env_given(of_policy=True)
     eval: EvalGroup = field(default_factory=EvalGroup)
     suite: str = common.suite_option()
@@ -98,38 +95,18 @@ class EvalOptions:
     health: bool = option(False, "check that this machine can evaluate and render", flag="check", free=True)
 
     def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        if self.health:
+        """Refuse what does not go together."""
+        if self.health or self.replay is not None:
+            if self.replay is not None and len(self.evaluation) != 1:
+                raise UsageError("--replay is for an episode of one evaluation; give its EVALUATION first")
             return
-        if self.evaluation:
-            self._check_files()
-            return
-        if self.replay is not None or self.video is not None:
-            raise UsageError("--replay and --video are for an episode that was evaluated; give its EVALUATION first")
-        if (self.policy.path is None) == (self.policy.type is None):
+        if self.evaluation and (len(self.evaluation) < 2 or len({*self.evaluation}) < len(self.evaluation)):
+            raise UsageError("expected two or more different evaluations to merge, or one and --replay=SEED")
+        if not self.evaluation and (self.policy.path is None) == (self.policy.type is None):
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
-        if self.policy.type is not None and self.action_space not in (None, "joint_target"):
-            raise UsageError(f"--action_space={self.action_space} is for a checkpoint, not for {self.policy.type}")
         if self.until_width is not None and not 0 < self.until_width < 1:
             raise UsageError(f"--until_width is {self.until_width}; expected between 0 and 1: 0.02 for 2 points")
-        self._seeds()
-        if self.policy.path is not None:
-            check_space(self.policy.path, self.action_space)
         self.output.check()
-        common.env_config(self.env)
-
-    def _check_files(self) -> None:
-        for path in self.evaluation:
-            if self.evaluation.count(path) > 1:
-                raise UsageError(f"{path} is given twice; expected every evaluation once")
-        if self.replay is not None and len(self.evaluation) > 1:
-            raise UsageError(f"--replay is for one evaluation, not for {len(self.evaluation)}")
-        if self.replay is None:
-            if len(self.evaluation) < 2:
-                raise UsageError(
-                    f"{self.evaluation[0]} is the only one; expected two or more evaluations to merge, or --replay=SEED"
-                )
-            self.output.check()
 
     def run(self) -> None:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
@@ -150,10 +127,15 @@ class EvalOptions:
     def _evaluate(self) -> None:
         from manip_il.evaluation.film import film_outcomes
         from manip_il.evaluation.runner import EpisodeJournal, evaluate
+        from manip_il.seeding import stream_seeds
 
-        seeds, name = self._seeds(), str(self.policy.type or self.policy.path)
-        engine = self.engine.open()
-        job = self._job(engine, len(seeds))
+        most = EPISODES if self.until_width is None else MOST_EPISODES
+        end = self.eval.first + (self.eval.n_episodes or most)
+        seeds = stream_seeds(self.eval.stream, end, self.seed)[self.eval.first :]
+        name, engine = str(self.policy.type or self.policy.path), self.engine.open()
+        if len(seeds) > 1:
+            engine.warm_up(learned=self.policy.path is not None)  # while the policy is checked here
+        job = self._job()
         with self.output.open(self) as folder:
             journal = EpisodeJournal.open(folder, job, self.suite)
             with Stages(f"finished episodes, in {folder}") as stages, engine:
@@ -165,7 +147,20 @@ class EvalOptions:
                 self._keep(result, folder)
                 films = film_outcomes(engine, job, result, self.eval.films, folder / FILMS, stages)
             self._report(result, folder, *films)
-        say(f"next: {self._next(result)}")
+        failed = [episode.seed for episode in result.episodes if not episode.success]
+        seed = (failed or [result.episodes[0].seed])[0]
+        say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed} --video=replay.mp4")
+
+    def _job(self) -> RolloutJob:
+        from manip_il.collect.job import RolloutJob
+        from manip_il.evaluation.runner import episode_hold
+        from manip_il.evaluation.suites import suite_conditions
+
+        kind, device = self.policy.type or "expert", self.policy.device
+        env, driver, cameras = open_driver(self.policy.path, kind, self.env, trust=self.trust, device=device)
+        conditions = suite_conditions(self.suite, env, sees=cameras is not None)
+        hold, batch = episode_hold(env, self.eval.hold), self.eval.batch_size
+        return RolloutJob(env, driver, hold, label="last", conditions=conditions, batch=batch)
 
     def _keep(self, result: EvalResult, folder: Path) -> None:
         """Write the result and print its tables."""
@@ -182,56 +177,15 @@ class EvalOptions:
             say(f"return: {mean(returns):.2f}, standard deviation {pstdev(returns):.2f}")
         if self.until_width is not None:
             low, high = result.success.interval
-            reached = high - low <= self.until_width
-            say(
-                f"stopped after {len(result.episodes):,} episodes: the interval is {100 * (high - low):.2f} points wide"
-                + ("" if reached else f", not {100 * self.until_width:g} yet; give more --eval.n_episodes")
-            )
+            width = f"the interval is {100 * (high - low):.2f} points wide"
+            say(f"stopped after {len(result.episodes):,} episodes: {width}")
 
     def _report(
-        self,
-        result: EvalResult,
-        folder: Path,
-        films: Mapping[bool, Sequence[Film]] | None = None,
-        no_films: str = "",
+        self, result: EvalResult, folder: Path, films: Mapping[bool, Sequence[Film]] | None = None, no_films: str = ""
     ) -> None:
-        from manip_il.cli.dagger import run_curve
         from manip_il.evaluation.eval_report import eval_report
         from manip_il.evaluation.results import FILE_NAME
 
-        curve = run_curve(self.policy.path)
-        page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films, curve)
+        page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films)
         page.write(folder / REPORT_FILE)
-        say(f"result: {folder / FILE_NAME}")
-        say(f"report: {folder / REPORT_FILE}")
-
-    def _seeds(self) -> range:
-        from manip_il.seeding import stream_seeds
-
-        most = EPISODES if self.until_width is None else MOST_EPISODES
-        count = self.eval.n_episodes or most
-        return stream_seeds(self.eval.stream, self.eval.first + count, self.seed)[self.eval.first :]
-
-    def _job(self, engine: Engine, episodes: int) -> RolloutJob:
-        from manip_il.collect.job import RolloutJob
-        from manip_il.evaluation.suites import suite_conditions
-        from manip_il.evaluation.trial import episode_hold
-
-        if episodes > 1:
-            engine.warm_up(learned=self.policy.path is not None)  # while the policy is checked here
-        local = self.engine.engine == "local"
-        env, driver, cameras = open_driver(
-            self.policy.path, self.policy.type or "expert", self.env, draw=local, trust=self.trust
-        )
-        conditions = suite_conditions(self.suite, env, sees=cameras is not None)
-        job = RolloutJob(env, driver, episode_hold(env, self.eval.hold), label="last", conditions=conditions)
-        return replace(job, batch=self.eval.batch_size)
-
-    def _next(self, result: EvalResult) -> str:
-        failed = [episode.seed for episode in result.episodes if not episode.success]
-        folder = self.output.output_dir
-        if self.suite == "nominal" and not failed:
-            output = replace(self.output, output_dir=Path(f"{folder}_all"))
-            return command_line("eval", replace(self, suite="all", output=output))
-        seed = (failed or [result.episodes[0].seed])[0]
-        return shlex.join(["manip-il", "eval", str(folder), f"--replay={seed}", "--video=replay.mp4"])
+        say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

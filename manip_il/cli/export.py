@@ -30,7 +30,7 @@ class ExportOptions:
         MISSING,
         "a run, a checkpoint or a pretrained_model folder",
         positional=True,
-        check=lambda path: find_policy(path),
+        check=find_policy,
     )
     format: Literal["onnx"] = option("onnx", "for onnxruntime and others")
     output: Path = option(Path("policy.onnx"), "the file")

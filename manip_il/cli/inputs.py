@@ -1,15 +1,14 @@
-"""Datasets, policies and evaluations of a command; a wrong path is found by its files, before heavy imports."""
+"""Datasets, policies and evaluations that a command is given, checked against this program."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.common_options import env_config
 from manip_il.cli.options import Given, Open
-from manip_il.cli.progress import say, warn
+from manip_il.cli.progress import warn
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.policy_folder import find_policy, hub_hint
 
@@ -20,10 +19,20 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.evaluation.trial import Trial
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.learn.reward import LearnedReward
-    from manip_il.mdp import Observation
     from manip_il.sim.config import CameraConfig, EnvConfig
 
+REWARD = "a reward of manip-il reward fit"
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
+
+
+def exists(what: str) -> Callable[[Path], None]:
+    """Return the check of a path's option: it raises `UsageError` if nothing is there. what: is expected."""
+
+    def check(path: Path) -> None:
+        if not path.exists():
+            raise UsageError(f"{path} does not exist; expected {what}")
+
+    return check
 
 
 def require_dataset(root: Path) -> None:
@@ -32,34 +41,14 @@ def require_dataset(root: Path) -> None:
         hint = hub_hint(root, "datasets/")
         raise UsageError(f"{root} does not exist; expected the folder of a LeRobot dataset{hint}")
     if not (root / "meta" / "info.json").is_file():
-        raise UsageError(f"{root} is not a LeRobot dataset: it has no meta/info.json{_inside(root)}")
+        raise UsageError(f"{root} is not a LeRobot dataset: it has no meta/info.json")
 
 
 def require_eval(path: Path) -> None:
     """Raise `UsageError` unless `path` is a file, an `eval.json`, or a folder that holds one."""
-    meant = f" of manip-il eval; a policy to measure is given as --policy.path={path}"
-    if not path.exists():
-        raise UsageError(f"{path} does not exist; expected an eval.json{meant}")
-    if path.is_dir() and not (path / "eval.json").is_file():
-        raise UsageError(f"{path} holds no eval.json{meant}")
-
-
-def require_folder(path: Path, what: str) -> None:
-    """Raise `UsageError` unless there is such a folder. what: its expected content."""
-    if not path.is_dir():
-        raise UsageError(f"{path} {'is not a folder' if path.exists() else 'does not exist'}; expected {what}")
-
-
-def require_file(path: Path, what: str) -> None:
-    """Raise `UsageError` unless there is such a file. what: its expected content."""
-    if not path.is_file():
-        raise UsageError(f"{path} {'is no file' if path.exists() else 'does not exist'}; expected {what}")
-
-
-def _inside(root: Path) -> str:
-    """Name the datasets in a folder that is none itself, if it holds some."""
-    found = sorted(path.parents[1].name for path in root.glob("*/meta/info.json")) if root.is_dir() else []
-    return f"; it holds the datasets {', '.join(found[:3])}{' ...' if len(found) > 3 else ''}" if found else ""
+    if not path.is_file() and not (path / "eval.json").is_file():
+        problem = "holds no eval.json" if path.exists() else "does not exist; expected an eval.json"
+        raise UsageError(f"{path} {problem} of manip-il eval; a policy to measure is given as --policy.path={path}")
 
 
 def start_policy(settings: Open) -> Open:
@@ -91,10 +80,7 @@ def round_policy(settings: Open) -> tuple[Open, Path | None]:
 
 
 def check_given(config: RunConfig) -> None:
-    """Raise `MismatchError` unless what a run begins with, datasets or a policy, fits its environment; warn as others.
-
-    Raises what `check_policy` raises.
-    """
+    """Raise `MismatchError` unless the datasets and the policy that a run begins with fit its environment."""
     from manip_il.collect.environments import env_spec
     from manip_il.data.dataset import Dataset
     from manip_il.data.schema import SIM_STATE
@@ -112,15 +98,8 @@ def check_given(config: RunConfig) -> None:
             )
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
         warn(*dataset_differences(str(root), given.spec, given.fingerprint))
-    if config.start is None:
-        return
-    checkpoint = Checkpoint.open(config.start)
-    checkpoint.require_trust(config.fit.trust)
-    cameras = check_policy(checkpoint, config.env, draw=False, trust=config.fit.trust)
-    for what in ("names", "height", "width"):
-        theirs, ours = (getattr(one, what, None) for one in (cameras, config.cameras))
-        if theirs != ours:
-            raise MismatchError(f"cameras' {what}", str(config.start), theirs, "this run", ours)
+    if config.start is not None:
+        check_policy(Checkpoint.open(config.start), config.env, trust=config.fit.trust)
 
 
 def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> list[str]:
@@ -145,18 +124,12 @@ def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str
 
 
 def open_driver(
-    policy: Path | None,
-    kind: str,
-    env: Given | EnvConfig,
-    *,
-    draw: bool = True,
-    trust: bool = False,
-    quiet: bool = False,
+    policy: Path | None, kind: str, env: Given | EnvConfig, *, trust: bool = False, device: str = "cpu"
 ) -> tuple[EnvConfig, Driver, CameraConfig | None]:
     """Return what drives, checked, the environment that it drives, and the cameras whose pictures it takes.
 
     policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or what was given of it:
-    the rest is as the policy has it. draw, trust: see `check_policy`. quiet: do not say which pictures it takes.
+    the rest is as the policy has it. device: of a checkpoint. Raises what `check_policy` raises.
     """
     from manip_il.collect.drivers import PolicyDriver, driver_of
     from manip_il.learn.checkpoint import Checkpoint
@@ -165,101 +138,47 @@ def open_driver(
         return env_config(env) if isinstance(env, dict) else env, driver_of(kind), None
     checkpoint = Checkpoint.open(path := find_policy(policy))
     config = env_config(env, checkpoint.origin) if isinstance(env, dict) else env
-    cameras = check_policy(checkpoint, config, draw=draw, trust=trust)
-    if cameras is not None and not quiet:
-        say(_observation_text(cameras, checkpoint))
-    return config, PolicyDriver((path,), trust=trust), cameras
+    return config, PolicyDriver((path,), trust=trust, device=device), check_policy(checkpoint, config, trust=trust)
 
 
-def check_space(policy: Path, space: str | None) -> None:
-    """Raise `MismatchError` for a checkpoint of another action space than the one asked for."""
-    if space is None:
-        return
-    from manip_il.learn.checkpoint import Checkpoint
-
-    path = find_policy(policy)
-    if (theirs := Checkpoint.open(path).space) != space:
-        raise MismatchError("action space", str(path), theirs, "--action_space", space)
-
-
-def check_policy(
-    checkpoint: Checkpoint, env: EnvConfig, *, draw: bool = True, trust: bool = False
-) -> CameraConfig | None:
+def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False) -> CameraConfig | None:
     """Return the cameras whose pictures the policy takes, if any; warn if it was trained on something else.
 
-    draw: make its first pictures here, to see that they can be made. trust: see `LearnedPolicy.load`. Raises
-    `MismatchError` unless the policy can drive `env`, `RenderError` if there is no OpenGL for its pictures, and what
-    `LearnedPolicy.load` raises.
+    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if it names models to load without `trust`.
     """
-    from manip_il.collect.environments import env_spec
-    from manip_il.learn.policy import LearnedPolicy
+    from manip_il.collect.environments import env_fingerprint, env_spec
+    from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.learn.policy_files import policy_cameras
 
-    cameras = policy_cameras(checkpoint.path)
-    spec = env_spec(env, cameras)
-    checkpoint.check_fits(spec)
-    warn(*_differences(checkpoint, env, cameras))
-    policy = LearnedPolicy.load(checkpoint, task=spec.instruction, trust=trust)
-    # One action now finds what else does not fit before a worker does.
-    observation = _first_observation(env, cameras, draw)
-    images = {camera: picture[None] for camera, picture in observation.images.items()}
-    policy.act(observation.state[None], observation.environment_state[None], images)
+    path, origin, cameras = checkpoint.path, checkpoint.origin, policy_cameras(checkpoint.path)
+    checkpoint.check_fits(env_spec(env, cameras))
+    checkpoint.require_trust(trust)
+    if origin is None:
+        lit = f", nor how its pictures were lit: {cameras.look} is assumed" if cameras else ""
+        warn(f"{path} was written by another tool and does not say which robot and task it is for{lit}")
+    elif origin.task != env.task:  # and with it the model and its hash
+        warn(f"task differs: {path} has {origin.task}, the environment has {env.task}")
+    else:
+        theirs = {name: value for name, value in origin.fingerprint.items() if cameras or name != "cameras_sha256"}
+        warn(*compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras)))
     return cameras
 
 
-def check_policies(policies: dict[str, Path], trial: Trial, folder: Path, engine: str) -> None:
+def check_policies(policies: Mapping[str, Path], trial: Trial) -> None:
     """Raise, before any episode runs, if one of the policies (name -> folder) cannot take a test."""
     from manip_il.learn.checkpoint import Checkpoint
 
     for name, policy in policies.items():
-        if not trial.file(folder, policy).is_file():
-            checkpoint = Checkpoint.open(policy)
-            origin = checkpoint.origin
-            if origin is not None and origin.task != trial.env.task:
-                raise MismatchError("task", name, origin.task, "the comparison", trial.env.task)
-            check_policy(checkpoint, trial.env, draw=engine == "local", trust=trial.trust)
-
-
-def _differences(checkpoint: Checkpoint, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:
-    from manip_il.collect.environments import env_fingerprint
-    from manip_il.data.fingerprint import compare_fingerprints
-
-    path, meta = checkpoint.path, checkpoint.origin
-    if meta is None:
-        lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
-        return [*lines, f"nor how its pictures were lit: {cameras.look} is assumed"] if cameras else lines
-    if meta.task != env.task:  # and with it the model and its hash
-        return [f"task differs: {path} has {meta.task}, the environment has {env.task}"]
-    theirs = dict(meta.fingerprint)
-    if cameras is None:
-        theirs.pop("cameras_sha256", None)  # it takes no pictures
-    return compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras))
-
-
-def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:
-    import numpy as np
-
-    from manip_il.collect.environments import make_env
-
-    world = make_env(env, cameras if draw else None)
-    world.start(0)
-    observation = world.observe()
-    if cameras is None or draw:
-        return observation
-    return replace(observation, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
-
-
-def _observation_text(cameras: CameraConfig, checkpoint: Checkpoint) -> str:
-    lights = ", ".join(f"{name} {value}" for name, value in asdict(cameras.look).items())
-    size = f"{cameras.height} x {cameras.width} pixels"
-    return f"observation {checkpoint.observation!r}: the policy uses {', '.join(cameras.names)}, {size}, {lights}"
+        checkpoint = Checkpoint.open(policy)
+        if checkpoint.origin is not None and checkpoint.origin.task != trial.env.task:
+            raise MismatchError("task", name, checkpoint.origin.task, "the comparison", trial.env.task)
+        check_policy(checkpoint, trial.env, trust=trial.trust)
 
 
 def load_reward(path: Path) -> LearnedReward:
     """Return the reward in a folder of `fit`, or in its `pretrained_model`. Raises what `LearnedReward.load` raises."""
     from manip_il.learn.reward import LearnedReward
 
-    require_folder(path, "a reward of manip-il reward fit")
     return LearnedReward.load(reward_folder(path))
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import dataset_differences, load_reward, require_dataset, require_folder, reward_folder
+from manip_il.cli.inputs import REWARD, dataset_differences, exists, load_reward, require_dataset, reward_folder
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, say_policy, warn
@@ -36,10 +36,6 @@ _OF_ALL = (
     *("validation_episodes", "seed"),
 )
 _FIRST = ("dataset.root", "init", "steps", "reward", "validation_episodes", "output_dir", "resume")
-
-
-def _require_policy(path: Path) -> None:
-    find_policy(path)
 
 
 @dataclass
@@ -124,7 +120,7 @@ class GailOptions(Learning):
     name: ClassVar[str] = "rl gail"
     example: ClassVar[str] = "manip-il rl gail --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/gail"
     dataset: GivenGroup
-    init: Path | None = option(None, f"{_INIT}; by default a new policy", check=_require_policy)
+    init: Path | None = option(None, f"{_INIT}; by default a new policy", check=find_policy)
     settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
@@ -197,20 +193,12 @@ class PpoOptions(Learning):
     title: ClassVar[str] = "PPO"
     name: ClassVar[str] = "rl ppo"
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
-    init: Path = option(MISSING, _INIT, check=_require_policy)
-    reward: Path = option(
-        MISSING,
-        "the reward: a folder of manip-il reward fit",
-        check=lambda path: require_folder(path, "a reward of manip-il reward fit"),
-    )
+    init: Path = option(MISSING, _INIT, check=find_policy)
+    reward: Path = option(MISSING, "the reward: a folder of manip-il reward fit", check=exists(REWARD))
     settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     workers: int | None = option(1, "processes that validate", at_least=1, free=True)
     output: ResumableOutput = group(ResumableOutput(Path("runs/ppo")), prefix="")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        self.output.check()
 
     def learning_config(self) -> LearningConfig:
         """Return what the run takes; raises `MismatchError` if reward and environment do not fit."""

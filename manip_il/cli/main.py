@@ -153,6 +153,8 @@ def _dispatch(words: list[str]) -> None:
         check_values(options)
         if hasattr(options, "check"):
             options.check()
+        elif hasattr(getattr(options, "output", None), "check"):
+            options.output.check()
         from manip_il.errors import silence_ffmpeg_warning
         from manip_il.sim.gl import require_known_backend
 

@@ -6,7 +6,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from manip_il.cli.inputs import require_dataset, require_file
+from manip_il.cli.inputs import exists, require_dataset
 from manip_il.cli.outputs import check_output, prepare_output, save_options
 from manip_il.cli.progress import Progress, say
 from manip_il.data.atomic import new_folder
@@ -49,10 +49,6 @@ class McapExportOptions:
         say(f"back to a dataset: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
 
 
-def _require_mapping(path: Path) -> None:
-    require_file(path, "a mapping file, such as configs/mcap/panda.yaml")
-
-
 @dataclass
 class McapImportOptions:
     """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in the order of their names.
@@ -62,16 +58,16 @@ class McapImportOptions:
     """
 
     example: ClassVar[str] = "manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
-    source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True)
+    source: Path = option(
+        MISSING, "an MCAP file, or a folder of them", positional=True, check=exists("an MCAP file, or a folder of them")
+    )
     dataset: Path = option(MISSING, "folder for the dataset", positional=True)
     mapping: Path = option(
-        MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)", check=_require_mapping
+        MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)", check=exists("a mapping file")
     )
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
-        if not self.source.exists():
-            raise UsageError(f"{self.source} does not exist; expected an MCAP file, or a folder of them")
         if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
             raise UsageError(f"{self.dataset} exists already; choose another folder, or delete it first")
 

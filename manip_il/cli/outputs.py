@@ -123,7 +123,7 @@ def check_same_options(folder: Path, options: Any) -> None:
     before = from_yaml(path, type(options))
     for known in options_of(type(options)):
         was, now = known.value(before), known.value(options)
-        has_grown = known.metadata.get("grows") and now >= was
+        has_grown = known.metadata.get("grows") and None not in (was, now) and now >= was
         if was != now and not known.metadata.get("free") and not has_grown:
             raise MismatchError(f"--{known.name}", str(path), was, "the command line", now)
 

@@ -45,7 +45,7 @@ def say_policy(policy: Path, validation: EvalResult, test: str, remedies: str) -
 
     test: the command that tests it. remedies: what may help.
     """
-    from manip_il.evaluation.failures import evaluation_verdict
+    from manip_il.evaluation.eval_report import evaluation_verdict
 
     if validation.success.successes:
         say(f"best policy: {policy}", f"next: {test}")

@@ -6,17 +6,13 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from manip_il.cli.inputs import require_folder
+from manip_il.cli.inputs import exists
 from manip_il.cli.outputs import require_ours
 from manip_il.cli.progress import has_bars, say
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.option import option
 
 REMOTES = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
-
-
-def _require_source(path: Path) -> None:
-    require_folder(path, "the folder of a dataset, a run or a policy")
 
 
 @dataclass
@@ -29,7 +25,9 @@ class PushOptions:
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
-    source: Path = option(MISSING, "folder of a dataset, a run or a policy", positional=True, check=_require_source)
+    source: Path = option(
+        MISSING, "folder of a dataset, a run or a policy", positional=True, check=exists("a dataset, a run or a policy")
+    )
     remote: str = option(MISSING, REMOTES, positional=True)
     dry_run: bool = option(False, "only list what would be uploaded and removed")
     journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")

@@ -80,7 +80,6 @@ class RecordOptions:
         check_output(root, resume=self.resume, overwrite=self.overwrite)
         if not (self.resume and root.is_dir() and any(root.iterdir())):
             check_output(journals, resume=self.resume, overwrite=self.overwrite, resumable=True)
-        common.require_pictures(self.env, self.cameras)
         self._job()
 
     def run(self) -> None:

@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from manip_il.cli.inputs import load_reward, require_dataset, require_file, require_folder
+from manip_il.cli.inputs import REWARD, exists, load_reward, require_dataset
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output
 from manip_il.cli.progress import Progress, say, warn
@@ -26,21 +26,9 @@ PROGRESS = "progress"
 _PAIRS = "pairs.json of manip-il reward pairs"
 
 
-def _require_pairs(path: Path) -> None:
-    require_file(path, _PAIRS)
-
-
-def _require_answers(path: Path) -> None:
-    require_file(path, "preferences.json of manip-il reward ask or answer")
-
-
 def _require_method(method: str) -> None:
     if method not in METHODS:
         raise UnknownName("method", method, METHODS)
-
-
-def _require_reward(path: Path) -> None:
-    require_folder(path, "a reward of manip-il reward fit")
 
 
 def _seed(what: str) -> Any:
@@ -59,10 +47,6 @@ class IrlOptions:
     method: str = option("max_entropy", ", ".join(METHODS), check=_require_method)
     seed: int = _seed("what is drawn at random")
     output: Output = group(Output(Path("runs/irl")), prefix="")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        self.output.check()
 
     def run(self) -> None:
         """Read, learn, write the reward and the page, print the weights."""
@@ -113,7 +97,7 @@ class PairsOptions:
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
     reward: Path | None = option(
-        None, "choose those about which the networks of this reward disagree most", check=_require_reward
+        None, "choose those about which the networks of this reward disagree most", check=exists(REWARD)
     )
     seed: int = _seed("the choice")
     output: Path = option(Path("pairs.json"), "the file")
@@ -153,7 +137,7 @@ class AskOptions:
     """
 
     example: ClassVar[str] = "manip-il reward ask pairs.json --output=ask.html"
-    pairs: Path = option(MISSING, _PAIRS, positional=True, check=_require_pairs)
+    pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
     output: Path = option(Path("ask.html"), "the page")
     robot: Path | None = option(None, "the YAML of the sources' robot, if that does not ship")
     overwrite: bool = option(False, "replace an existing file")
@@ -187,7 +171,7 @@ class AnswerOptions:
     """
 
     example: ClassVar[str] = "manip-il reward answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
-    pairs: Path = option(MISSING, _PAIRS, positional=True, check=_require_pairs)
+    pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
     teacher: str = option("perfect", "perfect, boltzmann[:1], mistaken[:0.1], myopic[:0.9] or skipping[:0.1]")
     seed: int = _seed("the teacher's chances")
     output: Path = option(Path("preferences.json"), "the file")
@@ -227,18 +211,19 @@ class FitOptions:
     """
 
     example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
-    pairs: Path = option(MISSING, _PAIRS, positional=True, check=_require_pairs)
-    answers: list[Path] = option(MISSING, "preferences.json of ask or answer", positional=True, check=_require_answers)
+    pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
+    answers: list[Path] = option(
+        MISSING,
+        "preferences.json of ask or answer",
+        positional=True,
+        check=exists("preferences.json of manip-il reward ask or answer"),
+    )
     more_pairs: list[Path] = option(
-        list, "further files of pairs of the same task and length of clip", check=_require_pairs
+        list, "further files of pairs of the same task and length of clip", check=exists(_PAIRS)
     )
     members: int = option(8, "networks of the ensemble, and folds of the pairs", at_least=3, at_most=64)
     seed: int = _seed("weights, folds and batches")
     output: Output = group(Output(Path("runs/reward")), prefix="")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        self.output.check()
 
     def run(self) -> None:
         """Fit, measure on held-out pairs, write the reward and the page."""
@@ -299,7 +284,7 @@ class ScoreOptions:
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
         if self.reward != PROGRESS:
-            require_folder(Path(self.reward), "a reward of manip-il reward fit, or the word progress")
+            exists(f"{REWARD}, or the word progress")(Path(self.reward))
         self.output.check()
 
     def run(self) -> None:

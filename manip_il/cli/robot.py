@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il import checks
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import open_driver, require_file, require_folder
+from manip_il.cli.inputs import exists, open_driver
 from manip_il.cli.options import Given, command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output
 from manip_il.cli.progress import Progress, say, warn
@@ -25,10 +25,6 @@ SUFFIXES = (".yaml", ".yml")
 PAGE = "check.html"
 
 
-def _require_model(path: Path) -> None:
-    require_file(path, "an MJCF")
-
-
 @dataclass
 class RobotNewOptions:
     """Write a first YAML for an arm's MJCF: hand, fingers and workspace as they look on the model.
@@ -39,8 +35,8 @@ class RobotNewOptions:
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"
-    model: Path = option(MISSING, "the arm's MJCF", positional=True, check=_require_model)
-    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", check=_require_model)
+    model: Path = option(MISSING, "the arm's MJCF", positional=True, check=exists("an MJCF"))
+    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", check=exists("an MJCF"))
     output: Path | None = option(None, "the YAML; by default beside the model, with its name")
     overwrite: bool = option(False, "replace an existing file")
 
@@ -50,7 +46,7 @@ class RobotNewOptions:
         if target.suffix not in SUFFIXES:
             raise UsageError(f"--output is {target}; expected a file, NAME.yaml")
         checks.name(f"the name of {target}, which will be the robot's,", target.stem)
-        require_folder(target.parent, f"the folder of {target}")
+        exists(f"the folder of {target}")(target.parent)
         if target.exists() and not self.overwrite:
             raise UsageError(f"{target} exists already; choose another --output, or give --overwrite")
 
@@ -106,9 +102,8 @@ def _require_task(task: str) -> None:
 class RobotCheckOptions:
     """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
 
-    Joints and gripper as they move, pictures of the arm with its frame and cameras, where it reaches, and the expert at
-    every task, as it is and with a tenth of the steps random; and what to change if something does not work. Exits
-    with 1 if a task cannot be done.
+    Pictures of the arm with its frame and cameras, where it reaches, and the expert at every task, as it is and with a
+    tenth of the steps random; and what to change if something does not work. Exits with 1 if a task cannot be done.
     """
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
@@ -129,6 +124,7 @@ class RobotCheckOptions:
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` if a task cannot be done."""
+        from manip_il.evaluation.results import write_json
         from manip_il.evaluation.robot_check import FILE_NAME
         from manip_il.evaluation.robot_page import check_report, looks
 
@@ -136,7 +132,7 @@ class RobotCheckOptions:
         with self.output.open(self) as folder:
             with Progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
                 found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
-            found.write(folder / FILE_NAME)
+            write_json(folder / FILE_NAME, found.to_json(), indent=2)
             try:
                 pictures, no_pictures = looks(self.robot), ""
             except RenderError as error:
@@ -151,11 +147,9 @@ class RobotCheckOptions:
             raise ManipError(f"{self.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
 
     def _say(self, found: RobotCheck) -> None:
-        from manip_il.evaluation.robot_page import advice, home_line, joint_table, motors_line, task_table, verdict
+        from manip_il.evaluation.robot_page import advice, home_line, task_table, verdict
         from manip_il.evaluation.tables import print_table
 
-        print_table(joint_table(found))
-        say(motors_line(found))
         say(home_line(found))
         print_table(task_table(found))
         say(verdict(found))
@@ -199,8 +193,7 @@ class CertifyOptions:
         from manip_il.evaluation.policy_folder import find_policy
         from manip_il.evaluation.tables import print_table
 
-        local = self.engine.engine == "local"
-        env, *_ = open_driver(self.policy.path, "expert", self.env, draw=local, trust=self.trust, quiet=True)
+        env, *_ = open_driver(self.policy.path, "expert", self.env, trust=self.trust)
         policy = find_policy(self.policy.path) if self.policy.path else None
         engine, count = self.engine.open(), count_episodes(env, self.cases, policy)
         with self.output.open(self) as folder:

@@ -23,7 +23,6 @@ from manip_il.cli.study_file import (
     with_start_cost,
     with_start_policy,
 )
-from manip_il.data.atomic import write_file
 from manip_il.errors import NoEffect
 from manip_il.seeding import stream_seeds
 
@@ -49,7 +48,7 @@ class Study:
         options: of the command, to be kept. training_seeds: in place of the file's.
         """
         from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, table_markdown
+        from manip_il.evaluation.study import FILE_NAME
         from manip_il.evaluation.tables import print_table
 
         plan = read_plan(self._file, training_seeds, self._trust)
@@ -61,13 +60,11 @@ class Study:
             self._learn(plan)
             study = self._test(plan, experts)
             write_json(folder / FILE_NAME, study.to_json())
-            write_file(folder / TABLE_FILE, table_markdown(study).encode())
             self._report(plan, study, options)
         for table in study.tables():
             print_table(table)
         for sentence in (study.verdict, *study.facts):
             say(sentence)
-        say(f"table: {folder / TABLE_FILE}")
         say(f"result: {folder / FILE_NAME}")
         say(f"report: {folder / REPORT_FILE}")
         say(f"next: {self._next(study)}")
@@ -129,7 +126,7 @@ class Study:
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
         trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self._trust)
-        check_policies(policies, trial, self._root, self._engine.engine)
+        check_policies(policies, trial)
         return trial
 
     def _member(self, plan: Plan, name: str, seed: int) -> Member:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import require_folder
+from manip_il.cli.inputs import exists
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import Output
 from manip_il.cli.progress import Progress, say
@@ -16,10 +16,6 @@ from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.theory.shift import Shift
-
-
-def _require_run(path: Path) -> None:
-    require_folder(path, "a run of manip-il dagger")
 
 
 @dataclass
@@ -32,16 +28,15 @@ class TheoryOptions:
 
     example: ClassVar[str] = "manip-il theory runs/dagger --output_dir=runs/theory"
     source: Path | None = option(
-        None, "a run of manip-il dagger, to look at its rounds", positional=True, check=_require_run
+        None,
+        "a run of manip-il dagger, to look at its rounds",
+        positional=True,
+        check=exists("a run of manip-il dagger"),
     )
     episodes: int = option(50, "of the expert and of every round's policy", at_least=2)
     cases: int = option(30, "wrong actions of each kind, to find what one costs the expert", at_least=1)
     workers: int | None = common.processes_option()
     output: Output = group(Output(Path("runs/theory")), prefix="")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        self.output.check()
 
     def run(self) -> None:
         """Compute, measure, write the page and the file, print the slopes."""

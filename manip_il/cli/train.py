@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
 from manip_il.cli.data_edits import RedrawOptions
-from manip_il.cli.inputs import dataset_differences, require_dataset, require_file, start_policy
+from manip_il.cli.inputs import dataset_differences, exists, require_dataset, start_policy
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput, check_same_options, prepare_output, save_options
 from manip_il.cli.progress import Progress, Stages, say, set_quiet, warn
@@ -71,7 +71,7 @@ class TrainOptions:
     weights: Path | None = option(
         None,
         "draw frames by the progress in this file of manip-il data score, as LeRobot's RA-BC weighs them",
-        check=lambda path: require_file(path, "rabc.parquet of manip-il data score"),
+        check=exists("rabc.parquet of manip-il data score"),
     )
     fit: Given = given(FitConfig, prefix="")
     seed: int = option(0, "seed of weights and batches, 0 to 1000", at_least=0, at_most=1000)

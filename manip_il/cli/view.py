@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import open_driver, require_folder
+from manip_il.cli.inputs import exists, open_driver
 from manip_il.cli.options import Given
 from manip_il.cli.progress import say, warn
 from manip_il.errors import RenderError, UsageError
@@ -65,7 +65,7 @@ class ViewOptions:
         if self.output is not None:
             if self.output.suffix != SUFFIX or self.output.is_dir():
                 raise UsageError(f"--output is {self.output}; expected a file, NAME{SUFFIX}")
-            require_folder(self.output.parent, f"the folder of --output={self.output}")
+            exists(f"the folder of --output={self.output}")(self.output.parent)
         if self.env.get("robot") == STOCK:
             raise UsageError(f'--robot.type={STOCK} cannot be viewed; gymnasium shows it: render_mode="human"')
         common.env_config(self.env)

@@ -107,13 +107,14 @@ class PolicyDriver(Driver):
     """Executes a policy's action, and with probability beta the expert's: pi_i = beta pi* + (1 - beta) pi_hat.
 
     policies: the first drives, the others answer with it where a query wants their disagreement. trust: whether models
-    that the checkpoints name may be loaded. (Ross et al. 2011)
+    that the checkpoints name may be loaded. device: of torch, on which they act. (Ross et al. 2011)
     """
 
     kind = "policy"
     policies: tuple[Path, ...] = ()
     beta: float = 0.0
     trust: bool = False
+    device: str = "cpu"
 
     @override
     def start(self, setting: Setting) -> Act:

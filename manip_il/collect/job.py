@@ -135,10 +135,11 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
 def _load(job: RolloutJob, path: Path, env: Environment) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
-    trust = isinstance(job.driver, PolicyDriver) and job.driver.trust
+    driver = job.driver
+    trust, device = (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
     checkpoint = Checkpoint.open(path)
     checkpoint.check_fits(env_spec(job.env, observed_cameras(job)))
-    return LearnedPolicy.load(checkpoint, task=env.task_description, trust=trust)
+    return LearnedPolicy.load(checkpoint, device, env.task_description, trust=trust)
 
 
 def _without_pictures(frame: Transition) -> Transition:

@@ -106,6 +106,11 @@ class Arm:
         return fmean(member.test.success.rate for member in self.members)
 
     @property
+    def has_histories(self) -> bool:
+        """Whether every policy comes from a run."""
+        return all(member.history for member in self.members)
+
+    @property
     def episodes(self) -> int:
         """Number of test episodes of each member."""
         return self.members[0].test.success.n

@@ -25,7 +25,6 @@ from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, EXPERT, INTERV
 
 FILE_NAME = "certificate.json"
 Group = Literal["start", "state", "action", "learner"]
-_MAX_SEEDS = 6  # of failures in a line
 _COLOURS: dict[Group, str] = {"start": EXPERT, "state": DAGGER, "action": CLONING, "learner": BASELINE}
 
 
@@ -76,9 +75,9 @@ class Row:
         return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
 
     @property
-    def failed(self) -> list[Case]:
-        """Cases that were not solved."""
-        return [case for case in self.cases if case.steps is None]
+    def counts(self) -> tuple[str, str]:
+        """Cases, and episodes that were left out, as a table has them."""
+        return str(len(self.cases)), str(self.left_out)
 
     @property
     def mean_steps(self) -> float | None:
@@ -100,7 +99,8 @@ class Row:
             return None
         # A percentile that was seen, the one above if it falls between two.
         p95, p99 = (int(np.percentile(gaps, share, method="higher")) for share in (95, 99))
-        return Gaps(float(np.mean(gaps)), p95, p99, max(gaps), len(self.failed))
+        unrecovered = sum(case.steps is None for case in self.cases)
+        return Gaps(float(np.mean(gaps)), p95, p99, max(gaps), unrecovered)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -113,7 +113,7 @@ class Row:
             "left_out": self.left_out,
             "success_rate": success.rate if success else None,
             "interval": list(success.interval) if success else None,
-            "without_label": sum(not case.labelled for case in self.failed),
+            "without_label": sum(case.steps is None and not case.labelled for case in self.cases),
             "mean_steps": self.mean_steps,
             "gap": asdict(gaps) if gaps and self.group == "action" else None,
             "cases": [[case.seed, case.moment, case.steps, case.undisturbed] for case in self.cases],
@@ -163,58 +163,33 @@ class Certificate:
     def write(self, path: Path) -> None:
         """Write `certificate.json`, creating its folder.
 
-        robot, task, policy (or null), fingerprint, settings, confidence of every interval, mu (the largest gap of all
-        wrong actions [control steps]), and rows, a list of: group (start, state, action, learner), kind, words, n,
-        left_out, success_rate and interval (null without cases), without_label (failures in which the expert had no
-        sound label at the end), mean_steps until solved, gap (`Gaps`; for wrong actions), and cases, each [seed,
-        moment, steps or null, undisturbed or null].
+        Of its keys mu is the largest gap of all wrong actions [control steps]; without_label of a row counts failures
+        in which the expert had no sound label at the end; a case is [seed, moment, steps, undisturbed].
         """
-        gaps = self.actions.gaps
-        content = {
-            "robot": self.robot,
-            "task": self.task,
-            "policy": self.policy,
-            "fingerprint": dict(self.fingerprint),
-            "settings": dict(self.settings),
-            "confidence": CONFIDENCE,
-            "mu": gaps.largest if gaps else None,
-            "rows": [row.to_json() for row in self.pooled_rows],
-        }
-        write_json(path, content, indent=None)
+        gaps, rows = self.actions.gaps, [row.to_json() for row in self.pooled_rows]
+        content = {"robot": self.robot, "task": self.task, "policy": self.policy, "fingerprint": dict(self.fingerprint)}
+        content |= {"settings": dict(self.settings), "confidence": CONFIDENCE, "mu": gaps.largest if gaps else None}
+        write_json(path, content | {"rows": rows}, indent=None)
 
     def tables(self) -> tuple[Table, Table]:
         """Return the table of recoveries, and that of the costs of wrong actions."""
         rows, horizon = self.pooled_rows, self._in_seconds(self.settings["horizon"])
-        recoveries = Table(
-            ("the expert continues from", f"solved in {horizon} {INTERVAL}", "mean steps", "cases", "left out"),
-            tuple(
-                (
-                    row.words,
-                    str(row.success or ""),
-                    "" if row.mean_steps is None else f"{row.mean_steps:.1f}",
-                    str(len(row.cases)),
-                    str(row.left_out),
-                )
-                for row in rows
-            ),
-            tuple(_COLOURS[row.group] for row in rows),
-        )
-        costs = tuple(
-            (
-                row.words,
-                f"{gaps.mean:.1f}",
-                *map(self._in_seconds, (gaps.p95, gaps.p99, gaps.largest)),
-                str(gaps.unrecovered),
-                str(len(row.cases)),
-            )
-            for row in [*self.of("action"), self.actions]
-            if (gaps := row.gaps) is not None
-        )
+        head = ("the expert continues from", f"solved in {horizon} {INTERVAL}", "mean steps", "cases", "left out")
+        cells = [
+            (row.words, str(row.success or ""), f"{row.mean_steps:.1f}" if row.mean_steps else "", *row.counts)
+            for row in rows
+        ]
+        recoveries = Table(head, tuple(cells), tuple(_COLOURS[row.group] for row in rows))
+        costs: list[tuple[str, ...]] = []
+        for row in [*self.of("action"), self.actions]:
+            if gaps := row.gaps:
+                seconds = map(self._in_seconds, (gaps.p95, gaps.p99, gaps.largest))
+                costs.append((row.words, f"{gaps.mean:.1f}", *seconds, str(gaps.unrecovered), row.counts[0]))
         head = ("one wrong action costs, in steps", "mean", "95th", "99th", "largest", "never solved", "cases")
-        return recoveries, Table(head, costs)
+        return recoveries, Table(head, tuple(costs))
 
     def facts(self) -> list[str]:
-        """Return sentences on the largest cost, on the learner's states, and on failures."""
+        """Return sentences on the largest cost, and on the learner's states."""
         gaps, lines = self.actions.gaps, list[str]()
         if gaps is not None:
             whole = ", the whole horizon" if gaps.unrecovered else ""
@@ -228,11 +203,6 @@ class Certificate:
         for row in self.of("learner"):
             count = row.left_out + len(row.cases)
             lines.append(f"The policy had solved {row.left_out} of {count} before the expert's turn.")
-        for row in self.rows:
-            seeds = [str(case.seed) for case in row.failed]
-            if seeds:
-                more = ", ..." if len(seeds) > _MAX_SEEDS else ""
-                lines.append(f"Not solved, {row.words}: seeds {', '.join(seeds[:_MAX_SEEDS])}{more}.")
         return lines
 
     def _in_seconds(self, steps: int) -> str:

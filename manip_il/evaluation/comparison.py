@@ -10,9 +10,15 @@ from typing import Any
 
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.arm import Arm, require_pair
-from manip_il.evaluation.intervals import CONFIDENCE, mean_interval
+from manip_il.evaluation.intervals import (
+    CONFIDENCE,
+    PairedComparison,
+    format_p,
+    format_points,
+    mean_interval,
+    sign_flip_exact,
+)
 from manip_il.evaluation.results import EvalResult, compare_results
-from manip_il.evaluation.significance import PairedComparison, format_p, format_points, sign_flip_exact
 
 FILE_NAME = "compare.json"
 _OF_PAIR = ("both", "only_left", "only_right", "neither", "difference", "interval", "p_value")
@@ -44,16 +50,11 @@ class Comparison:
         """Left and right."""
         return self.left, self.right
 
-    @property
-    def names(self) -> tuple[str, str]:
-        """Names of both arms."""
-        return self.left.name, self.right.name
-
     @cached_property
     def pairs(self) -> tuple[PairedComparison, ...]:
         """The paired comparison of each training seed."""
         members = zip(self.left.members, self.right.members, strict=True)
-        return tuple(compare_results(a.test, b.test, self.names) for a, b in members)
+        return tuple(compare_results(a.test, b.test, (self.left.name, self.right.name)) for a, b in members)
 
     @property
     def difference(self) -> float:
@@ -68,21 +69,16 @@ class Comparison:
         return mean_interval([pair.difference for pair in self.pairs])
 
     @cached_property
-    def margins(self) -> dict[int, int]:
-        """Test seed -> training seeds in which right succeeded less those in which left did."""
-        margins: Counter[int] = Counter()
-        for arm, sign in ((self.left, -1), (self.right, 1)):
-            for episode in (one for member in arm.members for one in member.test.episodes):
-                margins[episode.seed] += sign * episode.success
-        return dict(margins)
-
-    @cached_property
     def p_value(self) -> float:
         """Two-sided and exact over test episodes, all training seeds together; with one it is McNemar's.
 
         It holds for these trained policies; `interval` is about other training seeds, too.
         """
-        return sign_flip_exact(list(self.margins.values()))
+        margins: Counter[int] = Counter()
+        for arm, sign in ((self.left, -1), (self.right, 1)):
+            for episode in (one for member in arm.members for one in member.test.episodes):
+                margins[episode.seed] += sign * episode.success
+        return sign_flip_exact(list(margins.values()))
 
     @property
     def significant(self) -> bool:
@@ -93,13 +89,14 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """One sentence with the difference, its interval and p."""
-        n, left, right = len(self.pairs), *self.names
+        n, left, right = len(self.pairs), self.left.name, self.right.name
         sign = -1 if self.difference < 0 else 1
         better, worse = (left, right) if sign < 0 else (right, left)
         each = f" on each of {n} training seeds" if n > 1 else ""
         tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes{each}"
         over = f" on average over {n} training seeds" if n > 1 else ""
-        ahead = f"{over} (ahead in {self.ahead(better)} of {n})" if over else ""
+        leads = sum(sign * pair.difference > 0 for pair in self.pairs)
+        ahead = f"{over} (ahead in {leads} of {n})" if over else ""
         low, high = sorted(100 * sign * end for end in self.interval)
         points = f"{100 * sign * self.difference:z.1f} points [{low:z.1f}, {high:z.1f}]"  # z: no minus before a 0.0
         if self.significant:
@@ -113,11 +110,6 @@ class Comparison:
         return (
             f"No difference shown between {right} and {left}: {points}{ahead if self.difference else over}, {tested}."
         )
-
-    def ahead(self, name: str) -> int:
-        """Return the number of training seeds in which the arm of this name has the higher success."""
-        sign = 1 if name == self.right.name else -1
-        return sum(sign * pair.difference > 0 for pair in self.pairs)
 
     @property
     def numbers(self) -> str:
@@ -150,9 +142,9 @@ class Comparison:
     def file_json(self) -> dict[str, Any]:
         """Return the contents of `compare.json`: `to_json`, and on which episodes both were tested."""
         result = self.left.members[0].test
-        seeds = sorted(self.margins)
+        seeds = [episode.seed for episode in result.episodes]
         settings = {"robot": result.robot, "task": result.task, "settings": result.settings.to_json()}
-        return self.to_json() | settings | {"test_seeds": [seeds[0], seeds[-1]]}
+        return self.to_json() | settings | {"test_seeds": [min(seeds), max(seeds)]}
 
 
 def require_same_episodes(left_name: str, left: EvalResult, right_name: str, right: EvalResult) -> None:

@@ -12,15 +12,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from manip_il.errors import ManipError
-from manip_il.evaluation.episodes import Place
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion, format_percent
+from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.rounds import COSTS, Cost, History, has_unqueried_steps
-from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
+from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, EXPERT
 
 INK, SOFT, RULE = "#1d2126", "#5b636d", "#e3e5e8"
 ARMS = (DAGGER, CLONING, EXPERT, "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
@@ -29,6 +29,11 @@ _PANEL = (4.4, 3.0)  # of a figure that stands beside others [inches]
 _NAME = 20  # characters of a bar's name in a line
 _LOG_SPAN = 20  # amounts that differ by this factor or more are shown on a logarithmic axis
 _DPI = 96
+MAX_MARKS = 200  # of one outcome on a map; more would hide each other
+MAP_NOTE = (
+    "Circles: starts, squares: goals, crosses: where failed episodes ended. "
+    f"Of each outcome {MAX_MARKS} episodes are drawn at most."
+)
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same with whatever fonts a machine has
     "svg.hashsalt": "manip_il",  # the same figure is the same bytes
@@ -216,45 +221,42 @@ def curve_note(curves: Sequence[Curve]) -> str:
     return f"{note} Wall-clock is collecting and fitting, without validating."
 
 
-@dataclass(frozen=True)
-class MapGroup:
-    """Episodes of one outcome on a map: (start, goal, end) of what is to reach the goal [m]; end None if not known."""
+def failure_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
+    """Draw from above where episodes started, were to go and failed; no figure if none has its places.
 
-    name: str
-    colour: str
-    places: tuple[tuple[Place, Place, Place | None], ...]
-    joined: bool = True  # start and goal by a line
-
-
-def map_figures(groups: Sequence[MapGroup]) -> tuple[Figure, ...]:
-    """Draw starts as circles, goals as squares, and ends as crosses, from above and from the side."""
-    return tuple(_map_figure(groups, view) for view in ("above", "the side"))
-
-
-def _map_figure(groups: Sequence[MapGroup], view: Literal["above", "the side"]) -> Figure:
-    up = 1 if view == "above" else 2
-    places = np.array([place for group in groups for one in group.places for place in one[:2]])[:, [0, up]]
-    middle, half = (places.max(axis=0) + places.min(axis=0)) / 2, 0.55 * float(np.ptp(places, axis=0).max()) + 0.01
+    Of failed and of solved episodes at most `MAX_MARKS` are drawn, evenly chosen.
+    """
+    known = [
+        (one, start, goal)
+        for one in episodes
+        if (start := one.place("start")) is not None and (goal := one.place("goal")) is not None
+    ]
+    if not known:
+        return ()
+    points = np.array([place[:2] for _, *both in known for place in both])
+    middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, 0.55 * float(np.ptp(points, axis=0).max()) + 0.01
+    counts: list[str] = []
     with drawing(1, size=(_PANEL[0], 4.6)) as (drawn, axes):
         axis = axes[0, 0]
-        for group in groups:
-            many, alpha = len(group.places) > 80, 1.0 if group.joined else 0.5
-            starts = [(start[0], start[up]) for start, *_ in group.places]
-            goals = [(goal[0], goal[up]) for _, goal, _ in group.places]
-            ends = [(end[0], end[up]) for *_, end in group.places if end is not None]
-            if group.joined:
-                joins = np.array([(a, b, (np.nan, np.nan)) for a, b in zip(starts, goals, strict=True)])
-                axis.plot(*joins.reshape(-1, 2).T, color=group.colour, lw=0.7, alpha=0.25 if many else 0.5)
-            style = {"color": group.colour, "alpha": alpha, "ls": "", "ms": 3 if many else 4.5}
-            fill = "full" if group.joined else "none"
-            axis.plot(*zip(*starts, strict=True), marker="o", fillstyle=fill, label=plain(group.name), **style)
-            axis.plot(*zip(*goals, strict=True), marker="s", fillstyle=fill, **style)
-            if ends:
-                axis.plot(*zip(*ends, strict=True), "x", color=INK, ms=4, mew=0.9, alpha=0.6)
+        for name, success, colour in (("solved", True, BASELINE), ("failed, from start to goal", False, CLONING)):
+            found = [every for every in known if every[0].success == success]
+            counts.append(f"{len(found)} {name}")
+            if not found:
+                continue
+            places = np.unique(np.linspace(0, len(found) - 1, min(len(found), MAX_MARKS)).round().astype(int))
+            shown = [found[place] for place in places]
+            starts, goals = (np.array([every[which][:2] for every in shown]) for which in (1, 2))
+            style = {"color": colour, "ls": "", "ms": 4, "alpha": 0.5 if success else 0.9}
+            style["fillstyle"] = "none" if success else "full"
+            axis.plot(*starts.T, marker="o", label=name, **style)
+            axis.plot(*goals.T, marker="s", **style)
+            if not success:
+                axis.plot(*np.stack([starts, goals]).T, color=colour, lw=0.7, alpha=0.3)
+                ends = np.array([end[:2] for one, *_ in shown if (end := one.place("end")) is not None])
+                axis.plot(*ends.reshape(-1, 2).T, "x", color=INK, ms=4, mew=0.9, alpha=0.6)
         # Where it is, however far an object rolled away.
         axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
-        axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]" if up == 1 else "z, height [m]")
-        axis.set_title(f"seen from {view}", loc="left")
+        axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]")
+        axis.set_title("seen from above", loc="left")
         drawn.legend(loc="outside lower left")
-        counts = ", ".join(f"{len(group.places)} {group.name}" for group in groups)
-        return to_figure(drawn, f"Starts and goals seen from {view}: {counts}")
+        return (to_figure(drawn, f"Starts and goals seen from above: {', '.join(counts)}"),)

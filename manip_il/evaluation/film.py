@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
 
 import av
 import numpy as np
@@ -66,8 +65,8 @@ class Shot:
         pictures = render_states(env, CameraConfig(("front",), *_SIZE, FILM), states)
         frames = list(pictures[schema.IMAGES + "front"])
         chosen = np.unique(np.linspace(0, len(frames) - 1, self.stills).round().astype(int)) if self.stills else []
-        stills = tuple(Still(f"{one / fps:.1f} s", encode_picture(frames[one], "jpeg")) for one in chosen)
-        return Film(self.title, encode_mp4(frames, fps), self.caption, encode_picture(frames[-1], "jpeg"), stills)
+        stills = tuple(Still(f"{one / fps:.1f} s", encode_jpeg(frames[one])) for one in chosen)
+        return Film(self.title, encode_mp4(frames, fps), self.caption, encode_jpeg(frames[-1]), stills)
 
 
 def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], str]:
@@ -137,8 +136,8 @@ def encode_mp4(frames: Frames, fps: int) -> bytes:
         return path.read_bytes()
 
 
-def encode_picture(picture: NDArray[np.uint8], kind: Literal["png", "jpeg"]) -> bytes:
-    """Return one picture (height, width, 3) as a file; JPEG has a fifth of the size of PNG."""
+def encode_jpeg(picture: NDArray[np.uint8]) -> bytes:
+    """Return one picture (height, width, 3) as a file."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format=kind, optimize=True, **({"quality": 85} if kind == "jpeg" else {}))
+    Image.fromarray(picture).save(buffer, format="jpeg", optimize=True, quality=85)
     return buffer.getvalue()

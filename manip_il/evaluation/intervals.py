@@ -1,11 +1,12 @@
-"""Confidence intervals: of a success rate, of a paired difference of two, and of a mean over training seeds."""
+"""Confidence intervals and exact tests of success: one rate, two policies on the same seeds, several training seeds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any
 
 import numpy as np
 from scipy import optimize, special, stats
@@ -28,7 +29,8 @@ class Proportion:
     sequential: bool = False
 
     def __post_init__(self) -> None:
-        require_counts(self.successes, self.n)
+        if self.n < 1 or not 0 <= self.successes <= self.n:
+            raise UsageError(f"{self.successes} successes of {self.n} trials; expected 0 <= successes <= n and n >= 1")
 
     @classmethod
     def of(cls, outcomes: Sequence[bool], sequential: bool = False) -> Proportion:
@@ -56,11 +58,7 @@ def format_percent(rate: float) -> str:
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """Return the score interval (low, high) of a binomial proportion; `UsageError` for impossible counts.
-
-    Wilson (1927), J. Am. Stat. Assoc. 22, 209-212.
-    """
-    require_counts(successes, n)
+    """Return the score interval (low, high) of a binomial proportion (Wilson 1927, J. Am. Stat. Assoc. 22, 209-212)."""
     found = stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
     # At the ends the formula gives the rate itself, but for rounding.
     return (0.0 if successes == 0 else float(found.low)), (1.0 if successes == n else float(found.high))
@@ -72,63 +70,136 @@ def confidence_sequence(successes: int, n: int) -> tuple[float, float]:
     A rate p is left out once the likelihood of the outcomes, averaged over rates drawn from Beta(1/2, 1/2), is
     1 / (1 - confidence) times that of p: under the true rate this ratio is a martingale of mean 1, so with probability
     `CONFIDENCE` it stays below that (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). Wider than Wilson's,
-    which holds for an `n` fixed in advance. Raises `UsageError` as `wilson_interval` does.
+    which holds for an `n` fixed in advance.
     """
-    require_counts(successes, n)
     failures = n - successes
     mixture = special.betaln(successes + 0.5, failures + 0.5) - special.betaln(0.5, 0.5) + math.log1p(-CONFIDENCE)
 
     def excess(p: float) -> float:
         return float(mixture - special.xlogy(successes, p) - special.xlog1py(failures, -p))
 
+    def edge(low: float, high: float) -> float:
+        found: Any = optimize.brentq(excess, low, high, xtol=1e-15)
+        return found
+
     rate = min(max(successes / n, _EDGE), 1 - _EDGE)
-    low = 0.0 if successes == 0 else _root(excess, 1e-300, rate)
-    high = 1.0 if failures == 0 else _root(excess, rate, 1 - 1e-16)
-    return low, high
-
-
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    return cast(float, optimize.brentq(function, low, high, xtol=1e-15))
-
-
-def paired_difference_interval(both: int, only_first: int, only_second: int, neither: int) -> tuple[float, float]:
-    """Return (low, high) of the rate of the first minus the rate of the second, paired, inside [-1, 1].
-
-    Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: Wilson's limits of both rates, squared and added,
-    less their correlation with a continuity correction.
-    """
-    n = both + only_first + only_second + neither
-    first, second = both + only_first, both + only_second
-    require_counts(min(both, only_first, only_second, neither), n)
-    (l1, u1), (l2, u2) = wilson_interval(first, n), wilson_interval(second, n)
-    p1, p2 = first / n, second / n
-    cross = both * neither - only_first * only_second
-    if cross > 0:  # the correction draws a positive correlation towards none, never past it
-        cross = max(cross - n / 2, 0.0)
-    margins = math.sqrt(first * (n - first) * second * (n - second))
-    phi = cross / margins if margins else 0.0
-
-    def add_squares(a: float, b: float) -> float:
-        return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
-
-    difference = (only_first - only_second) / n
-    return max(-1.0, difference - add_squares(p1 - l1, u2 - p2)), min(1.0, difference + add_squares(u1 - p1, p2 - l2))
+    return (0.0 if successes == 0 else edge(1e-300, rate)), (1.0 if failures == 0 else edge(rate, 1 - 1e-16))
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Return Student's (low, high) of the mean of independent `values`; `UsageError` for fewer than two.
+    """Return Student's (low, high) of the mean of two or more independent `values`.
 
     Student (1908), Biometrika 6, 1-25. With two or three values it is wide: the factor on the standard error is 12.7
     or 4.3, against 2.0 for many values.
     """
-    if len(values) < 2:
-        raise UsageError(f"{len(values)} training seed has no interval over training seeds; expected at least 2")
     half = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * stats.sem(values))
     mean = float(np.mean(values))
     return mean - half, mean + half
 
 
-def require_counts(successes: int, n: int) -> None:
-    """Raise `UsageError` unless 0 <= successes <= n and n >= 1."""
-    if n < 1 or not 0 <= successes <= n:
-        raise UsageError(f"{successes} successes of {n} trials; expected 0 <= successes <= n and n >= 1")
+@dataclass(frozen=True, slots=True)
+class PairedComparison:
+    """Two policies on the same `n` episodes, counted by who succeeded."""
+
+    left: str
+    right: str
+    both: int
+    only_left: int
+    only_right: int
+    neither: int
+
+    @property
+    def n(self) -> int:
+        """Number of pairs."""
+        return self.both + self.only_left + self.only_right + self.neither
+
+    @property
+    def difference(self) -> float:
+        """Rate of `right` minus rate of `left`, in [-1, 1]."""
+        return (self.only_right - self.only_left) / self.n
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """(low, high) of `difference`, inside [-1, 1].
+
+        Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: Wilson's limits of both rates, squared and
+        added, less their correlation with a continuity correction.
+        """
+        n, right, left = self.n, self.both + self.only_right, self.both + self.only_left
+        (l1, u1), (l2, u2) = wilson_interval(right, n), wilson_interval(left, n)
+        p1, p2 = right / n, left / n
+        cross = self.both * self.neither - self.only_right * self.only_left
+        if cross > 0:  # the correction draws a positive correlation towards none, never past it
+            cross = max(cross - n / 2, 0.0)
+        margins = math.sqrt(right * (n - right) * left * (n - left))
+        phi = cross / margins if margins else 0.0
+
+        def add_squares(a: float, b: float) -> float:
+            return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
+
+        low, high = add_squares(p1 - l1, u2 - p2), add_squares(u1 - p1, p2 - l2)
+        return max(-1.0, self.difference - low), min(1.0, self.difference + high)
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided p that both have one success rate.
+
+        McNemar (1947), Psychometrika 12, 153-157, with the exact binomial in place of chi-square.
+        """
+        discordant = self.only_left + self.only_right
+        return float(stats.binomtest(self.only_left, discordant).pvalue) if discordant else 1.0
+
+    @property
+    def significant(self) -> bool:
+        """Whether the exact test rejects "equally good"."""
+        return self.p_value < 1 - CONFIDENCE
+
+    @property
+    def verdict(self) -> str:
+        """One sentence with the difference, its interval and p."""
+        numbers = (
+            f"{format_points(self.difference, self.interval)}, McNemar's exact {format_p(self.p_value)}, "
+            f"{self.n:,} paired episodes"
+        )
+        if self.significant:
+            better, worse = (self.right, self.left) if self.difference > 0 else (self.left, self.right)
+            return f"{better} beats {worse}: {numbers}."
+        if self.only_left == self.only_right == 0:
+            return f"{self.right} and {self.left} succeeded in exactly the same episodes: {numbers}."
+        return f"No difference shown between {self.right} and {self.left}: {numbers}."
+
+
+def compare_paired(
+    left: Sequence[bool], right: Sequence[bool], names: tuple[str, str] = ("A", "B")
+) -> PairedComparison:
+    """Compare outcomes that are paired by position, at least one."""
+    pairs = Counter(zip(left, right, strict=True))
+    return PairedComparison(*names, pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])
+
+
+def sign_flip_exact(differences: Sequence[int]) -> float:
+    """Return two-sided p that every difference, one a test episode, was as likely to have the other sign.
+
+    differences: right's successes less left's in that episode, summed over training seeds. The seeds' signs are flipped
+    together, so that training seeds which share an episode need not be independent in it. With one training seed this
+    is McNemar's exact test; in general Fisher's randomisation test (The Design of Experiments, 1935, section 21).
+    """
+    ways = np.array([1], dtype=object)  # of the sums -total, -total + 2, ..., total of the signed differences
+    for size, count in Counter(abs(d) for d in differences if d).items():
+        flips = np.zeros(size * count + 1, dtype=object)
+        flips[::size] = [math.comb(count, k) for k in range(count + 1)]
+        ways = np.convolve(ways, flips)
+    total, observed = len(ways) - 1, abs(sum(differences))
+    # Whole numbers divided once: exact at any count.
+    return sum(count for place, count in enumerate(ways) if abs(2 * place - total) >= observed) / sum(ways)
+
+
+def format_p(p: float) -> str:
+    """Return `p = 0.031`, or `p < 0.001` for what is smaller."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
+
+
+def format_points(difference: float, interval: tuple[float, float]) -> str:
+    """Return `+4.2 points [+1.1, +7.3]`."""
+    low, high = interval
+    return f"{100 * difference:+z.1f} points [{100 * low:+z.1f}, {100 * high:+z.1f}]"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
-from manip_il.evaluation.figures import Curve, Figure, curve_figures, curve_note
+from manip_il.evaluation.figures import Figure
 from manip_il.evaluation.rounds import format_seconds
 from manip_il.evaluation.tables import Table
 
@@ -93,26 +93,6 @@ class Report:
         """Write the page to `path`, whole or not at all, creating its folder."""
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, self.render().encode())
-
-
-def curve_section(curves: Sequence[Curve], target: float | None = None, tables: tuple[Table, ...] = ()) -> Section:
-    """Return success over every cost, with the numbers of each point folded away."""
-    points = {
-        f"{curve.name}, run {number}, {one.name}" if len(curve.runs) > 1 else f"{curve.name}, {one.name}": one
-        for curve in curves
-        for number, run in enumerate(curve.runs)
-        for one in run
-    }
-    numbers = {
-        name: f"{one.labels:,} labels, {format_seconds(one.seconds)}: {one.validation}" for name, one in points.items()
-    }
-    return Section(
-        "Success against cost",
-        figures=curve_figures(curves, target),
-        tables=tables,
-        notes=(curve_note(curves),),
-        named={"The curves in numbers": numbers},
-    )
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

@@ -3,23 +3,128 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il import checks
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, MismatchError
-from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
-from manip_il.evaluation.intervals import CONFIDENCE, Proportion
-from manip_il.evaluation.significance import PairedComparison, compare_paired
+from manip_il.evaluation.intervals import CONFIDENCE, PairedComparison, Proportion, compare_paired
+from manip_il.sim.conditions import NOMINAL, Condition
+
+if TYPE_CHECKING:
+    from manip_il.collect.job import RolloutJob
+    from manip_il.sim.config import EnvConfig
 
 FILE_NAME = "eval.json"
-WILSON = "Wilson's score interval"
-ANYTIME = "confidence sequence: holds whenever one stops"
-_EQUAL_IN_PARTS = ("policy_sha256", "robot", "task", "settings")
+Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
+# Of every episode, in the order of `EpisodeResult`.
+_KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeResult:
+    """One episode: `success` at some time, `success_at_end` at the last frame, `ret` the sum of rewards.
+
+    steps: control steps until the episode ended. phase_at_end: the expert's name for the last state.
+    detail: further keys of the JSON object.
+    """
+
+    seed: int
+    success: bool
+    success_at_end: bool
+    steps: int
+    ret: float
+    phase_at_end: str = ""
+    detail: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def condition(self) -> str:
+        """The condition's name; empty if none is given."""
+        name = self.detail.get("condition")
+        return name if isinstance(name, str) else ""
+
+    def place(self, when: Literal["start", "end", "goal"]) -> Place | None:
+        """Return where the object, or the hand if the task has none, was or was to go [m]; None if nothing says it."""
+        found = self.detail.get(when)
+        if isinstance(found, Mapping):
+            found = found.get("object", found.get("hand"))
+        if not isinstance(found, list | tuple) or len(found) != 3:
+            return None
+        x, y, z = map(float, found)
+        return x, y, z
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the episode as `eval.json` holds it."""
+        values = (self.seed, self.success, self.success_at_end, self.steps, self.ret, self.phase_at_end)
+        detail = {key: value for key, value in self.detail.items() if key not in _KEYS}
+        return dict(zip(_KEYS, values, strict=True)) | detail
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
+        """Return the inverse of `to_json`; `KeyError` or `TypeError` if a value is missing or of another kind."""
+        known = {"success_at_end": data["success"], "phase_at_end": ""} | {
+            key: data[key] for key in data if key in _KEYS
+        }
+        values: list[Any] = [convert(known[key]) for key, convert in _KEYS.items()]
+        return cls(*values, detail={key: value for key, value in data.items() if key not in _KEYS})
+
+
+@dataclass(frozen=True, slots=True)
+class EvalSettings:
+    """The settings that two evaluations must share to be compared, and that repeating an episode needs.
+
+    horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
+    of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
+    if it goes on to the horizon. object: shape and size of what is grasped, reward: of `carry`, empty for the task's
+    own.
+    """
+
+    horizon: int
+    tolerance: float
+    control_hz: int = 20  # and five steps, in files without them
+    success_steps: int = 5
+    suite: str = NOMINAL.name
+    conditions: tuple[Condition, ...] = (NOMINAL,)
+    hold: int | None = None
+    object: str = ""
+    reward: str = ""
+
+    @classmethod
+    def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
+        """Return those of a job whose conditions are called `suite`."""
+        env, conditions = job.env, job.conditions or (NOMINAL,)
+        steps, hz = env.success_steps, env.control_hz
+        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, env.object, env.reward)
+
+    def env(self, robot: str, task: str) -> EnvConfig:
+        """Return the environment that was evaluated in."""
+        from manip_il.sim.config import EnvConfig
+
+        limits = self.tolerance, self.success_steps, self.horizon
+        return EnvConfig(robot, task, self.control_hz, *limits, self.object, self.reward)
+
+    @property
+    def disturbance(self) -> str:
+        """The conditions in words, `none` if all are nominal."""
+        return "; ".join(map(str, self.conditions)) if any(one.ranges for one in self.conditions) else "none"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        plain = ("horizon", "tolerance", "control_hz", "success_steps", "hold", "suite")
+        conditions = [condition.to_json() for condition in self.conditions]
+        own = {key: getattr(self, key) for key in ("object", "reward") if getattr(self, key)}
+        return {key: getattr(self, key) for key in plain} | {"conditions": conditions} | own
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
+        """Return the inverse of `to_json`; raises as `EpisodeResult.from_json`. Other keys are ignored."""
+        known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
+        named = [dict(one) for one in known.pop("conditions", [NOMINAL.to_json()])]
+        return cls(**known, conditions=tuple(Condition.from_mapping(one.pop("name"), one) for one in named))
 
 
 @dataclass(frozen=True)
@@ -48,21 +153,18 @@ class EvalResult:
         if len(seeds) != len(self.episodes):
             raise ManipError(
                 f"evaluation of {self.policy}: {len(self.episodes)} episodes on {len(seeds)} seeds; "
-                "every episode needs its own seed"
+                "every episode needs its own seed, those of parts by --eval.first="
             )
 
     @property
     def success(self) -> Proportion:
         """Episodes that succeeded at some time."""
-        return self._proportion([episode.success for episode in self.episodes])
+        return Proportion.of([episode.success for episode in self.episodes], self.until_width is not None)
 
     @property
     def success_at_end(self) -> Proportion:
         """Episodes that stood at the goal when they ended."""
-        return self._proportion([episode.success_at_end for episode in self.episodes])
-
-    def _proportion(self, outcomes: Sequence[bool]) -> Proportion:
-        return Proportion.of(outcomes, self.until_width is not None)
+        return Proportion.of([episode.success_at_end for episode in self.episodes], self.until_width is not None)
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
@@ -87,11 +189,12 @@ class EvalResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `eval.json`."""
+        anytime = "confidence sequence: holds whenever one stops"
         return {
             "success_rate": self.success.rate,
             "interval": list(self.success.interval),
             "confidence": CONFIDENCE,
-            "interval_method": WILSON if self.until_width is None else ANYTIME,
+            "interval_method": "Wilson's score interval" if self.until_width is None else anytime,
             "n_episodes": len(self.episodes),
             "success_at_end_rate": self.success_at_end.rate,
             "until_width": self.until_width,
@@ -155,7 +258,7 @@ def compare_results(left: EvalResult, right: EvalResult, names: tuple[str, str] 
     Raises `MismatchError` where robot, task or settings differ, and `ManipError` where no seed is shared.
     """
     names = names or (left.policy, right.policy)
-    _require_equal(("robot", "task", "settings"), names[0], left, names[1], right)
+    _require_equal(names[0], left, names[1], right)
     ours = {episode.seed: episode.success for episode in left.episodes}
     theirs = {episode.seed: episode.success for episode in right.episodes}
     shared = sorted(ours.keys() & theirs.keys())
@@ -167,27 +270,17 @@ def compare_results(left: EvalResult, right: EvalResult, names: tuple[str, str] 
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     """Return all episodes of the parts (name -> part), in the order of their seeds.
 
-    Raises `MismatchError` where they are not of one policy in one world, and `ManipError` for no part, for a seed that
-    two of them ran, or for a part whose number of episodes depended on its outcomes.
+    Raises `MismatchError` if they are not of one policy in one world, and `ManipError` for a seed that two of them ran,
+    or for a part whose number of episodes depended on its outcomes.
     """
-    if not parts:
-        raise ManipError("no evaluations to merge; expected at least one")
     (first, one), *others = parts.items()
     for name, other in others:
         known = one.policy_sha256 or other.policy_sha256  # else the names alone say whether the policy is the same
-        _require_equal(_EQUAL_IN_PARTS if known else ("policy", *_EQUAL_IN_PARTS), first, one, name, other)
-    found: dict[int, tuple[str, EpisodeResult]] = {}
-    for name, part in parts.items():
-        if part.until_width is not None:
-            raise ManipError(f"{name} stopped by --until_width; only parts with a fixed number of episodes merge")
-        for episode in part.episodes:
-            if episode.seed in found:
-                raise ManipError(
-                    f"seed {episode.seed} is in {found[episode.seed][0]} and in {name}; give every part seeds of its "
-                    "own, by --eval.first= and --eval.n_episodes="
-                )
-            found[episode.seed] = name, episode
-    return replace(one, episodes=tuple(episode for _, (_, episode) in sorted(found.items())))
+        _require_equal(first, one, name, other, "policy_sha256" if known else "policy")
+    if stopped := next((name for name, part in parts.items() if part.until_width is not None), None):
+        raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes merge")
+    episodes = [episode for part in parts.values() for episode in part.episodes]
+    return replace(one, episodes=tuple(sorted(episodes, key=lambda episode: episode.seed)))
 
 
 def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -> None:
@@ -196,13 +289,11 @@ def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -
     write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
-def _require_equal(names: Sequence[str], left: str, one: EvalResult, right: str, other: EvalResult) -> None:
-    """Raise `MismatchError` naming the first field, of the settings too, in which two evaluations differ."""
-    plain = [name for name in names if name != "settings"]
-    sides = [(name, getattr(one, name), getattr(other, name)) for name in plain]
-    if "settings" in names:
-        own = [field.name for field in fields(EvalSettings)]
-        sides += [(name, getattr(one.settings, name), getattr(other.settings, name)) for name in own]
+def _require_equal(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
+    """Raise `MismatchError` naming the first field in which two differ: robot, task, a setting, or one of `more`."""
+    sides = [(name, getattr(one, name), getattr(other, name)) for name in (*more, "robot", "task")]
+    own = [field.name for field in fields(EvalSettings)]
+    sides += [(name, getattr(one.settings, name), getattr(other.settings, name)) for name in own]
     for name, ours, theirs in sides:
         if ours != theirs:
             words = ("; ".join(map(str, side)) if isinstance(side, tuple) else side for side in (ours, theirs))

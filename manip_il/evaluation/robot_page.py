@@ -1,4 +1,4 @@
-"""A robot's check as tables, advice, and `check.html`."""
+"""A robot's check as a page: tables, pictures, reach, and what to change."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from manip_il.evaluation.figures import Figure, drawing, plain, to_figure
-from manip_il.evaluation.film import encode_picture
+from manip_il.evaluation.figures import INK, Figure, drawing, plain, to_figure
+from manip_il.evaluation.film import encode_jpeg
 from manip_il.evaluation.report import Report, Section, Still
-from manip_il.evaluation.robot_check import ENOUGH, SOLVES, JointFacts, RobotCheck, TaskCheck, at_home, reach_map
+from manip_il.evaluation.robot_check import ENOUGH, LOW, SOLVES, RobotCheck, TaskCheck
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, Table
+from manip_il.robots.reach import reach_of
 from manip_il.sim.config import FILM
 from manip_il.sim.render import Line, Overview, marked_picture
 from manip_il.sim.scene import build_scene
-from manip_il.sim.world import Scene
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import TakesShape
 
-SLOW, USUAL = 0.25, 0.1  # rise of a joint from which on labels run ahead of the arm, and with the gains found [s]
-SWINGS = 0.2  # share of a step by which a joint goes beyond it
 _ROOM = 0.13  # of a map around the workspace [m]
+_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 _AXES = ((0.85, 0.12, 0.12, 1.0), (0.10, 0.62, 0.20, 1.0), (0.10, 0.30, 0.90, 1.0))  # x red, y green, z blue
 _SPACE = (0.05, 0.45, 0.75, 1.0)
 
@@ -55,7 +55,6 @@ def check_report(
             Section("Tasks", tables=(task_table(check),), notes=tasks),
             Section("At home in its scene", lead, stills=tuple(pictures), notes=home),
             Section("Where it reaches, and where tasks begin", figures=start_figures(check), notes=reaches),
-            Section("Joints, base to hand", tables=(joint_table(check),), notes=(motors_line(check),)),
         ),
     )
 
@@ -63,26 +62,18 @@ def check_report(
 def verdict(check: RobotCheck) -> str:
     """Return in a sentence which tasks a robot can do."""
     name, failed, count = check.robot.name, check.failed, len(check.tasks)
-    tasks = f"{count} task{'s' if count > 1 else ''}"
     asked = any(task.clean is not None for task in check.tasks)
-    can = "can do" if asked else "has starts for"
-    end = "" if asked else "; the expert was not asked"
+    can, end = ("can do", "") if asked else ("has starts for", "; the expert was not asked")
+    words = f"{name} {can} {f'all {count} tasks' if count > 1 else check.tasks[0].name}{end}"
     if failed:
+        cannot = ", ".join(task.name for task in failed)
         words = (
-            f"{name} {can} {count - len(failed)} of {tasks}{end}; it cannot do {', '.join(one.name for one in failed)}"
+            f"{name} {can} {count - len(failed)} of {count} task{'s' if count > 1 else ''}{end}; it cannot do {cannot}"
         )
-    else:
-        words = f"{name} {can} {f'all {tasks}' if count > 1 else check.tasks[0].name}{end}"
     shaken = [(task.name, task.noisy.success) for task in check.tasks if task.done and task.noisy is not None]
     if poor := [f"{one} in {success.successes} of {success.n}" for one, success in shaken if success.rate < SOLVES]:
         words += f"; with a tenth of the steps random the expert solves {', '.join(poor)} episodes"
     return f"{words}."
-
-
-def joint_table(check: RobotCheck) -> Table:
-    """Return the joints base to hand: limits, home, gains, and how they move and hold."""
-    columns = ("joint", "limits", "home", "kp", "kv", "force", "rise [ms]", "overshoot")
-    return Table(columns, tuple(_joint_row(joint) for joint in check.joints))
 
 
 def task_table(check: RobotCheck) -> Table:
@@ -106,79 +97,44 @@ def home_line(check: RobotCheck) -> str:
     return f"{opens} At home these overlap, as in every posture: {pairs}."
 
 
-def motors_line(check: RobotCheck) -> str:
-    """Return in a sentence what drives the joints, and what the columns of `joint_table` mean."""
-    return (
-        "Position control drives the joints: torque = kp (target - joint) - kv velocity, at most the force; gravity is "
-        "compensated. kp is in N m/rad, kv in N m s/rad, force in N m. "
-        f"Rise and overshoot: of a step of {check.robot.max_joint_step:g} rad from home, the longest of a label."
-    )
-
-
-def _joint_row(joint: JointFacts) -> tuple[str, ...]:
-    def angle(value: float) -> str:
-        return f"{1000 * value:.1f} mm" if joint.slides else f"{math.degrees(value):.0f}°"
-
-    limits = "free" if joint.limits is None else f"{angle(joint.limits[0])} to {angle(joint.limits[1])}"
-    rise = "over 1,000" if joint.rise is None else f"{1000 * joint.rise:.0f}"
-    numbers = (f"{joint.kp:.4g}", f"{joint.kv:.3g}", f"{joint.force:.3g}")
-    return (joint.name, limits, angle(joint.home), *numbers, rise, f"{100 * joint.overshoot:.0f} %")
-
-
 def start_figures(check: RobotCheck) -> tuple[Figure, ...]:
-    """Draw where the hand gets to on the table, with the starts of each task."""
-    reached, extent = reach_map(check.robot, _ROOM)
-    (x, y), half = check.robot.workspace.centre, check.robot.workspace.half_width
+    """Draw where the hand, pointing down, gets to on the table, with the starts of each task."""
+    reach, (x, y), half = reach_of(check.robot), check.robot.workspace.centre, check.robot.workspace.half_width
+    offsets = (np.linspace(-1, 1, 121)[1::2] * (half + _ROOM)).tolist()
+    reached = [[float(reach.has((x + dx, y + dy, LOW))) for dx in offsets] for dy in offsets]
+    extent = (x - half - _ROOM, x + half + _ROOM, y - half - _ROOM, y + half + _ROOM)
     figures: list[Figure] = []
     for task in check.tasks:
         with drawing(1, size=(3.0, 3.0)) as (drawn, axes):
             axis, words = axes[0, 0], f"{task.found} of {task.drawn} starts" if task.drawn else "no scene"
-            axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmax=2, interpolation="nearest")
-            axis.plot(*zip(*((x + a * half, y + b * half) for a, b in _SQUARE), strict=True), color="#1d2126", lw=1)
-            for places, style in ((task.goals, "s"), (task.objects, "o")):
-                if places:
-                    colour = {"s": CLONING, "o": DAGGER}[style]
-                    axis.plot(
-                        *zip(*places, strict=True), style, ms=3.5, mfc="none" if style == "s" else colour, mec=colour
-                    )
+            axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=2, interpolation="nearest")
+            axis.plot(*np.array([(x + a * half, y + b * half) for a, b in _SQUARE]).T, color=INK, lw=1)
+            axis.plot(*np.reshape(task.goals, (-1, 2)).T, "s", ms=3.5, mfc="none", mec=CLONING)
+            axis.plot(*np.reshape(task.objects, (-1, 2)).T, "o", ms=3.5, color=DAGGER)
             axis.set(xlim=extent[:2], ylim=extent[2:], xlabel="x [m]", ylabel="y [m]")
             axis.set_title(f"{plain(task.name)}: {words}", loc="left")
             figures.append(to_figure(drawn, f"Starts of {task.name} from above: {words}"))
     return tuple(figures)
 
 
-_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
-
-
 def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML, the arm's first, then for each task that cannot be done."""
-    lines = [line for joint in check.joints for line in _of_joint(joint)]
-    for one, other in check.overlaps:
-        lines.append(f"{one} and {other} overlap however the arm stands: take one of their contacts out of the model.")
+    lines = [
+        f"{one} and {other} overlap however the arm stands: take one of their contacts out of the model."
+        for one, other in check.overlaps
+    ]
     space = check.robot.workspace
     if check.table < ENOUGH:
-        centre = f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green"
+        change = f"take half_width: {check.half_width:g} in place of {space.half_width:g}"
+        if not check.half_width:
+            change = f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green"
         if not check.table and check.robot.gripper.files is not None:
-            centre += "; or turn the gripper on the hand by gripper.quaternion"
-        narrower = f"take half_width: {check.half_width:g} in place of {space.half_width:g}"
-        part = f"The hand gets to {100 * check.table:.0f} % of the workspace on the table"
-        lines.append(f"{part}: {narrower if check.half_width else centre}.")
-    return (*lines, *(line for task in check.failed for line in _of_task(check, task)))
+            change += "; or turn the gripper on the hand by gripper.quaternion"
+        lines.append(f"The hand gets to {100 * check.table:.0f} % of the workspace on the table: {change}.")
+    return (*lines, *(line for task in check.failed for line in _task_advice(check, task)))
 
 
-def _of_joint(joint: JointFacts) -> Iterator[str]:
-    if joint.rise is None:
-        yield f"{joint.name} does not get to its target in a second: raise its {joint.kp:.3g} in gains, or forces."
-    elif joint.rise > SLOW:
-        kp = joint.kp * (joint.rise / USUAL) ** 2
-        slow = f"{joint.name} takes {1000 * joint.rise:.0f} ms for a step"
-        yield f"{slow}: raise its number in gains from {joint.kp:.3g} towards {kp:.2g}, or in forces."
-    if joint.overshoot > SWINGS:
-        beyond = f"{joint.name} goes {100 * joint.overshoot:.0f} % beyond a step"
-        yield f"{beyond}: lower its {joint.kp:.3g} in gains, or raise its number in armature."
-
-
-def _of_task(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
+def _task_advice(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
     wide, most = max(task.widths.values(), default=0.0), check.opening
     if wide >= most:
         change = "widen gripper.open, or leave the task out"
@@ -192,10 +148,9 @@ def _of_task(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
         yield f"{task.name}: {task.refused}."
     elif task.clean is not None:
         success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
-        failed = (
-            f"the expert fails in {success.n - success.successes} of {success.n} episodes, {count} in phase {phase}"
-        )
-        yield f"{task.name}: {failed}; watch it: manip-il view --robot.type={check.name} --task.type={task.name}"
+        failed = f"the expert fails in {success.n - success.successes} of {success.n} episodes"
+        watch = f"manip-il view --robot.type={check.name} --task.type={task.name}"
+        yield f"{task.name}: {failed}, {count} in phase {phase}; watch it: {watch}"
 
 
 def looks(name: str) -> tuple[Still, ...]:
@@ -204,29 +159,26 @@ def looks(name: str) -> tuple[Still, ...]:
     Raises `RenderError` without off-screen OpenGL.
     """
     scene = build_scene(name, "reach")
-    data = at_home(scene)
-    data.mocap_pos[:, 2] = -9.0  # goals: out of sight
+    data, gripper = mujoco.MjData(scene.model), scene.gripper
+    data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
+    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
+    mujoco.mj_forward(scene.model, data)
     ee, rotation = data.site_xpos[scene.ee_site].copy(), data.site_xmat[scene.ee_site].reshape(3, 3)
     lines = [Line(ee, ee + 0.06 * axis, colour, 0.0035) for axis, colour in zip(rotation.T, _AXES, strict=True)]
     (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
     corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]
     lines += [Line(a, b, _SPACE, 0.003) for a, b in itertools.pairwise(corners)]
-    views: tuple[tuple[str | Overview, str], ...] = (
-        (_from_outside(scene, corners), "from outside"),
-        ("front", "what camera front sees"),
-        ("wrist", "what camera wrist sees"),
-    )
-    return tuple(
-        Still(words, encode_picture(marked_picture(name, "reach", data, view, (480, 640), FILM, lines), "jpeg"))
-        for view, words in views
-    )
-
-
-def _from_outside(scene: Scene, corners: Sequence[np.ndarray]) -> Overview:
-    """A look that has the arm's base and hand and the workspace in it."""
-    data = at_home(scene)
     points = np.vstack([data.xpos[1:], corners])
     points = points[np.abs(points).max(axis=1) < 3]  # without what was put out of sight
     low, high = points.min(axis=0), points.max(axis=0)
     distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
-    return Overview((low + high) / 2, distance, 55.0, -20.0)
+    views: tuple[tuple[str | Overview, str], ...] = (
+        (Overview((low + high) / 2, distance, 55.0, -20.0), "from outside"),
+        ("front", "what camera front sees"),
+        ("wrist", "what camera wrist sees"),
+    )
+    data.mocap_pos[:, 2] = -9.0  # goals: out of sight
+    return tuple(
+        Still(words, encode_jpeg(marked_picture(name, "reach", data, view, (480, 640), FILM, lines)))
+        for view, words in views
+    )

@@ -6,6 +6,7 @@ import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +18,24 @@ from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.positions import positions
-from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.learn.policy_files import policy_sha256
-from manip_il.mdp import Episode
+from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, draw
+from manip_il.sim.config import EnvConfig
+from manip_il.sim.scene import SCENES_KEPT, build_scene
+from manip_il.sim.world import World
+from manip_il.stock.simulation import StockSimulation
+from manip_il.stock.table import ROBOT as STOCK
+from manip_il.tasks.table import get_task
+from manip_il.tasks.task import objects_in
 
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
 CHECK_EVERY = 100  # episodes after which the width of the interval is checked
 EPISODES_FILE = "episodes.jsonl"
+_world = lru_cache(SCENES_KEPT)(World)
 
 
 def evaluate(
@@ -78,6 +85,11 @@ def evaluate(
     )
 
 
+def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
+    """Return how long after success an evaluation's episodes end; stock environments run to their own end."""
+    return None if env.robot == STOCK else hold
+
+
 def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     """Return the result of an episode."""
     solved = episode.columns[schema.SUCCESS].ravel()
@@ -106,6 +118,25 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     )
 
 
+def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
+    """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects, and `goal`.
+
+    The first object that the episode is about is called `object`; `goal` is where it, or the hand, is to go.
+    """
+    state = State.from_vector(sim_state)
+    found = StockSimulation().positions(env, state) if env.robot == STOCK else _positions(env, state)
+    return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
+
+
+def _positions(env: EnvConfig, state: State) -> dict[str, F64]:
+    world, task = _world(build_scene(env.robot, env.task, env.object)), get_task(env.task, env.object)
+    world.restore(state.physics, state.variation)
+    found = {"hand": world.ee.position, "goal": task.destination(world)}
+    for name in world.scene.objects:
+        found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
+    return found
+
+
 @dataclass(frozen=True)
 class EpisodeJournal:
     """Episodes of an evaluation as they end: first a line of what they have in common, then a line for each.
@@ -123,7 +154,12 @@ class EpisodeJournal:
         Raises `MismatchError` if its episodes are those of another policy, environment or version of this program,
         `ManipError` for a line that is not an episode.
         """
-        path, common = folder / EPISODES_FILE, _common(job, suite)
+        path = folder / EPISODES_FILE
+        common: dict[str, Any] = {
+            "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
+            "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
+            "settings": EvalSettings.of(job, suite).to_json(),
+        }
         try:
             records = read_lines(path)
             results = [EpisodeResult.from_json(record) for record in records[1:]]
@@ -134,9 +170,8 @@ class EpisodeJournal:
         if not records:
             append_line(path, common)
             return cls(path)
-        head = records[0]
         for key, now in common.items():
-            if (before := head.get(key)) != now:
+            if (before := records[0].get(key)) != now:
                 what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
                 raise MismatchError(what, "then", before, "now", now)
         return cls(path, {result.seed: result for result in results})
@@ -149,14 +184,6 @@ class EpisodeJournal:
             on_result(result)
 
         return add
-
-
-def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
-    return {
-        "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
-        "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
-        "settings": EvalSettings.of(job, suite).to_json(),
-    }
 
 
 def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:

@@ -16,7 +16,7 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.rounds import COSTS, Cost, Round, Rule, format_amount, has_unqueried_steps, largest_dip
 from manip_il.evaluation.tables import Table
 
-FILE_NAME, TABLE_FILE = "study.json", "table.md"
+FILE_NAME = "study.json"
 
 
 @dataclass(frozen=True)
@@ -180,19 +180,6 @@ def arms_table(arms: Sequence[Arm], comparisons: Mapping[str, Comparison]) -> Ta
         against = comparisons[arm.name].numbers if arm.name in comparisons else ""
         rows.append((arm.name, *(known or [""] * (len(costs) + 1)), tests, against))
     return Table(("arm", *map(_head, costs), "validation", "test", f"test, against {baseline}"), tuple(rows))
-
-
-def table_markdown(study: Study) -> str:
-    """Return the tables and facts, for the documentation."""
-    seeds = ", ".join(map(str, study.training_seeds))
-    tests = {test: len(one.episodes) for found in study.experts.values() for test, one in found.items()}
-    lines = [
-        f"{study.arms[0].episodes:,} test episodes; training seeds {seeds}, in brackets where each is told.",
-        *study.facts,
-        *(f"{test}: {count:,} test episodes." for test, count in tests.items()),
-    ]
-    tables = "".join(f"{table.filled().markdown()}\n" for table in study.tables())
-    return tables + "".join(f"- {line}\n" for line in lines)
 
 
 def _expert_json(result: EvalResult) -> dict[str, Any]:

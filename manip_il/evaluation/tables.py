@@ -1,4 +1,4 @@
-"""Tables of text, for the terminal, Markdown and reports."""
+"""Tables of text, for the terminal and reports."""
 
 from __future__ import annotations
 
@@ -43,13 +43,6 @@ class Table:
         keep = [i for i in range(len(self.columns)) if i == 0 or any(row[i] for row in self.rows)]
         rows = tuple(tuple(row[i] for i in keep) for row in self.rows)
         return Table(tuple(self.columns[i] for i in keep), rows, self.colours)
-
-    def markdown(self) -> str:
-        """Return the table as GitHub renders it, numbers to the right."""
-        rule = ("---", *("--:" for _ in self.columns[1:]))
-        rows = (self.columns, *self.rows)
-        head, *lines = ("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
-        return "\n".join([head, "|" + "|".join(rule) + "|", *lines]) + "\n"
 
     def aligned_lines(self) -> list[str]:
         """Return columns as wide as their widest cell, a rule under the head; all but the first set right."""

@@ -14,15 +14,13 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError
-from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
-from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.runner import HOLD, evaluate
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.runner import episode_hold, evaluate
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.policy_files import policy_cameras, policy_sha256
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import EnvConfig
-from manip_il.stock.table import ROBOT as STOCK
 
 FOLDER = "evaluations"
 
@@ -70,8 +68,7 @@ class Trial:
     def job(self, policy: Path | None) -> RolloutJob:
         """Return the rollouts of one policy; None: of the expert."""
         driver = ExpertDriver() if policy is None else PolicyDriver((policy,), trust=self.trust)
-        hold = episode_hold(self.env, HOLD)
-        return RolloutJob(self.env, driver, hold, label="last", conditions=self.conditions)
+        return RolloutJob(self.env, driver, episode_hold(self.env), label="last", conditions=self.conditions)
 
     def file(self, folder: Path, policy: Path | None) -> Path:
         """Return the file of a policy's or the expert's evaluation, named after its files, environment and episodes.
@@ -111,8 +108,3 @@ class Trial:
                 raise ManipError(f"{name} has {have} test episodes, because workers died")
             result.write(file)
         return EvalResult.read(file)
-
-
-def episode_hold(env: EnvConfig, hold: int | None) -> int | None:
-    """Return how long after success an evaluation's episodes end; stock environments run to their own end."""
-    return None if env.robot == STOCK else hold

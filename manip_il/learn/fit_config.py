@@ -71,7 +71,7 @@ class FitConfig:
     observation: Literal["state", "images", "both"] | None = option(
         None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
     )
-    steps: int | None = option(None, f"gradient steps; {_by_default('steps')}")
+    steps: int | None = option(None, f"gradient steps; {_by_default('steps')}", grows=True)
     batch_size: int | None = option(None, f"frames per step; {_by_default('batch_size')}")
     lr: float | None = option(None, "peak learning rate; by default the policy's own")
     optimizer: Mapping[str, Any] = option(

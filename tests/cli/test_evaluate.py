@@ -43,27 +43,15 @@ def seeing(tmp_path) -> Path:
 
 def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, capsys):
     assert evaluate(act, tmp_path / "e") == 0
-    out, err = capsys.readouterr()
-    assert "warning" not in err
-    assert "the policy uses" not in out
+    assert "warning" not in capsys.readouterr().err
     result = EvalResult.read(tmp_path / "e")
     assert (result.robot, result.task, [episode.steps for episode in result.episodes]) == ("panda", "reach", [8, 8])
 
 
-def test_a_policy_of_another_action_space_than_asked_for_is_refused(act, tmp_path, capsys):
-    assert evaluate(act, tmp_path / "e", "--action_space=ee_delta") == 1
-    assert "has joint_target, --action_space has ee_delta" in capsys.readouterr().err
-    assert evaluate(act, tmp_path / "e", "--action_space=joint_target") == 0
-
-
 @pytest.mark.gl
-def test_a_policy_of_pictures_says_what_it_looks_at(seeing, tmp_path, capsys):
+def test_a_policy_of_pictures_is_shown_them_in_its_own_light(seeing, tmp_path, capsys):
     assert evaluate(seeing, tmp_path / "e") == 0
-    out, err = capsys.readouterr()
-    assert "warning" not in err
-    [line] = [line for line in out.splitlines() if "the policy uses" in line]
-    assert "'images'" in line
-    assert "front, 32 x 32 pixels, shadows False, brightness 0.5" in line
+    assert "warning" not in capsys.readouterr().err
     assert EvalResult.read(tmp_path / "e").fingerprint == env_fingerprint(ENV, DIM)
 
 
@@ -80,12 +68,9 @@ def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tm
 
 
 @pytest.mark.usefixtures("no_opengl")
-@pytest.mark.parametrize("words", [(), ("--task.type=lift",)])  # it looks at no poses, so another task's are no matter
-def test_without_opengl_the_word_comes_before_the_first_episode(seeing, tmp_path, error, monkeypatch, words):
-    monkeypatch.setattr(ManipEnv, "advance", None)
-    assert evaluate(seeing, tmp_path / "e", *words) == 1
+def test_without_opengl_a_policy_of_pictures_is_refused_in_one_line(seeing, tmp_path, error):
+    assert evaluate(seeing, tmp_path / "e") == 1
     assert "no OpenGL here" in error()
-    assert not (tmp_path / "e").exists()
 
 
 def feature(kind: str, *shape: int) -> dict[str, object]:
@@ -93,32 +78,29 @@ def feature(kind: str, *shape: int) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    ("change", "code", "words"),
+    ("change", "words"),
     [
-        (lambda policy: (policy / "model.safetensors").unlink(), 1, "no model.safetensors in"),
-        (lambda policy: (policy / "pytorch_model.bin").write_bytes(b"\x80\x04N."), 1, "pytorch_model.bin is a pickle"),
-        ({"type": "akt"}, 2, "did you mean 'act'?"),
+        (lambda policy: (policy / "model.safetensors").unlink(), "no model.safetensors in"),
+        (lambda policy: (policy / "pytorch_model.bin").write_bytes(b"\x80\x04N."), "pytorch_model.bin is a pickle"),
         (
             {"input_features": {STATE: feature("STATE", 8), "observation.images.top": feature("VISUAL", 3, 32, 32)}},
-            1,
             "top, the environment has front, side, wrist",
         ),
         (
             {"input_features": {STATE: feature("STATE", 8), "observation.effort": feature("STATE", 8)}},
-            1,
             "observation.effort, panda/reach has observation.state",
         ),
-        ({"output_features": {"action": feature("ACTION", 7)}}, 1, "the policy has 7, panda/reach has 8"),
-        ({"input_features": {STATE: feature("STATE", 6)}}, 1, "the policy has 6, panda/reach has 8"),
+        ({"output_features": {"action": feature("ACTION", 7)}}, "the policy has 7, panda/reach has 8"),
+        ({"input_features": {STATE: feature("STATE", 6)}}, "the policy has 6, panda/reach has 8"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_bad_checkpoint_is_one_line_before_the_first_step(change, code, words, act, tmp_path, monkeypatch, error):
+def test_a_bad_checkpoint_is_one_line_before_the_first_step(change, words, act, tmp_path, monkeypatch, error):
     monkeypatch.setattr(ManipEnv, "advance", None)
     if callable(change):
         change(act)
     else:
         edit_config(act, **change)
-    assert evaluate(act, tmp_path / "e") == code
+    assert evaluate(act, tmp_path / "e") == 1
     assert words in error()
     assert not (tmp_path / "e").exists()

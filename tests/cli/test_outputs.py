@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.outputs import CONFIG_FILE, check_same_options, prepare_output
+from manip_il.cli.outputs import CONFIG_FILE, check_same_options, prepare_output, save_options
 from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
+from manip_il.cli.train import SourceGroup, TrainOptions
 from manip_il.data.atomic import exclusive, write_file
-from manip_il.errors import FolderExistsError, UsageError
+from manip_il.errors import FolderExistsError, MismatchError, UsageError
 
 from .made_runs import make_eval
 
@@ -159,3 +161,11 @@ def test_where_nothing_may_be_written_beside_it_a_folder_is_taken_unheld(tmp_pat
         assert [path.name for path in tmp_path.rglob("*")] == ["volume"]
     with pytest.raises(PermissionError), exclusive(tmp_path / "new"):
         pass
+
+
+def test_a_resumed_run_may_have_more_steps_but_no_fewer(tmp_path):
+    save_options(tmp_path, resumed := TrainOptions(SourceGroup([tmp_path]), fit={"steps": 4}))
+    check_same_options(tmp_path, replace(resumed, fit={"steps": 8}))
+    for other in ({"steps": 2}, {}):
+        with pytest.raises(MismatchError, match="--steps"):
+            check_same_options(tmp_path, replace(resumed, fit=other))

@@ -11,10 +11,9 @@ import numpy as np
 
 from manip_il.evaluation.arm import Arm, Member
 from manip_il.evaluation.comparison import Comparison
-from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
-from manip_il.evaluation.film import encode_mp4, encode_picture
+from manip_il.evaluation.film import encode_jpeg, encode_mp4
 from manip_il.evaluation.report import Film
-from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.rounds import History, Rule, history
 
 from .test_rounds import records
@@ -68,7 +67,7 @@ def small_film(number: int) -> Film:
     frames = np.full((12, 48, 64, 3), 230, dtype=np.uint8)
     for index, frame in enumerate(frames):
         frame[10:30, 4 * index : 4 * index + 14] = (200, 40 * number % 255, 60)
-    poster = encode_picture(frames[-1], "jpeg")
+    poster = encode_jpeg(frames[-1])
     return Film("policy", encode_mp4(list(frames), 12), f"seed {FIRST_SEED + number}", poster)
 
 

@@ -11,10 +11,9 @@ from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.arm import Arm, Member
 from manip_il.evaluation.compare_report import comparison_table
 from manip_il.evaluation.comparison import Comparison
-from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
-from manip_il.evaluation.results import EvalResult, write_json
+from manip_il.evaluation.intervals import compare_paired
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, write_json
 from manip_il.evaluation.rounds import history
-from manip_il.evaluation.significance import compare_paired
 
 from .test_rounds import records
 

@@ -10,7 +10,7 @@ from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver, Ra
 from manip_il.collect.environments import env_actions, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import MismatchError, UsageError
-from manip_il.evaluation.positions import positions
+from manip_il.evaluation.runner import positions
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit
 from manip_il.mdp import State

@@ -21,7 +21,7 @@ from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import EXPERT_PHASE
 from manip_il.errors import UnknownName, UsageError
-from manip_il.evaluation.positions import positions
+from manip_il.evaluation.runner import positions
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
