@@ -7,18 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il import checks
 from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, Sampling, check_labels
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_given, require_dataset, round_policy
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import CONFIG_FILE, REPORT_FILE, ResumableOutput
-from manip_il.cli.parsing import from_yaml
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, say_policy
 from manip_il.data.json_lines import append_line, read_lines
-from manip_il.errors import ManipError
-from manip_il.learn.fit_config import FitConfig, check_weights
+from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS
 
@@ -82,13 +79,6 @@ class DaggerOptions:
     trust: bool = common.trust_option()
     output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")
 
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        self.output.check()
-        if self.dataset.root:
-            check_weights(self.dataset.root, ())
-        self._config()
-
     def run(self) -> None:
         """Run, or go on with, all rounds."""
         config = self.config()
@@ -102,22 +92,12 @@ class DaggerOptions:
         if (folder / "dataset").is_dir():
             say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}")
-        robot = common.own_robot(config.env.robot)
-        test = f"manip-il eval --policy.path={best}{robot} --output_dir={folder}/test"
-        remedies = f"more --steps ({config.fit.total_steps:,} a round now)"
-        if config.start is None and not config.datasets:
-            remedies += f", more --demonstrations ({config.demonstrations:,} now)"
+        test = f"manip-il eval --policy.path={best}{common.own_robot(config.env.robot)} --output_dir={folder}/test"
+        remedies = f"more --steps ({config.fit.total_steps:,} a round now), or more --demonstrations"
         say_policy(best, best_round(results).validation, test, remedies)
 
     def config(self) -> RunConfig:
-        """Return what `run_algorithm` takes; `UsageError` for what does not go together."""
-        config = self._config()
-        check_labels(config)
-        check_given(config)
-        return config
-
-    def _config(self) -> RunConfig:
-        """Return the same before the policy's own configuration is checked, which takes seconds to import."""
+        """Return what `run_algorithm` takes; raises for what does not go together, or does not fit what is given."""
         from manip_il.collect.query import parse_query  # which imports numpy
         from manip_il.evaluation.suites import varied
 
@@ -125,7 +105,7 @@ class DaggerOptions:
         observation, cameras = self._pictures(start)
         env = common.env_config(self.env)
         of_fit: Given = {"policy": policy, "observation": observation, "trust": self.trust}
-        return RunConfig(
+        config = RunConfig(
             env=env,
             method=self.method,
             conditions=varied(self.vary, env, sees=cameras is not None),
@@ -137,6 +117,9 @@ class DaggerOptions:
             query_rule=None if self.query is None else parse_query(self.query),
             **self.settings,
         )
+        check_labels(config)
+        check_given(config)
+        return config
 
     def _pictures(self, start: Path | None) -> tuple[str | None, CameraConfig | None]:
         """Return observation and cameras: those given, else those of the policy to begin with."""
@@ -178,7 +161,7 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
     from manip_il.evaluation.results import compare_results
     from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
 
-    best = best_round(results)
+    best, folder = best_round(results), options.output.output_dir
     kind = ALGORITHMS[config.method].title
     first = "cloning" if config.start is None else "the policy given"
     names = [f"{first} (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
@@ -192,36 +175,24 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
     return run_report(
         rows,
-        curves=[learning_curve(options.output.output_dir, kind)],
+        curves=[learning_curve(folder, kind)],
         title=f"{kind} on {config.env.robot} {config.env.task}",
         verdict=best_verdict(names, results),
         command=command_line("dagger", options),
         facts=tuple(facts),
         config=to_plain(options),
         fingerprint=best.validation.fingerprint,
-        timings=round_timings(options.output.output_dir),
+        timings=round_timings(folder),
     )
 
 
 def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
-    """Return which round is the best, its validation success, and whether it is shown to be better than round 0.
-
-    Where round 0 is the best itself, it is compared with the last round. names: of the rounds.
-    """
-    from manip_il.evaluation.results import compare_results
-
-    best = best_round(list(results))
-    if not best.validation.success.successes:
-        return f"No round of {len(results)} succeeds in any of {best.validation.success.n:,} validation episodes."
-    found = f"{best.validation.success} success on {best.validation.success.n:,} validation episodes"
-    other = results[0] if best.round else results[-1]
-    if other is best:
-        return f"{names[best.round]}: {found}."
-    comparison = compare_results(other.validation, best.validation)
-    name = names[best.round]
-    if comparison.significant and comparison.difference > 0:
-        return f"{name} is the best of {len(results)}: {found}."
-    return f"{name} is chosen of {len(results)}, with {found}; no difference from {names[other.round]} is shown."
+    """Return which round is chosen, and its validation success. names: of the rounds."""
+    best = best_round(results)
+    success = best.validation.success
+    if not success.successes:
+        return f"No round of {len(results)} succeeds in any of {success.n:,} validation episodes."
+    return f"{names[best.round]} is chosen of {len(results)}: {success} success on {success.n:,} validation episodes."
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> Curve:
@@ -232,22 +203,7 @@ def learning_curve(folder: Path, name: str = "DAgger") -> Curve:
     return Curve(name, (history(read_lines(folder / METRICS_FILE), str(folder)),))
 
 
-def run_curve(policy: Path | None) -> Curve | None:
-    """Return the learning curve of the DAgger run that a policy lies in; None if it lies in none."""
-    for folder in [] if policy is None else [policy, *policy.resolve().parents[:5]]:
-        if (folder / METRICS_FILE).is_file():
-            try:
-                return learning_curve(folder, ALGORITHMS[from_yaml(folder / CONFIG_FILE, DaggerOptions).method].title)
-            except (ManipError, KeyError):  # of another command, which counts no labels
-                return None
-    return None
-
-
 def round_timings(folder: Path) -> dict[str, float]:
     """Return what each round's stages took [s], from the run's metrics."""
-    path = folder / METRICS_FILE
-    return {
-        f"round {record.get('round')}, {stage}": checks.number(f"{path}: {stage}", seconds, 0)
-        for record in read_lines(path)
-        for stage, seconds in checks.mapping(f"{path}: seconds", record.get("seconds")).items()
-    }
+    records = read_lines(folder / METRICS_FILE)
+    return {f"round {one['round']}, {stage}": took for one in records for stage, took in one["seconds"].items()}

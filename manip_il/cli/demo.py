@@ -16,9 +16,7 @@ from manip_il.cli.dagger import DaggerOptions, learning_curve, round_timings, ru
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
-from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.names import MLP
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -31,6 +29,8 @@ if TYPE_CHECKING:
 RUN = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # in place of `manip-il dagger`'s own
 FIT = {"steps": 3_000, "batch_size": 256}
 _OF_RUN = (*RUN, "episodes_per_round", "disturbed_share", "seed")
+PLACE = "evaluation"
+MORE = 2  # place of the policy that is cloned from as many labels, among the contestants
 SUITES = {"nominal": "nominal", "disturbed": "knocked", "validation": "nominal"}  # by the folder of the evaluations
 
 
@@ -53,39 +53,15 @@ class DemoOptions:
     engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/demo")), prefix="")
 
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        if (kind := self.fit.get("policy", {}).get("type", MLP)) != MLP:
-            raise UsageError(
-                f"{UnknownName('policy', kind, [MLP])}; LeRobot's policies (act, diffusion) are trained by "
-                "manip-il train and manip-il dagger, with --policy.type=..."
-            )
-        self._dagger().check()
-
     def run(self) -> None:
         """Run what is not there yet, print the table, write the report."""
-        config = self._dagger().config()
+        settings, fit = RUN | self.settings, FIT | self.fit
+        config = DaggerOptions(env=self.env, settings=settings, fit=fit, output=self.output).config()
         with self.output.open(self) as folder:
             kept = f"every finished episode, round and evaluation, in {folder}"
             with Stages(kept) as stages, self.engine.open() as engine:
                 engine.warm_up(learned=True)
                 _Demo(self, config, engine, stages).run()
-
-    @property
-    def seed(self) -> int:
-        """Shift of every random stream."""
-        return self.settings.get("seed", 0)
-
-    @property
-    def validation_episodes(self) -> int:
-        """Episodes that choose the best round."""
-        return self.settings.get("validation_episodes", RUN["validation_episodes"])
-
-    def _dagger(self) -> DaggerOptions:
-        """Return the options of the DAgger run."""
-        return DaggerOptions(
-            env=self.env, settings=RUN | self.settings, fit=FIT | self.fit, engine=self.engine, output=self.output
-        )
 
 
 @dataclass(frozen=True)
@@ -110,7 +86,7 @@ class _Demo:
     def run(self) -> None:
         """Run every part, then print the table and write the report."""
         from manip_il.evaluation.rounds import format_seconds
-        from manip_il.evaluation.tables import policy_table, print_table
+        from manip_il.evaluation.tables import PolicyRow, policy_table, print_table
 
         with self._timed("demonstrations and DAgger"):
             results = run_rounds(self.config, self.folder / "dagger", self.engine, self.stages)
@@ -120,7 +96,8 @@ class _Demo:
             measured = self._measure(contestants)
         with self._timed("films"):
             films = self._film(contestants, measured["nominal"])
-        rows = self._rows(contestants, measured)
+        nominal, disturbed = measured["nominal"], measured["disturbed"]
+        rows = [PolicyRow(w.name, nominal[w.key], w.labels, disturbed[w.key], w.colour) for w in contestants]
         report = self._report(contestants, rows, measured, films)
         report.write(self.folder / REPORT_FILE)
         print_table(policy_table(rows), empty="-")
@@ -156,19 +133,20 @@ class _Demo:
         """Return folder -> policy -> evaluation; those of an interrupted run are read."""
         from manip_il.seeding import stream_seeds
 
-        options, more = self.options, [one for one in contestants if one.key == "cloned_more"]
         measured: dict[str, dict[str, EvalResult]] = {}
-        for folder, stream, count, measured_ones in (
-            ("nominal", "test", options.test_episodes, contestants),
-            ("disturbed", "test", options.disturbed_episodes, contestants),
-            ("validation", "validation", options.validation_episodes, more),
+        for folder, stream, count, some in (
+            ("nominal", "test", self.options.test_episodes, contestants),
+            ("disturbed", "test", self.options.disturbed_episodes, contestants),
+            ("validation", "validation", self.config.validation_episodes, [contestants[MORE]]),
         ):
-            trial, place = self._trial(folder, stream_seeds(stream, count, options.seed)), self.folder / "evaluation"
+            trial, place = (
+                self._trial(folder, stream_seeds(stream, count, self.config.seed)),
+                self.folder / "evaluation",
+            )
+            last = (self.engine, self.stages)
             measured[folder] = {
-                one.key: trial.measure(
-                    one.policy, one.name, place / folder / f"{one.key}.json", self.engine, self.stages, complete=False
-                )
-                for one in measured_ones
+                one.key: trial.measure(one.policy, one.name, place / folder / f"{one.key}.json", *last, complete=False)
+                for one in some
             }
         return measured
 
@@ -188,14 +166,6 @@ class _Demo:
             shots.append(Shot(job, episode, one.name, caption, stills=6))
         self.stages.start("films", len(shots))
         return film_shots(shots, self.stages)
-
-    def _rows(
-        self, contestants: Sequence[Contestant], measured: Mapping[str, Mapping[str, EvalResult]]
-    ) -> list[PolicyRow]:
-        from manip_il.evaluation.tables import PolicyRow
-
-        nominal, disturbed = measured["nominal"], measured["disturbed"]
-        return [PolicyRow(w.name, nominal[w.key], w.labels, disturbed[w.key], w.colour) for w in contestants]
 
     def _report(
         self,

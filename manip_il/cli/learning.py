@@ -18,7 +18,6 @@ from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
-from manip_il.learn.fit_config import check_weights
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -59,13 +58,15 @@ class Learning:
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
         from manip_il.algorithms.learning_run import best_validation, validations
+        from manip_il.algorithms.run import Watch
         from manip_il.collect.workers import Engine
 
         config = self.learning_config()
         with self.output.open(self) as folder:
             kept = f"every finished iteration, in {folder}"
             with Stages(kept) as stages, Engine(self.workers) as engine:
-                self._learn(config, folder, engine, stages)
+                watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
+                self._learn(config, self.learning_run(config, folder, engine, watch), stages)
             self._report(config, folder)
         say(f"report: {folder / REPORT_FILE}")
         robot = common.own_robot(config.env.robot)
@@ -78,20 +79,24 @@ class Learning:
         """Return what the run takes; raises for what is wrong with datasets and policy together."""
         raise NotImplementedError
 
-    def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
-        """Return the run's iterations, the last finished one of a resumed run first."""
+    def learning_run(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> LearningRun:
+        """Return the run, which `iterations` continues."""
+        from manip_il.algorithms.learning_run import LearningRun
+
+        return LearningRun(config, folder, engine, watch)
+
+    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
+        """Return the iterations that are left."""
         raise NotImplementedError
 
-    def _learn(self, config: LearningConfig, folder: Path, engine: Engine, stages: Stages) -> None:
-        from manip_il.algorithms.run import Watch
-
-        watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
-        iterations = self.iterations(config, folder, engine, watch)
+    def _learn(self, config: LearningConfig, run: LearningRun, stages: Stages) -> None:
+        metrics, iterations = run.folder / METRICS_FILE, self.iterations(run, config)
         stages.start(f"{self.title}, steps", config.steps)
-        written = {record["iteration"] for record in read_lines(folder / METRICS_FILE)}
-        for result in iterations:
+        written = {record["iteration"] for record in read_lines(metrics)}
+        first = run.begin()  # what it goes on from, which may have ended before its line was written
+        for result in itertools.chain([first] if first else [], iterations):
             if result.number not in written:
-                append_line(folder / METRICS_FILE, result.to_json())
+                append_line(metrics, result.to_json())
             shown = {name: result.metrics[name] for name in ("success", "kl") if name in result.metrics}
             stages.reach(result.steps, **shown)
             if result.validation is not None:
@@ -127,11 +132,6 @@ class GailOptions(Learning):
     workers: int | None = option(1, "processes that validate", at_least=1, free=True)
     output: ResumableOutput = group(ResumableOutput(Path("runs/gail")), prefix="")
 
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        self.output.check()
-        check_weights(self.dataset.root, ())
-
     def learning_config(self) -> LearningConfig:
         """Return what the run takes; raises if the demonstrations are not all for one environment that is known."""
         from manip_il.data.dataset import Dataset
@@ -151,13 +151,11 @@ class GailOptions(Learning):
             **self.settings,
         )
 
-    def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
-        """Return the run's iterations, the last finished one of a resumed run first."""
+    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
+        """Return the iterations that are left."""
         from manip_il.algorithms.gail import gail
-        from manip_il.algorithms.learning_run import LearningRun
 
-        run = LearningRun(config, folder, engine, watch)
-        return _resumed(run, gail(run, config))
+        return gail(run, config)
 
 
 @dataclass
@@ -173,13 +171,11 @@ class AirlOptions(GailOptions):
     settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
     output: ResumableOutput = group(ResumableOutput(Path("runs/airl")), prefix="")
 
-    def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
-        """Return the run's iterations, the last finished one of a resumed run first."""
+    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
+        """Return the iterations that are left."""
         from manip_il.algorithms.airl import airl
-        from manip_il.algorithms.learning_run import LearningRun
 
-        run = LearningRun(config, folder, engine, watch)
-        return _resumed(run, airl(run, config))
+        return airl(run, config)
 
 
 @dataclass
@@ -210,14 +206,17 @@ class PpoOptions(Learning):
         reward.check_fits("the environment", env_spec(env))
         return LearningConfig(env=env, start=find_policy(self.init), ppo=self.ppo, **self.settings)
 
-    def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:
-        """Return the run's iterations, the last finished one of a resumed run first."""
+    def learning_run(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> LearningRun:
+        """Return the run, which `iterations` continues."""
         from manip_il.algorithms.learning_run import LearningRun
+
+        return LearningRun(config, folder, engine, watch, absorbing=False, reward=reward_folder(self.reward))
+
+    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
+        """Return the iterations that are left."""
         from manip_il.algorithms.ppo import ppo
 
-        reward = reward_folder(self.reward)
-        run = LearningRun(config, folder, engine, watch, absorbing=False, reward=reward)
-        return _resumed(run, ppo(run, load_reward(self.reward)))
+        return ppo(run, load_reward(self.reward))
 
 
 def _known_env(name: str, spec: RobotTaskSpec | Origin) -> EnvConfig:
@@ -228,9 +227,3 @@ def _known_env(name: str, spec: RobotTaskSpec | Origin) -> EnvConfig:
     if not is_known(spec.robot, spec.task):
         raise UsageError(f"{name} is for {spec.robot} {spec.task}, which cannot be simulated here")
     return EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
-
-
-def _resumed(run: LearningRun, iterations: Iterator[Iteration]) -> Iterator[Iteration]:
-    """Return a run's iterations after that which it goes on from, which may have ended before its line was written."""
-    first = run.begin()
-    return itertools.chain([first] if first else [], iterations)

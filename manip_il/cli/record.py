@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il import checks
 from manip_il.cli import common_options as common
 from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import check_output, check_same_options, prepare_output, save_options
+from manip_il.cli.outputs import check_same_options, prepare_output, save_options
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
-from manip_il.sim.config import EnvConfig, scene_name
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.collect.workers import Engine
-    from manip_il.sim.config import CameraConfig
 
 HOLD = 10  # control steps that a demonstration goes on for after success
 
@@ -74,54 +71,35 @@ class RecordOptions:
     resume: bool = option(False, "continue a recording, or add more episodes", free=True)
     overwrite: bool = option(False, "replace an existing dataset", free=True)
 
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        root, journals = self._folders()
-        check_output(root, resume=self.resume, overwrite=self.overwrite)
-        if not (self.resume and root.is_dir() and any(root.iterdir())):
-            check_output(journals, resume=self.resume, overwrite=self.overwrite, resumable=True)
-        self._job()
-
     def run(self) -> None:
         """Record; the dataset is written as the episodes come."""
+        from manip_il.collect.environments import env_spec
+
         job = self._job()
         if job.cameras:
             from manip_il.data.video import try_encoder
 
             try_encoder(VideoConfig(**self.dataset.rgb_encoder), job.cameras.size, job.env.control_hz)
-        from manip_il.collect.environments import env_spec
-
         env_spec(job.env, job.cameras)  # refuses what no scene can be made of, before anything is written
-        engine = self.engine.open()
-        root, journals = self._folders()
+        repo_id = self.dataset.repo_id or f"local/{job.env.name}"
+        root = self.dataset.root or Path("datasets") / repo_id.partition("/")[2]
+        journals = root.with_name(f"{root.name}.journals")
         with exclusive(root):
             prepare_output(root, resume=self.resume, overwrite=self.overwrite)
             prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
             if self._is_complete(root, journals):
                 say(f"{root} holds its {self.dataset.num_episodes} episodes already")
             else:
-                self._record(engine, job, root, journals)
+                self._record(job, root, journals, repo_id)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 
     def _job(self) -> RolloutJob:
         from manip_il.collect.job import RolloutJob
         from manip_il.evaluation.suites import varied
 
-        env, cameras = common.env_config(self.env), self._cameras()
+        env, cameras = common.env_config(self.env), common.camera_config(self.cameras, self.image)
         conditions = varied(self.vary, env, sees=cameras is not None)
         return RolloutJob(env, hold=HOLD, cameras=cameras, conditions=conditions)
-
-    def _cameras(self) -> CameraConfig | None:
-        return common.camera_config(self.cameras, self.image)
-
-    def _repo_id(self) -> str:
-        robot, task = self.env.get("robot", EnvConfig.robot), self.env.get("task", EnvConfig.task)
-        return self.dataset.repo_id or f"local/{scene_name(robot, task)}"
-
-    def _folders(self) -> tuple[Path, Path]:
-        require_repo_id(self._repo_id())
-        root = self.dataset.root or Path("datasets") / self._repo_id().partition("/")[2]
-        return root, root.with_name(f"{root.name}.journals")
 
     def _is_complete(self, root: Path, journals: Path) -> bool:
         """Return whether a resumed recording is complete."""
@@ -136,9 +114,7 @@ class RecordOptions:
             raise ManipError(f"no {journals} to continue from; record {root} again with --overwrite=true")
         return Dataset.open(root).info.episodes == self.dataset.num_episodes
 
-    def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:
-        from dataclasses import asdict
-
+    def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance, record
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
@@ -149,9 +125,8 @@ class RecordOptions:
         warn(*journal_of(journals, job).prepare())
         save_options(journals, self)
         video = asdict(VideoConfig(**self.dataset.rgb_encoder)) if job.cameras else {}
-        recording = Recording(self._repo_id(), True, count, provenance(job), video)
-        kept = f"every finished episode, in {journals}"
-        with Stages(kept) as stages, engine:
+        recording = Recording(repo_id, True, count, provenance(job), video)
+        with Stages(f"every finished episode, in {journals}") as stages, self.engine.open() as engine:
             stages.start(f"record {job.env.robot} {job.env.task}", max(0, count - len(list_seeds(journals))))
             episodes = collect_successes(engine, job, seeds, count, journals, stages.episode)
             info, failed = record(episodes, journals, root, job, recording, replace=self.resume)

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.data_edits import RedrawOptions
 from manip_il.cli.inputs import dataset_differences, exists, require_dataset, start_policy
 from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import ResumableOutput, check_same_options, prepare_output, save_options
+from manip_il.cli.outputs import ResumableOutput
 from manip_il.cli.progress import Progress, Stages, say, set_quiet, warn
-from manip_il.data.atomic import exclusive
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig, check_weights
 from manip_il.option import option
@@ -63,11 +61,6 @@ class TrainOptions:
         "resume",
     )
     dataset: SourceGroup
-    redraw: int = option(
-        0,
-        "learn from so many scenes drawn anew from the dataset's states (manip-il data redraw), for pictures",
-        at_least=0,
-    )
     weights: Path | None = option(
         None,
         "draw frames by the progress in this file of manip-il data score, as LeRobot's RA-BC weighs them",
@@ -79,14 +72,10 @@ class TrainOptions:
     output: ResumableOutput = group(ResumableOutput(Path("runs/train")), prefix="")
 
     def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        config = self._fit_config()
+        """Refuse what does not go together, and a folder that is taken."""
         check_weights(self.dataset.root, self.dataset.weights)
-        self._check_redraw(config)
-        if self.weights is not None and (len(self.dataset.root) > 1 or self.redraw):
-            raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
-        if not self.redraw:
-            self._check_columns(config)
+        if self.weights is not None and len(self.dataset.root) > 1:
+            raise UsageError("--weights is for the frames of one dataset; give one --dataset.root")
         if _is_first_process():
             self.output.check()
 
@@ -96,44 +85,36 @@ class TrainOptions:
 
         if not _is_first_process():
             set_quiet(True)
-        config = self._fit_config()
+        config, folder = self._fit_config(), self.output.output_dir
         lerobot = LeRobotFit(config)  # refuses what LeRobot would, before anything is written
-        with contextlib.ExitStack() as held:
-            root = self._redrawn(held) if self.redraw else None
-            sources = self._sources(config, (root,) if root else tuple(self.dataset.root))
-            weights = self._frame_weights(lerobot, sources.datasets[0])
-            if root is None:
-                self._prepare(held)
+        sources = self._sources(config)
+        weights = self._frame_weights(lerobot, sources.datasets[0])
+        with self.output.open(self) if _is_first_process() else contextlib.nullcontext():
             path = self._fit(config, sources, weights)
         if _is_first_process():
-            say(f"checkpoint: {path}")
             robot = common.own_robot(sources.spec.robot, suffix=".yaml")
-            say(f"next: manip-il eval --policy.path={path}{robot} --output_dir={self.output.output_dir}/eval")
+            say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path}{robot} --output_dir={folder}/eval")
 
-    def _prepare(self, held: contextlib.ExitStack) -> None:
-        """Hold the run's folder, emptied or with the run to resume."""
-        if _is_first_process():
-            folder, resume = self.output.output_dir, self.output.resume
-            held.enter_context(exclusive(folder))
-            prepare_output(folder, resume=resume, overwrite=self.output.overwrite)
-            if resume:
-                check_same_options(folder, self)
+    def _fit_config(self) -> FitConfig:
+        from manip_il.seeding import stream_base
 
-    def _check_columns(self, config: FitConfig) -> None:
-        """Refuse datasets that lack what the policy looks at."""
-        from manip_il.data.info import read_info
-        from manip_il.learn.sources import input_columns
+        policy, seed = start_policy(self.fit.get("policy", {})), stream_base("training", self.seed)
+        own: Given = {"policy": policy, "seed": seed, "trust": self.trust}
+        return FitConfig(**self.fit | own)
 
-        for root in self.dataset.root:
-            input_columns(config, root, read_info(root))
+    def _sources(self, config: FitConfig) -> Sources:
+        """Return the datasets, which must agree with the first."""
+        from manip_il.data.dataset import Dataset
+        from manip_il.learn.names import PLAIN
+        from manip_il.learn.sources import Sources
 
-    def _check_redraw(self, config: FitConfig) -> None:
-        if self.redraw and len(self.dataset.root) > 1:
-            raise UsageError("--redraw is for one dataset; redraw each by manip-il data redraw, and give those")
-        if self.redraw and not config.takes_images:
-            raise UsageError("--redraw is for policies on pictures; use --policy.type=cnn, or --observation=images")
-        if self.redraw and RANK in os.environ:
-            raise UsageError("--redraw is not for processes that were started together; redraw by manip-il data redraw")
+        sources = Sources(tuple(map(Dataset.open, self.dataset.root)), tuple(self.dataset.weights))
+        sources.check_alike(pictures=config.takes_images, language=config.kind not in PLAIN)
+        for one in sources.datasets:
+            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
+            odd = [key for key in one.cameras if config.takes_images and not one.features[key].is_rgb]
+            warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
+        return sources
 
     def _frame_weights(self, lerobot: LeRobotFit, dataset: Dataset) -> NDArray[np.float64] | None:
         """Return how often each frame is drawn, relative to the others, (N,); None if all are drawn alike."""
@@ -147,54 +128,13 @@ class TrainOptions:
         say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         return weights
 
-    def _redrawn(self, held: contextlib.ExitStack) -> Path:
-        """The dataset of redrawn scenes in the run's folder, which is held from here on; made if it is not there."""
-        from manip_il.collect.edits import open_source
-
-        source, target = self.dataset.root[0], self.output.output_dir / "redrawn"
-        open_source(source)  # refuses one without states before anything is removed
-        self._prepare(held)
-        save_options(self.output.output_dir, self)
-        if not target.is_dir():
-            RedrawOptions(source, target, self.redraw, seed=self.seed).make()
-        return target
-
-    def _fit_config(self) -> FitConfig:
-        from manip_il.seeding import stream_base
-
-        policy, seed = start_policy(self.fit.get("policy", {})), stream_base("training", self.seed)
-        own: Given = {"policy": policy, "seed": seed, "trust": self.trust}
-        return FitConfig(**self.fit | own)
-
-    def _sources(self, config: FitConfig, roots: tuple[Path, ...]) -> Sources:
-        """Return the datasets, which must agree with the first."""
-        from manip_il.data.dataset import Dataset
-        from manip_il.learn.names import PLAIN
-        from manip_il.learn.sources import Sources
-
-        sources = Sources(tuple(map(Dataset.open, roots)), tuple(self.dataset.weights))
-        sources.check_alike(pictures=config.takes_images, language=config.kind not in PLAIN)
-        for one in sources.datasets:
-            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
-            odd = [key for key in one.cameras if config.takes_images and not one.features[key].is_rgb]
-            warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
-        looks = sources.looks if config.takes_images else []
-        for root, look in zip(roots, looks, strict=False):
-            if look != looks[0]:
-                warn(f"light differs: {roots[0]} has {looks[0]}, {root} has {look}; evaluated in the first")
-        return sources
-
     def _fit(self, config: FitConfig, sources: Sources, weights: NDArray[np.float64] | None) -> Path:
         from manip_il.learn.train import Trainer
 
-        folder = self.output.output_dir
+        folder, resume = self.output.output_dir, self.output.resume
         pictures = sum(len(one) * len(one.cameras) for one in sources.datasets) if config.takes_images else 0
         with Progress(pictures, "decode pictures, once") as bar:
-            trainer = Trainer(
-                sources, config, folder, resume=self.output.resume, on_frames=bar.advance, weights=weights
-            )
-        if _is_first_process():
-            save_options(folder, self)  # now that what can be wrong has been found
+            trainer = Trainer(sources, config, folder, resume=resume, on_frames=bar.advance, weights=weights)
         steps = config.steps_per_checkpoint
         with Stages(f"every finished checkpoint in {folder} (one every {steps:,} steps)") as stages:
             stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)

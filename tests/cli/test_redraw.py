@@ -106,29 +106,6 @@ def test_a_dataset_of_another_scene_is_refused(lacks, demos, tmp_path, capsys):
 
 @pytest.mark.gl
 @pytest.mark.slow
-def test_train_redraws_in_passing_and_goes_on_after_a_kill(demos, tmp_path, capsys):
-    run = tmp_path / "run"
-    words = ["train", f"--dataset.root={demos}", "--policy.type=cnn", "--policy.width=16", "--redraw=30", "--steps=2"]
-    words += ["--batch_size=4", "--log_freq=1", f"--output_dir={run}", "--quiet"]
-    assert main(words) == 0
-    assert Dataset.open(run / "redrawn").info.frames == 30
-    config = json.loads((run / "checkpoints/last/pretrained_model/config.json").read_text())
-    assert set(config["input_features"]) == {
-        "observation.state", "observation.images.front", "observation.images.side", "observation.images.wrist"
-    }  # fmt: skip
-    shutil.rmtree(run / "checkpoints")
-    before = digests(run / "redrawn")
-    assert main([*words, "--resume=true"]) == 0
-    assert digests(run / "redrawn") == before
-    capsys.readouterr()
-    assert main([*words[:2], "--redraw=30", f"--output_dir={tmp_path / 'mlp'}"]) == 2
-    assert "--redraw is for policies on pictures; use --policy.type=cnn" in capsys.readouterr().err
-    assert main([*words[:2], f"--dataset.root={demos},{run / 'redrawn'}", *words[2:]]) == 2
-    assert "--redraw is for one dataset" in capsys.readouterr().err
-
-
-@pytest.mark.gl
-@pytest.mark.slow
 def test_dagger_by_pictures_redraws_every_rounds_states_the_same_after_a_kill(demos, tmp_path, capsys):
     run = tmp_path / "run"
     words = ["dagger", f"--dataset.root={demos}", "--policy.type=cnn", "--policy.width=16", "--redraw=60"]
