@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, field, replace
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -19,10 +18,8 @@ from manip_il.option import option
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
-    from manip_il.evaluation.arm import Arm, Member
-    from manip_il.evaluation.comparison import Comparison
+    from manip_il.evaluation.arm import Member
     from manip_il.evaluation.trial import Trial
-    from manip_il.sim.config import EnvConfig
 
 AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; seconds "
@@ -70,16 +67,13 @@ class CompareOptions:
     output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")
 
     def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        from manip_il.evaluation.rounds import Rule  # here, as help needs no statistics
-
+        """Refuse what does not go together."""
         self.output.check()
         if self._is_study:
             return
         if len(self.sides) != 2 or any(side.suffix in _YAML for side in self.sides):
             raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML of one study")
         left, right = self.sides
-        Rule.parse(self.checkpoint, self.at)
         if left.resolve() == right.resolve():
             raise UsageError(f"{left} is compared with itself; give two different ones")
 
@@ -126,11 +120,7 @@ class CompareOptions:
             report = compare_report(comparison, command_line("compare", self), facts, to_plain(self))
             report.write(folder / REPORT_FILE)
         print_table(comparison_table(comparison))
-        for line in (*facts, comparison.verdict):
-            say(line)
-        say(f"result: {folder / FILE_NAME}")
-        say(f"report: {folder / REPORT_FILE}")
-        say(f"next: {self._next(comparison)}")
+        say(*facts, comparison.verdict, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
 
     def _trial(self, members: Sequence[Member]) -> Trial | None:
         """Return the test to run, checked; None if all is evaluated already."""
@@ -139,6 +129,7 @@ class CompareOptions:
         from manip_il.evaluation.comparison import require_same_episodes
         from manip_il.evaluation.results import compare_results
         from manip_il.evaluation.trial import Trial
+        from manip_il.learn.checkpoint import Checkpoint
 
         if members[0].result is not None:
             first = members[0]
@@ -149,22 +140,7 @@ class CompareOptions:
             return None
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
-        trial = Trial.of(common_env(members, self._policy_env), seeds, self.suite, policies.values(), self.trust)
+        env = common_env(members, lambda policy: common.env_config(self.env, Checkpoint.open(policy).origin))
+        trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)
         check_policies(policies, trial)
         return trial
-
-    def _policy_env(self, policy: Path) -> EnvConfig:
-        from manip_il.learn.checkpoint import Checkpoint
-
-        return common.env_config(self.env, Checkpoint.open(policy).origin)
-
-    def _next(self, comparison: Comparison) -> str:
-        loser: Arm = comparison.left if comparison.difference > 0 else comparison.right
-        if any(member.policy is None for arm in comparison.arms for member in arm.members):
-            return "manip-il compare STUDY.yaml  (does it hold for other training seeds?)"
-        folder = self.output.output_dir
-        if self.suite == "nominal":
-            output = replace(self.output, output_dir=Path(f"{folder}_disturbed"))
-            return command_line("compare", replace(self, suite="disturbed", output=output))
-        words = [f"--policy.path={loser.members[0].policy}", "--eval.films=3", f"--output_dir={folder}_films"]
-        return shlex.join(["manip-il", "eval", *words])

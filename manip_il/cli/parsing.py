@@ -51,7 +51,7 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
     return from_layers(cls, [(str(path), _read_yaml(path))])
 
 
-def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Mapping[str, Any]]]) -> T:
+def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]]) -> T:
     """Read options from trees of differences, as YAML gives them; a later tree wins.
 
     layers: the origin of a tree, for error messages, and the tree. `UsageError` as from a YAML file.
@@ -146,19 +146,18 @@ def _next_value(name: str, known: Known, rest: list[str]) -> str:
     return rest.pop(0)
 
 
-def _read_yaml(path: Path) -> dict[Any, Any]:
+def _read_yaml(path: Path) -> Any:
     from manip_il.checks import read_yaml
 
-    tree = read_yaml(path, "a YAML file of options")
-    if not isinstance(tree, dict | None):
-        raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of option names to values")
-    return tree or {}
+    return read_yaml(path, "a YAML file of options")
 
 
-def _read_layers(layers: Iterable[tuple[str, Mapping[Any, Any]]], known: Known) -> dict[str, _Said]:
+def _read_layers(layers: Iterable[tuple[str, Any]], known: Known) -> dict[str, _Said]:
     said: dict[str, _Said] = {}
     for origin, tree in layers:
-        said |= _read_tree(tree, known, origin)
+        if not isinstance(tree, dict | None):
+            raise UsageError(f"{origin}: expected a mapping of options, got {shorten(tree)}")
+        said |= _read_tree(tree or {}, known, origin)
     return said
 
 

@@ -17,7 +17,6 @@ from manip_il.cli.study_file import (
     ArmOptions,
     ExpertTest,
     Plan,
-    check_same_file,
     keep_file,
     read_plan,
     with_start_cost,
@@ -27,9 +26,7 @@ from manip_il.errors import NoEffect
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
-    from manip_il.collect.workers import Engine
     from manip_il.evaluation.arm import Member
-    from manip_il.evaluation.results import EvalResult
     from manip_il.evaluation.study import Study as Tested
     from manip_il.evaluation.trial import Trial
     from manip_il.sim.config import EnvConfig
@@ -53,8 +50,6 @@ class Study:
 
         plan = read_plan(self._file, training_seeds, self._trust)
         experts = expert_trials(plan)
-        if self._output.resume:
-            check_same_file(self._root, plan.file)
         with self._output.open(options) as folder:
             keep_file(folder, plan.file)
             self._learn(plan)
@@ -63,11 +58,7 @@ class Study:
             self._report(plan, study, options)
         for table in study.tables():
             print_table(table)
-        for sentence in (study.verdict, *study.facts):
-            say(sentence)
-        say(f"result: {folder / FILE_NAME}")
-        say(f"report: {folder / REPORT_FILE}")
-        say(f"next: {self._next(study)}")
+        say(study.verdict, *study.facts, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
 
     def _learn(self, plan: Plan) -> None:
         """Run one after the other, seed by seed, so that a study that is stopped early has all arms.
@@ -108,16 +99,14 @@ class Study:
         with Stages(kept) as stages, self._engine.open() as engine:
             last = (self._root, engine, stages)
             arms = [Arm(name, tuple(one.measure(trials[name], *last) for one in arm)) for name, arm in chosen.items()]
-            solved = {name: self._test_expert(name, tests, engine, stages) for name, tests in experts.items()}
+            solved = {
+                name: {
+                    test: trial.measure(None, f"expert, {name}, {test}", trial.file(self._root, None), engine, stages)
+                    for test, trial in tests.items()
+                }
+                for name, tests in experts.items()
+            }
         return Tested(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved, plan.within)
-
-    def _test_expert(
-        self, arm: str, trials: Mapping[str, Trial], engine: Engine, stages: Stages
-    ) -> dict[str, EvalResult]:
-        """Return what the expert solves of an arm's task: name of the test -> result."""
-        names = {test: f"expert, {arm}, {test}" for test in trials}
-        files = {test: trial.file(self._root, None) for test, trial in trials.items()}
-        return {test: trial.measure(None, names[test], files[test], engine, stages) for test, trial in trials.items()}
 
     def _trial(self, plan: Plan, name: str, members: Iterable[Member]) -> Trial:
         """The test of an arm's policies, which are checked before any episode runs."""
@@ -146,14 +135,6 @@ class Study:
         command = command_line("compare", options)
         page = study_report(study, f"Study: {what}, {self._file.stem}", command, to_plain(plan.file))
         page.write(self._root / REPORT_FILE)
-
-    def _next(self, study: Tested) -> str:
-        best = max(study.arms, key=lambda arm: arm.test_rate)
-        other = study.baseline if best.name != study.baseline else study.arms[-1].name
-        if other in (None, best.name):
-            return f"manip-il eval --policy.path={best.members[0].policy} --eval.films=3"
-        left, right = self._root / other, self._root / best.name
-        return f"manip-il compare {left} {right} --at=seconds --output_dir={self._root}_seconds"
 
 
 def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:

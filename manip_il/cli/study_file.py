@@ -5,7 +5,6 @@ An arm is `manip-il dagger`, or an algorithm that begins with what round 0 of su
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -35,7 +34,6 @@ LearningOptions = GailOptions | PpoOptions  # an AirlOptions is a GailOptions
 ArmOptions = DaggerOptions | LearningOptions
 ALGORITHMS: Mapping[str, type[LearningOptions]] = {"gail": GailOptions, "airl": AirlOptions, "ppo": PpoOptions}
 OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study itself sets
-ARM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclass
@@ -102,13 +100,16 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
     file = from_yaml(path, StudyFile)
     if training_seeds is not None:
         file = replace(file, training_seeds=training_seeds)
-    _check_numbers(path, file)
+    check_values(file, "")
+    if not file.arms:
+        raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
     arms: dict[str, ArmOptions] = {}
     starts: dict[str, str | None] = {}
     envs: dict[str, EnvConfig] = {}
     for name in file.arms:
-        options = _arm(path, file, name)
         with _named(path, name):
+            checks.name("its name, which becomes a folder,", name)
+            options = read_arm((f"{path}: common", file.common), (f"{path}: arms.{name}", file.arms[name]))
             start = starts[name] = first_arm(options, arms)
             if isinstance(options, DaggerOptions):
                 options = replace(options, trust=trust)
@@ -116,18 +117,11 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
             elif start is not None:
                 envs[name] = learning_env(start, envs[start])
         arms[name] = options
-    experts = {name: _expert_test(path, name, file.expert[name]) for name in file.expert}
-    rule, within = Rule.parse(file.checkpoint, file.at), tuple(_amount(one) for one in file.within)
+    experts = {name: _expert_test(f"{path}: expert.{name}", file.expert[name]) for name in file.expert}
+    rule, within = Rule.parse(file.checkpoint, file.at), tuple(Rule.parse("best", one) for one in file.within)
+    if any(one.amount is None for one in within):
+        raise UsageError(f"{path}: within is {file.within}; expected costs with an amount, such as steps:20000")
     return Plan(file, arms, starts, rule, within, _baseline(file, envs), envs, experts)
-
-
-def _amount(text: str) -> Rule:
-    from manip_il.evaluation.rounds import Rule
-
-    rule = Rule.parse("best", text)
-    if rule.amount is None:
-        raise UsageError(f"within has {text!r}; expected a cost with an amount, such as steps:20000")
-    return rule
 
 
 def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
@@ -145,60 +139,22 @@ def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
 
 
 def keep_file(folder: Path, file: StudyFile) -> None:
-    """Write the study's file beside its runs."""
-    write_file(folder / STUDY_FILE, dump_yaml(file).encode())
+    """Write the study's file beside its runs.
 
-
-def check_same_file(folder: Path, file: StudyFile) -> None:
-    """Raise `MismatchError` for an option that differs from the study's in `folder`; training seeds may be more."""
-    from manip_il.evaluation.report import flatten
-
+    Raises `MismatchError` if another one is there already; training seeds may be more.
+    """
     path = folder / STUDY_FILE
-    if not path.is_file():
-        return
-    before = from_yaml(path, StudyFile)
-    was, now = flatten(to_plain(before)), flatten(to_plain(file))
-    if before.training_seeds <= file.training_seeds:
-        was["training_seeds"] = now["training_seeds"]
-    for name in [*was, *(name for name in now if name not in was)]:
-        if was.get(name) != now.get(name):
-            raise MismatchError(name, str(path), was.get(name, "nothing"), "the file", now.get(name, "nothing"))
+    if path.is_file():
+        before = from_yaml(path, StudyFile)
+        if replace(before, training_seeds=max(before.training_seeds, file.training_seeds)) != file:
+            was, now = to_plain(before), to_plain(file)
+            names = ", ".join(name for name in now if was[name] != now[name])
+            raise MismatchError(names, str(path), "another", "the file", "its own; give another --output_dir")
+    write_file(path, dump_yaml(file).encode())
 
 
-def _check_numbers(path: Path, file: StudyFile) -> None:
-    from manip_il.evaluation.trial import FOLDER
-
-    if not file.arms:
-        raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
-    check_values(file, "")
-    for name in file.arms:
-        is_name = isinstance(name, str) and ARM_NAME.fullmatch(name) and len(name) <= checks.LONGEST_NAME
-        if not is_name or ".." in name or name == FOLDER:
-            raise UsageError(
-                f"{path}: an arm is named {checks.shorten(name)}, which becomes a folder; expected letters, digits, "
-                f"_ . and -, at most {checks.LONGEST_NAME}{', and not ' + FOLDER if name == FOLDER else ''}"
-            )
-
-
-def _arm(path: Path, file: StudyFile, name: str) -> ArmOptions:
-    differences = file.arms[name]
-    if not isinstance(differences, dict | None):
-        raise UsageError(
-            f"{path}: arms.{name}: expected a mapping of options of manip-il dagger, got {checks.shorten(differences)}"
-        )
-    layers = [(f"{path}: common", file.common), (f"{path}: arms.{name}", differences or {})]
-    for origin, tree in layers:
-        if own := next((own for own in OWN if own in tree), None):
-            raise UsageError(f"{origin}: {own} is set by the study itself, for every run; take it out")
-    with _named(path, name):
-        return read_arm(*layers)
-
-
-def _expert_test(path: Path, name: str, tree: Any) -> ExpertTest:
-    origin = f"{path}: expert.{name}"
-    if not isinstance(tree, dict | None):
-        raise UsageError(f"{origin}: expected robot, suite, vary and n_episodes, got {checks.shorten(tree)}")
-    test = from_layers(ExpertTest, [(origin, tree or {})])
+def _expert_test(origin: str, tree: Any) -> ExpertTest:
+    test = from_layers(ExpertTest, [(origin, tree)])
     check_values(test, f"{origin}: ")
     if test.vary and test.suite != "nominal":
         raise UsageError(f"{origin}: has suite and vary; expected one of them")
@@ -216,17 +172,20 @@ def _named(path: Path, arm: str) -> Generator[None]:
         raise
 
 
-def read_arm(common: tuple[str, Mapping[str, Any]], own: tuple[str, Mapping[str, Any]]) -> ArmOptions:
+def read_arm(common: tuple[str, Any], own: tuple[str, Any]) -> ArmOptions:
     """Return an arm's options; each argument is an origin, for errors, and a tree. common: of `manip-il dagger` alone.
 
-    Raises `UsageError` for an option that is none, `UnknownName` for an algorithm.
+    Raises `UsageError` for an option that is none, or that the study sets; `UnknownName` for an algorithm.
     """
     origin, tree = own
-    if ALGORITHM not in tree:
+    for said in (common, own):
+        if name := next((name for name in OWN if name in (said[1] if isinstance(said[1], dict) else ())), None):
+            raise UsageError(f"{said[0]}: {name} is set by the study itself, for every run; take it out")
+    if not isinstance(tree, dict) or ALGORITHM not in tree:
         return from_layers(DaggerOptions, [common, own])
-    name = tree[ALGORITHM]
-    if not isinstance(name, str) or name not in ALGORITHMS:
-        raise UnknownName("algorithm", str(name)[: checks.LONGEST_NAME], ALGORITHMS)
+    name = str(tree[ALGORITHM])
+    if name not in ALGORITHMS:
+        raise UnknownName("algorithm", name, ALGORITHMS)
     return from_layers(ALGORITHMS[name], [(origin, {key: tree[key] for key in tree if key != ALGORITHM})])
 
 

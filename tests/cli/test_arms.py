@@ -84,7 +84,7 @@ def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
         (", dataset.root: cloning}", "}", "arm 'scratch': --dataset.root is missing"),
         ("steps: 300", "rounds: 3", "arms.gail: 'rounds'"),
         ("horizon: 100", "horizon: 99", "arm 'gail': environment differs: arm 'cloning' has"),
-        ("steps:20000", "steps", "within has 'steps'; expected a cost with an amount"),
+        ("steps:20000", "steps", "within is ['steps', 'seconds:60']; expected costs with an amount"),
         ("steps:20000", "stairs:3", "unknown way to compare 'stairs'"),
     ],
 )

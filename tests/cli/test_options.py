@@ -145,7 +145,7 @@ def test_words_beat_yaml_beats_defaults(tmp_path):
         ("dataset: {num_episodes: null}", ["expected a whole number, got None"]),
         ("dataset: {repo_id: no}", ["expected text, got False", "quotes"]),
         ("cameras: front", ["comma-separated list"]),
-        ("- 1", ["holds list", "expected a mapping"]),
+        ("- 1", ["expected a mapping"]),
         ("a: [", ["is not YAML"]),
     ],
 )

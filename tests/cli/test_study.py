@@ -90,7 +90,6 @@ def test_the_answer_is_printed_and_written(here, runs, capsys):
     out = capsys.readouterr().out
     assert "No difference shown between dagger and cloning: +0.0 points" in out
     assert "within 300 labels (the most that every run reached)" in out
-    assert "next: manip-il compare s/dagger s/cloning --at=seconds --output_dir=s_seconds" in out
     data = json.loads((here / "s" / "study.json").read_text())
     assert data["baseline"] == "cloning"
     assert data["rule"] == {"checkpoint": "best", "at": "labels", "limit": 300}
@@ -128,12 +127,9 @@ def test_a_run_that_never_gets_to_the_rules_amount_ends_the_study_at_once(here, 
 @pytest.mark.parametrize(
     ("before", "after", "name"),
     [
-        ("rounds: 2", "rounds: 3", "common.rounds"),
-        ("dagger:", "dagger: {beta: 'constant:0.5'}", "arms.dagger"),
-        ("n_episodes: 2", "n_episodes: 3", "eval.n_episodes"),
-        ("at: labels", "at: end", "at"),
+        ("rounds: 2", "rounds: 3", "common"),
         ("training_seeds: 2", "training_seeds: 1", "training_seeds"),
-        ("  cloning: {method: cloning}\n", "", "arms.cloning.method"),
+        ("  cloning: {method: cloning}\n", "", "arms"),
     ],
 )
 def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs, capsys, error):
@@ -142,7 +138,7 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
     (here / "x.yaml").write_text(FILE.replace(before, after))
     capsys.readouterr()
     assert study("--resume=true") == 1
-    assert f"{name} differs: s/study.yaml has" in error()
+    assert f"{name} differs: s/study.yaml has another" in error()
     assert len(runs) == 4
 
 
@@ -157,15 +153,14 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
         ("rounds: 2", "seed: 2", "x.yaml: common: seed is set by the study itself"),
         ("method: cloning", "output_dir: y", "arms.cloning: output_dir is set by the study itself"),
         ("dagger:\n", "dagger: 3\n", "arms.dagger: expected a mapping"),
-        ("  dagger:", "  ../dagger:", "named '../dagger', which becomes a folder"),
-        ("  dagger:", "  evaluations:", "and not evaluations"),
+        ("  dagger:", "  ../dagger:", "its name, which becomes a folder, is '../dagger'"),
         ("target: 0.6", "target: 60", "target is 60.0; expected 0.0 to 1.0"),
         ("target: 0.6", "baseline: clonning", "did you mean 'cloning'?"),
         ("at: labels", "at: label", "did you mean 'labels'?"),
         ("training_seeds: 2", "training_seeds: 0", "training_seeds is 0"),
         ("n_episodes: 2", "n_episodes: 0", "eval.n_episodes is 0"),
         ("method: cloning", "env.horizon: 9", "horizon differs: arm 'cloning' has 9, arm 'dagger' has 8"),
-        ("at: labels", "expert: {a: 3}", "x.yaml: expert.a: expected robot, suite, vary and n_episodes, got 3"),
+        ("at: labels", "expert: {a: 3}", "x.yaml: expert.a: expected a mapping of options, got 3"),
         ("at: labels", "expert: {a: {suit: all}}", "expert.a: 'suit' (did you mean 'suite'?)"),
         ("at: labels", "expert: {a: {n_episodes: 0}}", "expert.a: n_episodes is 0; expected at least 1"),
         ("at: labels", "expert: {a: {vary: [object], suite: all}}", "has suite and vary; expected one of them"),
