@@ -17,7 +17,7 @@ from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
 from manip_il.data.schema import LABEL_VALID
-from manip_il.evaluation.trial import Progress
+from manip_il.evaluation.runner import Progress
 from manip_il.seeding import stream_seeds
 
 

@@ -19,7 +19,7 @@ from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
     from manip_il.evaluation.arm import Member
-    from manip_il.evaluation.trial import Trial
+    from manip_il.evaluation.runner import Trial
 
 AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; seconds "
@@ -128,7 +128,7 @@ class CompareOptions:
         from manip_il.evaluation.arm import common_env
         from manip_il.evaluation.comparison import require_same_episodes
         from manip_il.evaluation.results import compare_results
-        from manip_il.evaluation.trial import Trial
+        from manip_il.evaluation.runner import Trial
         from manip_il.learn.checkpoint import Checkpoint
 
         if members[0].result is not None:

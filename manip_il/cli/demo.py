@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.report import Film, Report
     from manip_il.evaluation.results import EvalResult
+    from manip_il.evaluation.runner import Trial
     from manip_il.evaluation.tables import PolicyRow
-    from manip_il.evaluation.trial import Trial
 
 RUN = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # in place of `manip-il dagger`'s own
 FIT = {"steps": 3_000, "batch_size": 256}
@@ -125,7 +125,7 @@ class _Demo:
         ]
 
     def _trial(self, folder: str, seeds: range) -> Trial:
-        from manip_il.evaluation.trial import Trial
+        from manip_il.evaluation.runner import Trial
 
         return Trial.of(self.config.env, seeds, SUITES[folder])
 

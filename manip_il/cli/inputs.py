@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.algorithms.config import RunConfig
     from manip_il.collect.drivers import Driver
     from manip_il.data.schema import RobotTaskSpec
-    from manip_il.evaluation.trial import Trial
+    from manip_il.evaluation.runner import Trial
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.learn.reward import LearnedReward
     from manip_il.sim.config import CameraConfig, EnvConfig

@@ -27,8 +27,8 @@ from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
     from manip_il.evaluation.arm import Member
+    from manip_il.evaluation.runner import Trial
     from manip_il.evaluation.study import Study as Tested
-    from manip_il.evaluation.trial import Trial
     from manip_il.sim.config import EnvConfig
 
 
@@ -110,7 +110,7 @@ class Study:
 
     def _trial(self, plan: Plan, name: str, members: Iterable[Member]) -> Trial:
         """The test of an arm's policies, which are checked before any episode runs."""
-        from manip_il.evaluation.trial import Trial
+        from manip_il.evaluation.runner import Trial
 
         policies = {member.name: member.policy for member in members if member.policy is not None}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
@@ -150,8 +150,8 @@ def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
 
 def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
     """Return a test in an arm's environment; None if it would change nothing."""
+    from manip_il.evaluation.runner import Trial
     from manip_il.evaluation.suites import varied
-    from manip_il.evaluation.trial import Trial
     from manip_il.robots.table import get_robot  # here, as help needs no simulator
 
     env = replace(env, robot=test.robot or env.robot)

@@ -17,7 +17,7 @@ from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.policy_folder import EXPECTED, find_policy, require_source
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
-from manip_il.evaluation.trial import Progress, Trial
+from manip_il.evaluation.runner import Progress, Trial
 from manip_il.sim.config import EnvConfig
 
 CONFIG_FILE = "config.yaml"
@@ -109,11 +109,6 @@ class Arm:
     def has_histories(self) -> bool:
         """Whether every policy comes from a run."""
         return all(member.history for member in self.members)
-
-    @property
-    def episodes(self) -> int:
-        """Number of test episodes of each member."""
-        return self.members[0].test.success.n
 
     def map(self, change: Callable[[Member], Member]) -> Arm:
         """Return the arm with every member changed."""

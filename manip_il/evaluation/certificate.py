@@ -173,17 +173,16 @@ class Certificate:
 
     def tables(self) -> tuple[Table, Table]:
         """Return the table of recoveries, and that of the costs of wrong actions."""
-        rows, horizon = self.pooled_rows, self._in_seconds(self.settings["horizon"])
-        head = ("the expert continues from", f"solved in {horizon} {INTERVAL}", "mean steps", "cases", "left out")
+        head = ("the expert continues from", f"solved {INTERVAL}", "mean steps", "cases", "left out")
         cells = [
             (row.words, str(row.success or ""), f"{row.mean_steps:.1f}" if row.mean_steps else "", *row.counts)
-            for row in rows
+            for row in self.pooled_rows
         ]
-        recoveries = Table(head, tuple(cells), tuple(_COLOURS[row.group] for row in rows))
+        recoveries = Table(head, tuple(cells), tuple(_COLOURS[row.group] for row in self.pooled_rows))
         costs: list[tuple[str, ...]] = []
         for row in [*self.of("action"), self.actions]:
             if gaps := row.gaps:
-                seconds = map(self._in_seconds, (gaps.p95, gaps.p99, gaps.largest))
+                seconds = map(self.in_seconds, (gaps.p95, gaps.p99, gaps.largest))
                 costs.append((row.words, f"{gaps.mean:.1f}", *seconds, str(gaps.unrecovered), row.counts[0]))
         head = ("one wrong action costs, in steps", "mean", "95th", "99th", "largest", "never solved", "cases")
         return recoveries, Table(head, tuple(costs))
@@ -193,7 +192,7 @@ class Certificate:
         gaps, lines = self.actions.gaps, list[str]()
         if gaps is not None:
             whole = ", the whole horizon" if gaps.unrecovered else ""
-            largest = self._in_seconds(gaps.largest)
+            largest = self.in_seconds(gaps.largest)
             # exact for independent draws, none of which cost more
             above = 1 - (1 - CONFIDENCE) ** (1 / len(self.actions.cases))
             lines.append(
@@ -205,7 +204,8 @@ class Certificate:
             lines.append(f"The policy had solved {row.left_out} of {count} before the expert's turn.")
         return lines
 
-    def _in_seconds(self, steps: int) -> str:
+    def in_seconds(self, steps: int) -> str:
+        """Return `100 steps (5 s)`."""
         return f"{steps} steps ({steps / self.settings['control_hz']:.3g} s)"
 
 
@@ -216,9 +216,10 @@ def certificate_report(certificate: Certificate, command: str, config: Mapping[s
     changed = f"{states.success} of {len(states.cases):,} changed states" if states.success else "no changed state"
     rows = [row for row in certificate.pooled_rows if row.name != "all"]
     bars = [Bar(row.words, (row.success,), _COLOURS[row.group]) for row in rows if row.success]
+    horizon = certificate.in_seconds(certificate.settings["horizon"])
     note = (
-        "An episode is perturbed once, at a step drawn from those of the undisturbed one; the expert then has a whole "
-        "horizon. Left out: the perturbation changed nothing, or found no place."
+        "An episode is perturbed once, at a step drawn from those of the undisturbed one; the expert then has "
+        f"{horizon}. Left out: the perturbation changed nothing, or found no place."
     )
     cost_note = "The cost of an action: control steps until solved after it, less those of the undisturbed episode."
     return Report(

@@ -25,7 +25,7 @@ from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, RenderError
 from manip_il.evaluation.report import Film, Still
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.trial import Progress
+from manip_il.evaluation.runner import Progress
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.config import FILM, CameraConfig

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
@@ -114,9 +115,10 @@ def _plain(value: object) -> str:
     return "(empty)" if isinstance(value, Mapping) else str(value)
 
 
-def _keep_together(sentence: str) -> str:
-    """A sentence in which a number keeps its unit, and a comparison its sign, on one line."""
-    return re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", sentence)
+def _prose(words: str) -> Markup:
+    """Words in which a number keeps its unit, and a comparison its sign, on one line; paths break after a slash."""
+    kept = re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", words)
+    return escape(kept).replace("/", Markup("/<wbr>"))
 
 
 def _split_interval(cell: str) -> tuple[str, str]:
@@ -135,7 +137,8 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
     )
     filters: dict[str, Any] = {
-        "prose": _keep_together,
+        "prose": _prose,
+        "heading": lambda column: column if "/" in column else column[:1].upper() + column[1:],
         "split_interval": _split_interval,
         "base64": lambda content: base64.b64encode(content).decode("ascii"),
         "durations": lambda timings: {name: format_seconds(seconds) for name, seconds in timings.items()},

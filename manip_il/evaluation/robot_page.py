@@ -112,6 +112,7 @@ def start_figures(check: RobotCheck) -> tuple[Figure, ...]:
             axis.plot(*np.reshape(task.goals, (-1, 2)).T, "s", ms=3.5, mfc="none", mec=CLONING)
             axis.plot(*np.reshape(task.objects, (-1, 2)).T, "o", ms=3.5, color=DAGGER)
             axis.set(xlim=extent[:2], ylim=extent[2:], xlabel="x [m]", ylabel="y [m]")
+            axis.grid(visible=False)
             axis.set_title(f"{plain(task.name)}: {words}", loc="left")
             figures.append(to_figure(drawn, f"Starts of {task.name} from above: {words}"))
     return tuple(figures)

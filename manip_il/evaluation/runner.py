@@ -1,28 +1,32 @@
-"""Evaluate one policy on given seeds: each finished episode is kept at once, and any can be run again alone."""
+"""Evaluate policies on given seeds: what is finished is kept at once, and any episode can be run again alone."""
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from manip_il.collect.drivers import ExpertDriver, PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
+from manip_il.data.fingerprint import canonical_json
 from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.learn.policy_files import policy_sha256
+from manip_il.evaluation.suites import suite_conditions
+from manip_il.learn.policy_files import policy_cameras, policy_sha256
 from manip_il.mdp import F64, Episode, State
-from manip_il.sim.conditions import NOMINAL, draw
+from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.sim.config import EnvConfig
 from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.world import World
@@ -35,7 +39,27 @@ _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
 CHECK_EVERY = 100  # episodes after which the width of the interval is checked
 EPISODES_FILE = "episodes.jsonl"
+FOLDER = "evaluations"  # of trials
 _world = lru_cache(SCENES_KEPT)(World)
+
+
+class Progress(Protocol):
+    """Interface of what shows work under way, a stage of so many episodes or steps at a time."""
+
+    def start(self, description: str, total: int) -> None:
+        """Begin a stage."""
+
+    def episode(self, episode: Episode | EpisodeResult) -> None:
+        """Count an episode."""
+
+    def step(self) -> None:
+        """Count a step."""
+
+    def log(self, record: dict[str, Any]) -> None:
+        """Take a fit's metrics at a step."""
+
+    def close(self) -> None:
+        """End the stage."""
 
 
 def evaluate(
@@ -194,3 +218,59 @@ def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]
     pairs = {name: (getattr(before, name), getattr(after, name)) for name in ("success", "success_at_end", "steps")}
     pairs |= {"return": (before.ret, after.ret)}
     return [f"{name} was {was}, is {value}" for name, (was, value) in pairs.items() if was != value]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Environment, seeds and conditions of a test; trust: whether models that checkpoints name may be loaded."""
+
+    env: EnvConfig
+    seeds: range
+    suite: str = "nominal"
+    conditions: tuple[Condition, ...] = ()
+    trust: bool = False
+
+    @classmethod
+    def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path] = (), trust: bool = False) -> Trial:
+        """Make one of a suite's conditions, without those of cameras if none of the policies uses any."""
+        sees = any(policy_cameras(policy) is not None for policy in policies)
+        return cls(env, seeds, suite, suite_conditions(suite, env, sees=sees), trust)
+
+    def job(self, policy: Path | None) -> RolloutJob:
+        """Return the rollouts of one policy; None: of the expert."""
+        driver = ExpertDriver() if policy is None else PolicyDriver((policy,), trust=self.trust)
+        return RolloutJob(self.env, driver, episode_hold(self.env), label="last", conditions=self.conditions)
+
+    def file(self, folder: Path, policy: Path | None) -> Path:
+        """Return the file of a policy's or the expert's evaluation, named after its files, environment and episodes.
+
+        So another policy of the same name is another file, and what was measured before stays true.
+        """
+        settings = EvalSettings.of(self.job(policy), self.suite).to_json()
+        sha256 = policy and policy_sha256(policy)
+        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), settings, sha256)
+        return folder / FOLDER / f"{hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]}.json"
+
+    def measure(
+        self,
+        policy: Path | None,
+        name: str,
+        file: Path,
+        engine: Engine,
+        progress: Progress,
+        *,
+        complete: bool = True,
+    ) -> EvalResult:
+        """Return the evaluation of a policy from its file, which is made first if it is not there.
+
+        name: in progress and results. complete: raise `ManipError` if workers died of a seed, which leaves it out.
+        """
+        if not file.is_file():
+            progress.start(f"test {name}{'' if self.suite == 'nominal' else ', ' + self.suite}", len(self.seeds))
+            result = evaluate(engine, self.job(policy), self.seeds, name, progress.episode, suite=self.suite)
+            progress.close()
+            if complete and len(result.episodes) < len(self.seeds):
+                have = f"{len(result.episodes)} of {len(self.seeds)}"
+                raise ManipError(f"{name} has {have} test episodes, because workers died")
+            result.write(file)
+        return EvalResult.read(file)

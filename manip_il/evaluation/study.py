@@ -9,7 +9,7 @@ from statistics import fmean
 from typing import Any
 
 from manip_il.errors import ManipError, UnknownName
-from manip_il.evaluation.arm import Arm, Member
+from manip_il.evaluation.arm import Arm
 from manip_il.evaluation.comparison import Comparison, seeds_facts
 from manip_il.evaluation.intervals import Proportion, format_percent
 from manip_il.evaluation.results import EvalResult
@@ -68,11 +68,11 @@ class Study:
             reach, worst = sum(arm.test_rate >= self.target for arm in ranked), ranked[-1]
             least = f"the last, {worst.name}, solves {format_percent(worst.test_rate)}"
             return f"{reach} of {len(ranked)} solve {100 * self.target:g} % of their unseen starts; {least}."
-        best, seeds = ranked[0], len(self.training_seeds)
+        best, seeds, n = ranked[0], len(self.training_seeds), ranked[0].members[0].test.success.n
         over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
         other = next((arm for arm in ranked[1:] if best.name == self.baseline or arm.name == self.baseline), None)
         behind = f"; {other.name} {format_percent(other.test_rate)}" if other else ""
-        return f"{best.name} solves {format_percent(best.test_rate)} of {best.episodes:,} unseen starts{over}{behind}."
+        return f"{best.name} solves {format_percent(best.test_rate)} of {n:,} unseen starts{over}{behind}."
 
     @property
     def facts(self) -> list[str]:
@@ -116,16 +116,15 @@ class Study:
 
         def best(arm: Arm, rule: Rule) -> str:
             rounds = [rule.within(member.history, rule.amount) for member in arm.members]
-            best = [max((one.validation for one in own), key=lambda one: one.rate) for own in rounds if own]
-            return _rates(best) if len(best) == len(rounds) else ""
+            return (
+                _rates([max((one.validation for one in own), key=lambda one: one.rate) for own in rounds])
+                if all(rounds)
+                else ""
+            )
 
-        columns = [
-            f"within {format_amount(one.axis, one.amount)}" for one in self.within if one.axis != "end" and one.amount
-        ]
-        return Table(
-            ("arm, validation", *columns),
-            tuple((arm.name, *(best(arm, rule) for rule in self.within)) for arm in self.arms),
-        )
+        columns = [f"within {format_amount(one.axis, one.amount or 0)}" for one in self.within if one.axis != "end"]
+        rows = [(arm.name, *(best(arm, rule) for rule in self.within)) for arm in self.arms]
+        return Table(("arm, validation", *columns), tuple(rows))
 
     def reached(self, arm: Arm) -> list[Round | None]:
         """Return the round of each training seed in which validation first reached the target."""
@@ -149,9 +148,12 @@ class Study:
         comparison = self.comparisons.get(arm.name)
         return {
             "test_success": arm.test_rate,
-            "validation_success": fmean(_chosen(member).validation.rate for member in arm.members),
+            "validation_success": fmean(one.chosen.validation.rate for one in arm.members if one.chosen),
             "against_baseline": comparison.to_json() if comparison else None,
-            "expert": {name: _expert_json(result) for name, result in self.experts.get(arm.name, {}).items()},
+            "expert": {
+                name: {"success_rate": one.rate, "interval": list(one.interval), "n_episodes": one.n}
+                for name, one in ((name, found.success) for name, found in self.experts.get(arm.name, {}).items())
+            },
             "training_seeds": [
                 {"seed": member.training_seed}
                 | member.to_json()
@@ -171,25 +173,12 @@ def arms_table(arms: Sequence[Arm], comparisons: Mapping[str, Comparison]) -> Ta
     rows: list[tuple[str, ...]] = []
     for arm in arms:
         chosen = [member.chosen for member in arm.members if member.chosen]
-        known = (
-            [*(_mean_cost(cost, chosen) for cost in costs), _rates([one.validation for one in chosen])]
-            if chosen
-            else []
-        )
-        tests = _rates([member.test.success for member in arm.members])
+        known = [""] * (len(costs) + 1)
+        if chosen:
+            known = [*(_mean_cost(cost, chosen) for cost in costs), _rates([one.validation for one in chosen])]
         against = comparisons[arm.name].numbers if arm.name in comparisons else ""
-        rows.append((arm.name, *(known or [""] * (len(costs) + 1)), tests, against))
+        rows.append((arm.name, *known, _rates([member.test.success for member in arm.members]), against))
     return Table(("arm", *map(_head, costs), "validation", "test", f"test, against {baseline}"), tuple(rows))
-
-
-def _expert_json(result: EvalResult) -> dict[str, Any]:
-    success = result.success
-    return {"success_rate": success.rate, "interval": list(success.interval), "n_episodes": success.n}
-
-
-def _chosen(member: Member) -> Round:
-    assert member.chosen is not None
-    return member.chosen
 
 
 def _head(cost: Cost) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.errors import RenderError
-from manip_il.evaluation import runner, trial
+from manip_il.evaluation import runner
 
 from .made_runs import make_policy
 
@@ -49,8 +49,7 @@ def evaluated(monkeypatch) -> list[str]:
         names.append(name)
         return real(engine, job, seeds, name, *rest, **named)
 
-    for module in (runner, trial):
-        monkeypatch.setattr(module, "evaluate", counted)
+    monkeypatch.setattr(runner, "evaluate", counted)
     return names
 
 
