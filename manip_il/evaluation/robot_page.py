@@ -105,9 +105,9 @@ def start_figures(check: RobotCheck) -> tuple[Figure, ...]:
     extent = (x - half - _ROOM, x + half + _ROOM, y - half - _ROOM, y + half + _ROOM)
     figures: list[Figure] = []
     for task in check.tasks:
-        with drawing(1, size=(3.0, 3.0)) as (drawn, axes):
+        with drawing(1, size=(2.8, 2.8)) as (drawn, axes):
             axis, words = axes[0, 0], f"{task.found} of {task.drawn} starts" if task.drawn else "no scene"
-            axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=2, interpolation="nearest")
+            axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=3, interpolation="nearest")
             axis.plot(*np.array([(x + a * half, y + b * half) for a, b in _SQUARE]).T, color=INK, lw=1)
             axis.plot(*np.reshape(task.goals, (-1, 2)).T, "s", ms=3.5, mfc="none", mec=CLONING)
             axis.plot(*np.reshape(task.objects, (-1, 2)).T, "o", ms=3.5, color=DAGGER)
