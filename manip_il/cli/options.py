@@ -102,24 +102,21 @@ def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, .
     for one, kind, default in fields_of(cls, base):
         inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
         if "given" in one.metadata:
-            defaults = one.metadata["defaults"]
-            for option in given_options(one):
-                changes = {"default": defaults[option.name]} if option.name in defaults else {}
-                name = option.metadata.get("flag", inner + option.name)
-                found.append(dataclasses.replace(option, name=name, path=(*here, option.name), **changes))
+            source, only, defaults = (one.metadata[key] for key in ("given", "only", "defaults"))
+            for theirs in dataclasses.fields(source):
+                if "help" in theirs.metadata and (not only or theirs.name in only):
+                    name = theirs.metadata.get("flag", inner + theirs.name)
+                    own = defaults.get(theirs.name, _default(theirs))
+                    found.append(
+                        Option(
+                            name, (*here, theirs.name), _type_of(source, theirs), own, theirs.metadata, is_given=True
+                        )
+                    )
         elif dataclasses.is_dataclass(kind):
             found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
         else:
             found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata))
     return found
-
-
-def given_options(one: dataclasses.Field[Any]) -> Iterator[Option]:
-    """Yield the options of a `Given` field, by the names of the fields."""
-    cls, only = one.metadata["given"], one.metadata["only"]
-    for inner in dataclasses.fields(cls):
-        if "help" in inner.metadata and (not only or inner.name in only):
-            yield Option(inner.name, (inner.name,), _type_of(cls, inner), _default(inner), inner.metadata, True)
 
 
 def fields_of(cls: type, base: Any) -> Iterator[tuple[dataclasses.Field[Any], Any, Any]]:
@@ -202,13 +199,26 @@ def expected(option_type: Any) -> str:
     return f"one of {', '.join(named)}" if named else _EXPECTED.get(option_type, "text")
 
 
-def decode(option_type: Any, value: Any, *, is_word: bool = False) -> Any:
-    """Return `value` as the declared type; `ValueError` if it is none. is_word: `null` and commas have a meaning."""
+def from_word(option_type: Any, word: str) -> Any:
+    """Return a word of the command line as YAML would give it: `null`, and commas of a list, have a meaning."""
     if (some := without_none(option_type)) is not option_type:
-        is_none = value is None or (is_word and value.lower() in ("null", "none"))
-        return None if is_none else decode(some, value, is_word=is_word)
+        return None if word.lower() in ("null", "none") else from_word(some, word)
+    if typing.get_origin(option_type) is not list:
+        return word
+    inner = word[1:-1] if word.startswith("[") and word.endswith("]") else word
+    return [item.strip().strip("'\"") for item in inner.split(",")] if inner.strip() else []
+
+
+def decode(option_type: Any, value: Any) -> Any:
+    """Return `value`, as YAML gives it or as text, as the declared type; `ValueError` if it is none."""
+    if (some := without_none(option_type)) is not option_type:
+        return None if value is None else decode(some, value)
     if typing.get_origin(option_type) is list:
-        return _decode_list(typing.get_args(option_type)[0], value, is_word)
+        (item_type,) = typing.get_args(option_type)
+        items = [value] if item_type is Path and isinstance(value, str) else value  # one path for a list of one
+        if not isinstance(items, list):
+            raise ValueError
+        return [decode(item_type, item) for item in typing.cast(list[Any], items)]
     if named := choices(option_type):
         if value not in named:
             raise ValueError
@@ -218,37 +228,29 @@ def decode(option_type: Any, value: Any, *, is_word: bool = False) -> Any:
     return _decode_scalar(option_type, value)
 
 
-def _decode_list(item_type: Any, value: Any, is_word: bool) -> list[Any]:
-    if is_word:
-        inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
-        value = [item.strip().strip("'\"") for item in inner.split(",")] if inner.strip() else []
-        if "" in value:
-            raise ValueError
-    if item_type is Path and isinstance(value, str):
-        value = [value]  # in YAML one path stands for a list of one
-    if not isinstance(value, list):
-        raise ValueError
-    return [decode(item_type, item) for item in typing.cast(list[Any], value)]
-
-
 def _decode_scalar(option_type: Any, value: Any) -> Any:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if option_type is bool:
-        if isinstance(value, bool):
+    if isinstance(value, bool):
+        if option_type is bool:
             return value
-        if value in ("true", "false"):
-            return value == "true"
-    elif option_type is int and (isinstance(value, str) or (is_number and isinstance(value, int))):
-        return int(value)
-    elif option_type is float and (isinstance(value, str) or is_number):
-        number = float(value)
-        if number == number:  # NaN would slip through every range check
-            return number
-    elif option_type is str and isinstance(value, str):
-        return value
-    elif option_type is Path and isinstance(value, str) and value:
-        # A shell leaves the tilde of `--root=~/x` alone.
-        return Path(value).expanduser() if value == "~" or value.startswith("~/") else Path(value)
+    elif isinstance(value, int | float):
+        if option_type is float and value == value:  # NaN would slip through every range check
+            return float(value)
+        if option_type is int and isinstance(value, int):
+            return value
+    elif isinstance(value, str):
+        return _decode_text(option_type, value)
+    raise ValueError
+
+
+def _decode_text(option_type: Any, text: str) -> Any:
+    if option_type is str:
+        return text
+    if option_type is bool and text in ("true", "false"):
+        return text == "true"
+    if option_type is int or (option_type is float and float(text) == float(text)):
+        return option_type(text)
+    if option_type is Path and text:  # a shell leaves the tilde of `--root=~/x` alone
+        return Path(text).expanduser() if text == "~" or text.startswith("~/") else Path(text)
     raise ValueError
 
 

@@ -9,30 +9,42 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from manip_il import __version__
 from manip_il.checks import shorten
-from manip_il.cli.options import Option, choices, decode, expected, fields_of, options_of, to_plain, without_none
+from manip_il.cli.options import (
+    Option,
+    choices,
+    decode,
+    expected,
+    fields_of,
+    from_word,
+    options_of,
+    to_plain,
+    without_none,
+)
 from manip_il.errors import UsageError, did_you_mean, nearest, nearest_names
 from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
 _FEW = 3
-_PATHS = (Path, list[Path])
 type Known = Mapping[str, Option]
 
 
-@dataclass(frozen=True)
-class _Said:
-    """A value as the user gave it, and its origin, for the error message."""
+class _Said(NamedTuple):
+    """A value as the user gave it, and its origin, for the error message: `--NAME`, or which file's key."""
 
     value: Any
     origin: str
-    is_word: bool  # from the command line, where everything is text
+
+    @property
+    def is_word(self) -> bool:
+        """Whether it is from the command line."""
+        return self.origin.startswith("--")
 
 
 def parse[T](cls: type[T], words: Sequence[str], command: str = "") -> T:
@@ -93,30 +105,24 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
         word = rest.pop(0)
         if not word.startswith("--"):
             if not places:
-                raise _unexpected_word(word, known, command)
+                raise _unexpected_word(word, command)
             option = places[0] if places[0].is_list else places.pop(0)
-            if option.is_list:  # takes every word that is left
-                before = said[option.name].value if option.name in said else []
-                said[option.name] = _Said([*before, word], option.label, False)
-            else:
-                said[option.name] = _Said(word, option.label, True)
+            before = said[option.name].value if option.is_list and option.name in said else []
+            said[option.name] = _Said([*before, word] if option.is_list else word, option.label)
             continue
         name, equals, value = word[2:].partition("=")
         if name not in known and name.replace("-", "_") in known:  # as other programs write it
             name = name.replace("-", "_")
-        if group := _open_group(name, known):
-            if not equals and (not rest or rest[0].startswith("--")):
-                raise UsageError(f"--{name} has no value; expected --{name}=VALUE")
-            said[name] = _Said(_as_yaml(value if equals else rest.pop(0), group), f"--{name}", False)
-            continue
-        if name != CONFIG_PATH and (name not in known or known[name].positional or known[name].is_open):
+        group = _open_group(name, known)
+        is_option = name in known and not known[name].positional and not known[name].is_open
+        if not group and not is_option and name != CONFIG_PATH:
             raise unknown_option("option", name, known, "--", command)
         if not equals:
             value = _next_value(name, known, rest)
         if name == CONFIG_PATH:
             config_paths.append(value)
         else:
-            said[name] = _Said(value, f"--{name}", True)
+            said[name] = _Said(_as_yaml(value, group) if group else from_word(known[name].type, value), f"--{name}")
     return said, config_paths
 
 
@@ -167,7 +173,7 @@ def _read_tree(tree: Mapping[Any, Any], known: Known, origin: str, prefix: str =
         name = f"{prefix}{key}"
         is_open = name in known and known[name].is_open
         if not is_open and (name in known or _open_group(name, known)):
-            said[name] = _Said(value, f"{origin}: {name}", False)
+            said[name] = _Said(value, f"{origin}: {name}")
         elif not is_open and not any(option.startswith(f"{name}.") for option in known):
             raise unknown_option(f"key in {origin}:", name, known, "", "")
         elif not isinstance(value, dict | None):
@@ -214,7 +220,7 @@ def _build[T](cls: type[T], values: Mapping[tuple[str, ...], Any], base: Any = N
 
 def _decode_said(option_type: Any, said: _Said) -> Any:
     try:
-        return decode(option_type, said.value, is_word=said.is_word)
+        return decode(option_type, said.value)
     except (ValueError, OverflowError):
         hint = nearest(said.value, choices(option_type)) if isinstance(said.value, str) else ""
         quotes = "; YAML needs quotes around text like this" if option_type is str and not said.is_word else ""
@@ -237,21 +243,11 @@ def unknown_option(kind: str, name: str, known: Known, dashes: str, command: str
     return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; {_help(command)} lists all")
 
 
-def _unexpected_word(word: str, known: Known, command: str) -> UsageError:
-    """Return the error for a word that is neither an option nor a value: how it may have been meant."""
-    text = f"unexpected {shorten(word)}"
-    name = word.lstrip("-").partition("=")[0]
-    if name in known or (word.startswith("-") and nearest_options(name, known)):
-        return UsageError(f"{text}; options begin with two dashes: --{word.lstrip('-')}")
-    if "=" in word:
-        return unknown_option("option", name, known, "--", command)
-    if word.endswith((".yaml", ".yml")):
-        return UsageError(f"{text}; a file of options is given as --config_path={word}")
-    paths = [one.name for one in known.values() if without_none(one.type) in _PATHS and one.name != "output_dir"]
-    opens = [f"{one.name}.path" for one in known.values() if one.is_open and one.name == "policy"]
-    if paths or opens:
-        return UsageError(f"{text}; options are written --name=value (did you mean --{(paths or opens)[0]}={word}?)")
-    return UsageError(f"{text}; options are written --name=value, and {_help(command)} lists them")
+def _unexpected_word(word: str, command: str) -> UsageError:
+    """Return the error for a word that is neither an option nor a value."""
+    if word.startswith("-") or "=" in word:
+        return UsageError(f"unexpected {shorten(word)}; options begin with two dashes: --{word.lstrip('-')}")
+    return UsageError(f"unexpected {shorten(word)}; options are written --name=value, and {_help(command)} lists them")
 
 
 def nearest_options(name: str, known: Collection[str]) -> list[str]:
