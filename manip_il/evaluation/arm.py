@@ -13,7 +13,7 @@ from manip_il import checks
 from manip_il.collect.workers import Engine
 from manip_il.data.json_lines import read_lines
 from manip_il.data.schema import OWN_OBJECT
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.policy_folder import EXPECTED, find_policy, require_source
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
@@ -89,11 +89,6 @@ class Arm:
 
     name: str
     members: tuple[Member, ...]
-
-    def __post_init__(self) -> None:
-        seeds = self.training_seeds
-        if not seeds or len(set(seeds)) != len(seeds):
-            raise ManipError(f"{self.name} has training seeds {seeds}; expected each once, and at least one")
 
     @property
     def training_seeds(self) -> list[int | None]:

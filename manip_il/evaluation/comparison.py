@@ -8,7 +8,7 @@ from functools import cached_property
 from statistics import fmean
 from typing import Any
 
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.evaluation.arm import Arm, require_pair
 from manip_il.evaluation.intervals import (
     CONFIDENCE,
@@ -36,8 +36,6 @@ class Comparison:
     right: Arm
 
     def __post_init__(self) -> None:
-        if self.left.name == self.right.name:
-            raise UsageError(f"{self.left.name} is compared with itself; give two different ones")
         require_pair(self.left, self.right)
         # Also policies of different training seeds must have run the same episodes.
         first, *others = (*self.left.members, *self.right.members)

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion, format_percent
 from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.rounds import COSTS, Cost, History, has_unqueried_steps
@@ -28,6 +27,8 @@ _MARKERS = "osD^"  # told apart without colour
 _PANEL = (4.4, 3.0)  # of a figure that stands beside others [inches]
 _NAME = 20  # characters of a bar's name in a line
 _LOG_SPAN = 20  # amounts that differ by this factor or more are shown on a logarithmic axis
+_COST_WORDS = {"labels": "expert labels", "steps": "simulated steps", "seconds": "wall-clock [s]"}
+_MINUTES = 300.0  # from so many seconds on they are shown as minutes
 _DPI = 96
 MAX_MARKS = 200  # of one outcome on a map; more would hide each other
 MAP_NOTE = (
@@ -97,12 +98,6 @@ def plain(text: str) -> str:
     return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
 
 
-def plain_lines(name: str) -> str:
-    """Return a name as `plain` text in at most three short lines, broken at blanks and slashes."""
-    lines = textwrap.wrap(name.replace("/", "/ "), _NAME)
-    return "\n".join(plain(line.replace("/ ", "/")) for line in lines[-3:])
-
-
 @dataclass(frozen=True)
 class Bar:
     """Success rates of one thing: one with its interval, or those of training seeds, of which the bar is the mean."""
@@ -114,7 +109,9 @@ class Bar:
 
 def rates_figure(bars: Sequence[Bar]) -> Figure:
     """Draw success rates as bars from 0 to 100 %, with intervals, or with a dot for each training seed."""
-    names = [plain_lines(bar.name) for bar in bars]
+    # at most three short lines, broken at blanks and slashes
+    lines = [textwrap.wrap(bar.name.replace("/", "/ "), _NAME)[-3:] for bar in bars]
+    names = ["\n".join(plain(part.replace("/ ", "/")) for part in parts) for parts in lines]
     height = 0.55 + sum(0.24 + 0.14 * (1 + name.count("\n")) for name in names)
     with drawing(1, size=(4.4, height)) as (drawn, axes):
         axis = axes[0, 0]
@@ -148,13 +145,6 @@ class Curve:
     colour: str = DAGGER
     costs: tuple[Cost, ...] = COSTS
 
-    def __post_init__(self) -> None:
-        if not self.runs or not all(self.runs):
-            raise ManipError(f"learning curve of {self.name!r} has a training seed without a round, or none at all")
-
-
-_UNITS = ((3 * 3600.0, 3600.0, "h"), (300.0, 60.0, "min"), (0.0, 1.0, "s"))  # from so many seconds on; in seconds
-
 
 def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple[Figure, ...]:
     """Draw success over every cost that is known, a figure each. target: drawn as a level, in [0, 1].
@@ -180,10 +170,12 @@ def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple
 
 def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, target: float | None) -> None:
     amounts = [one.amount(cost) for curve in curves for run in curve.runs for one in run]
-    unit, name = 1.0, {"labels": "expert labels", "steps": "simulated steps"}.get(cost, cost)
-    if cost == "seconds":
-        _, unit, short = next(one for one in _UNITS if max(amounts) >= one[0])
-        name = f"wall-clock [{short}]"
+    unit, name = (
+        1.0,
+        {"labels": "expert labels", "steps": "simulated steps", "seconds": "wall-clock [s]"}.get(cost, cost),
+    )
+    if cost == "seconds" and max(amounts) >= _MINUTES:
+        unit, name = 60.0, "wall-clock [min]"
     for place, curve in enumerate(curves):
         style: dict[str, Any] = {
             "color": curve.colour,

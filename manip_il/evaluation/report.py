@@ -14,7 +14,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError
 from manip_il.evaluation.figures import Figure
 from manip_il.evaluation.rounds import format_seconds
 from manip_il.evaluation.tables import Table
@@ -80,11 +79,6 @@ class Report:
     config: Mapping[str, Any] = field(default_factory=dict[str, Any])
     fingerprint: Mapping[str, Any] = field(default_factory=dict[str, Any])
     timings: Mapping[str, float] = field(default_factory=dict[str, float])
-
-    def __post_init__(self) -> None:
-        for what in ("title", "verdict", "command"):
-            if not getattr(self, what).strip():
-                raise ManipError(f"report {self.title!r}: {what} is empty")
 
     def render(self) -> str:
         """Return the page as one string of HTML."""

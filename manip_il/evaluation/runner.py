@@ -20,7 +20,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.fingerprint import canonical_json
 from manip_il.data.json_lines import append_line, read_lines
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.suites import suite_conditions
@@ -78,10 +78,8 @@ def evaluate(
     suite: name of the job's conditions. done: results by seed of an earlier run. until_width: stop once the interval,
     high less low, is as narrow; checked after every `CHECK_EVERY` seeds in their order, whatever the workers.
     on_result: called with every result as its episode ends. A seed that repeatedly kills its worker is left out, with a
-    warning. Raises `UsageError` for a width that is not within 0 and 1.
+    warning.
     """
-    if until_width is not None and not 0 < until_width < 1:
-        raise UsageError(f"until_width is {until_width}; expected between 0 and 1, such as 0.02 for 2 points")
     results: dict[int, EpisodeResult] = {}
     known = done or {}
     for part in itertools.batched(seeds, len(seeds) or 1 if until_width is None else CHECK_EVERY):

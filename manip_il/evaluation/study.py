@@ -8,7 +8,6 @@ from functools import cached_property
 from statistics import fmean
 from typing import Any
 
-from manip_il.errors import ManipError, UnknownName
 from manip_il.evaluation.arm import Arm
 from manip_il.evaluation.comparison import Comparison, seeds_facts
 from manip_il.evaluation.intervals import Proportion, format_percent
@@ -35,14 +34,6 @@ class Study:
     limit: float | None = None
     experts: Mapping[str, Mapping[str, EvalResult]] = field(default_factory=dict)
     within: tuple[Rule, ...] = ()
-
-    def __post_init__(self) -> None:
-        names = [arm.name for arm in self.arms]
-        if self.baseline is not None and self.baseline not in names:
-            raise UnknownName("baseline", self.baseline, names)
-        for arm in self.arms:
-            if not all(member.history and member.chosen for member in arm.members):
-                raise ManipError(f"arm {arm.name!r} holds a policy that belongs to no run")
 
     @property
     def training_seeds(self) -> list[int | None]:

@@ -12,7 +12,6 @@ from manip_il.collect.drivers import PolicyDriver, RandomDriver
 from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
-from manip_il.errors import UsageError
 from manip_il.evaluation import runner
 from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.runner import episode_result, evaluate
@@ -160,9 +159,3 @@ def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
         assert resumed == whole
         assert not {one.seed for one in finished} & set(done)
         assert sorted(one.seed for one in finished) == sorted(seed for asked in engine.asked for seed in asked)
-
-
-@pytest.mark.parametrize("width", [0.0, 1.0, -0.1])
-def test_a_width_that_cannot_be_is_refused(width, coins):
-    with pytest.raises(UsageError, match="expected between 0 and 1"):
-        evaluate(coins([True]), COIN, range(1), "coin", until_width=width)

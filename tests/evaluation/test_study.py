@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.errors import ManipError, UnknownName
 from manip_il.evaluation.arm import Arm, Member
 from manip_il.evaluation.rounds import Rule, history
 from manip_il.evaluation.study import Study
@@ -95,10 +94,3 @@ def test_tasks_are_not_compared_and_have_what_the_expert_solves_beside_them():
     assert [row(study, "dart")[name] for name in tests] == ["", "50.0 %"]
     assert not any("against" in column for column in study.results_table().filled().columns)
     assert study.to_json()["arms"]["dagger"]["expert"]["fetch"]["n_episodes"] == 100
-
-
-def test_what_is_no_study_is_refused():
-    with pytest.raises(UnknownName, match="did you mean 'cloning'"):
-        Study(arms(), "clonig", 0.9, Rule())
-    with pytest.raises(ManipError, match="belongs to no run"):
-        Study((Arm("a", (made_member(HARD, 0),)),), "a", 0.9, Rule())
