@@ -34,10 +34,18 @@ def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> B
     return numbers | {key: torch.from_numpy(frames[key][rows]).float() / 255 for key in keys}
 
 
+def read_off(policy: CNNPolicy, batch: Batch) -> torch.Tensor:
+    """Return `observation.environment_state` as pictures and joints show it, (B, k), in its own units."""
+    found, moves = policy.network_inputs(batch)[:, policy.seen_size :], policy.truth_scale > 0
+    return policy.truth_mean + torch.where(moves, found / policy.truth_scale.clamp(min=1e-12), 0.0)
+
+
 def report(policy: CNNPolicy, batch: Batch, names: tuple[str, ...]) -> None:
     """Print the median error of every place [mm] and yaw [mrad] that is read off."""
     with torch.no_grad():
-        found = torch.cat([policy.read_off({k: v[i : i + 50] for k, v in batch.items()}) for i in range(0, FRAMES, 50)])
+        found = torch.cat(
+            [read_off(policy, {k: v[i : i + 50] for k, v in batch.items()}) for i in range(0, FRAMES, 50)]
+        )
     truth, found = batch[ENVIRONMENT_STATE][: len(found)].double().numpy(), found.double().numpy()
     for name in names:
         first = names.index(name)

@@ -120,7 +120,7 @@ class TrainOptions:
         """Return how often each frame is drawn, relative to the others, (N,); None if all are drawn alike."""
         if self.weights is None:
             return None
-        from manip_il.learn.weights import rabc_weights
+        from manip_il.learn.samples import rabc_weights
 
         episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
         ahead = getattr(lerobot.policy, "chunk_size", None) or int(dataset.fps)

@@ -17,7 +17,7 @@ from typing import Any
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, OWN_OBJECT, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName
-from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
+from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 
 CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -30,7 +30,6 @@ _STEPS = (  # of LeRobot's default processors, and ours: they load nothing
     *("rename_observations_processor", "to_batch_processor", "device_processor"),
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
 )
-_NAMING = ("model", "tokenizer", "encoder_name", "vlm", "path")  # in the names of options that name what is loaded
 _MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled")
 _MUST_AGREE = {
     "robot": "robot",
@@ -168,8 +167,6 @@ class Checkpoint:
         except (ManipError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
             line = f"{type(error).__name__}: {checks.one_line(error)}"
             raise ManipError(f"{path / CONFIG} has features that cannot be read ({line})") from error
-        if origin is not None and origin.action_space not in (None, space):
-            raise MismatchError("action space", str(path / META_FILE), origin.action_space, CONFIG, space)
         return cls(
             path,
             config,
@@ -230,13 +227,8 @@ class Checkpoint:
 
     def require_trust(self, trust: bool) -> None:
         """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
-        others = [
-            _list_options(f"the step {checks.shorten(step['registry_name'])} of {name}", step["config"])
-            for name, steps in self.processors.items()
-            for step in steps
-            if step["registry_name"] not in _STEPS
-        ]
-        require_trust(self.config, str(self.path), trust, others)
+        steps = [step for steps in self.processors.values() for step in steps if step["registry_name"] not in _STEPS]
+        require_trust(self.config, str(self.path), trust, steps)
 
     def require_processors(self) -> None:
         """Raise `ManipError` unless both processors are there."""
@@ -246,25 +238,24 @@ class Checkpoint:
                 raise ManipError(f"no {self.path / name}; {hint}")
 
 
-def require_trust(settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[str] = ()) -> None:
-    """Raise `ManipError` unless a policy loads nothing by name, or `trust` is given; says what would be loaded.
+def require_trust(
+    settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
+) -> None:
+    """Raise `ManipError` unless a policy loads nothing by name, or `trust` is given; names what may be loaded.
 
     settings: its options with `type`, as `config.json` has them. source: of them, for the message. steps: of its
-    processors that load something, in words.
+    processors that load something.
     """
-    kind = settings["type"]
-    named = {
-        name: value
-        for name, value in settings.items()
-        if isinstance(value, str) and any(word in name for word in _NAMING) and name != "pretrained_path"
-    }
-    wanted = list(steps)
-    if kind not in PLAIN or "vision_encoder_name" in named:
-        wanted.insert(0, _list_options(f"models that LeRobot's {kind!r} names", named))
-    if wanted and not trust:
+    kind, named = settings["type"], list[Any]()
+    if kind not in PLAIN or settings.get("vision_encoder_name"):
+        named += [value for name, value in settings.items() if "name" in name or "path" in name]
+    for step in steps:
+        named += [step["registry_name"], *step["config"].values()]
+    texts = sorted({value for value in named if isinstance(value, str)})
+    if (kind not in PLAIN or texts) and not trust:
         raise ManipError(
-            f"{source} is a policy of type {kind!r} that would load {'; '.join(wanted)}: this fetches files and may "
-            "run code that comes with them; if you trust its source, add --trust=true"
+            f"{source} is a policy of type {kind!r} that would load what it names ({checks.shorten(texts)}): this "
+            "fetches files and may run code that comes with them; if you trust its source, add --trust=true"
         )
 
 
@@ -278,9 +269,7 @@ def read_config(path: Path) -> dict[str, Any]:
                 f"{file} is a pickle, which may run any code when it is read: convert it to safetensors and remove it"
             )
     if not (path / WEIGHTS).is_file():
-        adapter = (path / "adapter_model.safetensors").is_file()
-        hint = "it is an adapter: merge it into its base policy first" if adapter else "the weights are missing"
-        raise ManipError(f"no {WEIGHTS} in {path}; {hint}")
+        raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
     config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json", _LARGEST_JSON)
     if not isinstance(config.get("type"), str):
         raise ManipError(f"{path / CONFIG} is not a LeRobot policy's: it names no type")
@@ -295,14 +284,11 @@ def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ..
 def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     """Action space and robot: the mlp's and cnn's by their configuration, all others' by the postprocessor's step."""
     options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
-    converted, robot = options.get("action_space", JOINT_TARGET), str(options.get("robot", ""))
     own = config["type"] in OWN_SPACE
-    space = config.get("action_space", JOINT_DELTA) if own else converted
+    space = config.get("action_space", JOINT_DELTA) if own else options.get("action_space", JOINT_TARGET)
     if space not in ACTION_SPACES:
         raise UnknownName("action space", checks.shorten(space), ACTION_SPACES)
-    if own and converted != (in_step := EE_DELTA if space == EE_DELTA else JOINT_TARGET):
-        raise MismatchError(f"action space, for {space},", PROCESSORS[1], converted, CONFIG, in_step)
-    return space, robot
+    return space, str(options.get("robot", ""))
 
 
 def _processor_steps(path: Path) -> list[dict[str, Any]]:
@@ -327,10 +313,3 @@ def _step(path: Path, step: dict[str, Any]) -> dict[str, Any]:
         if not (path.parent / known["state_file"]).is_file():
             raise ManipError(f"no {known['state_file']} beside it")
     return known
-
-
-def _list_options(what: str, options: Mapping[str, Any]) -> str:
-    """`what` with the three options that say most, the names of models first."""
-    first = sorted(options.items(), key=lambda item: not isinstance(item[1], str))[:3]
-    text = ", ".join(f"{checks.shorten(key)[1:-1]}={checks.shorten(value)}" for key, value in first)
-    return f"{what}: {text}" if text else what

@@ -15,6 +15,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from torch import Tensor, nn
 
+from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, KEYPOINTS, STATE
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.mlp import MLPConfig, MLPPolicy
@@ -219,23 +220,13 @@ class CNNPolicy(MLPPolicy):
             rows = [self.network_inputs({key: batch[key][i : i + 1] for key in keys}) for i in range(len(state))]
             return self.model.act(torch.cat(rows))
 
-    @torch.no_grad()
-    def read_off(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return `observation.environment_state` as pictures and joints show it, (B, k), in its own units.
-
-        Raises `UsageError` for a policy that has not learnt to.
-        """
-        if self.privileged is None:
-            raise UsageError("this cnn reads nothing off its pictures but actions: it learnt without environment_state")
-        found, moves = self.network_inputs(batch)[:, self.seen_size :], self.truth_scale > 0
-        return self.truth_mean + torch.where(moves, found / self.truth_scale.clamp(min=1e-12), 0.0)
-
     @override
     def _build(self, config: MLPConfig) -> None:
         config = cast(CNNConfig, config)
         features = config.input_features or {}
         self.cameras = sorted(config.image_features)
         config.input_features = {key: features[key] for key in (*self.inputs, *self.cameras)}
+        self._by_index: dict[str, Tensor] = {}  # of every frame of the data, by its `index`
         self.privileged: nn.Module | None = None
         self.aux_weight, self.heatmap_weight = config.aux_weight, config.heatmap_weight
         self._make(config)
@@ -281,6 +272,18 @@ class CNNPolicy(MLPPolicy):
             if (places := self._of_frames(KEYPOINTS, batch)) is not None:
                 losses = losses + self.heatmap_weight * self._heat_map_losses(places)
             return losses
+
+    def _of_frames(self, name: str, batch: dict[str, Tensor]) -> Tensor | None:
+        """What is known of the frames of a batch, (B, ...): of these LeRobot's preprocessor keeps `index` alone."""
+        if name not in self._by_index or batch.get(INDEX) is None:
+            return None
+        return self._by_index[name][batch[INDEX].reshape(-1).cpu()].to(batch[STATE].device)
+
+    def _remember(self, name: str, columns: Table, values: Tensor) -> None:
+        """Keep values (N, ...) of all frames of the data."""
+        index = torch.from_numpy(columns[INDEX].reshape(-1))
+        self._by_index[name] = values.new_zeros((int(index.max()) + 1, *values.shape[1:]))
+        self._by_index[name][index] = values
 
     def _heat_map_losses(self, places: Tensor) -> Tensor:
         """Mean over the cameras, (B,). places: (B, cameras, K, 3)."""

@@ -24,8 +24,8 @@ from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
 
+from manip_il import checks
 from manip_il.errors import ManipError
-from manip_il.learn.lerobot_policy import line_of
 
 Batch = dict[str, Any]
 ROWS = 25  # of the episodes that run in lockstep, whose numbers follow each other: each has a row to itself
@@ -68,7 +68,7 @@ class EpisodePolicy:
         except ManipError:
             raise
         except Exception as error:  # the code of any policy, with options and statistics from anywhere
-            raise ManipError(f"the policy cannot act: {type(error).__name__}: {line_of(error)}") from error
+            raise ManipError(f"the policy cannot act: {type(error).__name__}: {checks.one_line(error)}") from error
         return actions.to("cpu", torch.float32)
 
     def forget(self, episodes: Iterable[int]) -> None:

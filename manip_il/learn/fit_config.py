@@ -180,11 +180,8 @@ def check_weights(roots: Sequence[Path], weights: Sequence[float]) -> None:
     """Raise `UsageError` for no dataset, for one that is given twice, and for weights that do not fit them."""
     if not roots:
         raise UsageError("--dataset.root names no dataset; expected at least one folder")
-    seen: dict[Path, Path] = {}
-    for root in roots:
-        if (real := root.resolve()) in seen:
-            raise UsageError(f"--dataset.root names {seen[real]} and {root}, one dataset; use --dataset.weights")
-        seen[real] = root
+    if len({root.resolve() for root in roots}) < len(roots):
+        raise UsageError("--dataset.root names one dataset twice; use --dataset.weights")
     if weights and len(weights) != len(roots):
         raise UsageError(f"--dataset.weights has {len(weights)} numbers, --dataset.root {len(roots)} datasets")
     for root, weight in zip(roots, weights, strict=False):

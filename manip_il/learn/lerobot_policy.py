@@ -7,7 +7,6 @@ import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from urllib.error import URLError
 
 import draccus
 import numpy as np
@@ -16,6 +15,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 
+from manip_il import checks
 from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError, UnknownName
 from manip_il.learn.action_spaces import Conversion
@@ -27,7 +27,6 @@ from manip_il.learn.network import warm_start
 from manip_il.learn.training_state import readable_state
 
 _DEVICE_STEP = "device_processor"
-_LONGEST = 300  # characters of another program's message
 _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all of the data is noise, not scale
 
 
@@ -43,16 +42,21 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     config.pretrained_path = None if warm else resumed or start
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
-            policy = make_policy(config, ds_meta=meta) if config.pretrained_path is None else _loaded(config, meta)
-    except (URLError, OSError) as error:
-        if not weights or isinstance(error, FileNotFoundError):
+            policy = make_policy(config, ds_meta=meta)
+    except ManipError:
+        raise
+    except ImportError as error:
+        raise ManipError(f"--policy.type={config.type} needs more packages: {error}") from error
+    except Exception as error:  # weights from anywhere, read by the code of any policy: errors of every kind
+        if config.pretrained_path is not None:
+            line = f"{type(error).__name__}: {checks.one_line(error)}"
+            raise ManipError(f"{config.pretrained_path} does not fit this policy: {line}") from error
+        if not weights or not isinstance(error, OSError):
             raise
         raise ManipError(
             f"cannot download {weights} ({error}): train from scratch with --policy.pretrained_backbone_weights=null, "
             f"or put the file that torchvision names into {torch.hub.get_dir()}/checkpoints"
         ) from error
-    except ImportError as error:
-        raise ManipError(f"--policy.type={config.type} needs more packages: {error}") from error
     if warm:
         model: Any = policy.model
         warm_start(model, Path(str(start)))
@@ -60,17 +64,6 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
         config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
     config.pretrained_path = None
     return policy
-
-
-def _loaded(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
-    """The policy with the weights in `config.pretrained_path`."""
-    try:
-        return make_policy(config, ds_meta=meta)
-    except (ImportError, ManipError):
-        raise
-    except Exception as error:  # weights from anywhere, read by the code of any policy: errors of every kind
-        what = f"{type(error).__name__}: {line_of(error)}"
-        raise ManipError(f"{config.pretrained_path} does not fit this policy: {what}") from error
 
 
 def build_processors(
@@ -132,9 +125,11 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
             return _load(checkpoint, device)
     except ImportError as error:
-        raise ManipError(f"{path} is a policy of type {kind!r}, which needs more packages: {line_of(error)}") from error
+        raise ManipError(
+            f"{path} is a policy of type {kind!r}, which needs more packages: {checks.one_line(error)}"
+        ) from error
     except Exception as error:  # a folder from anywhere, read by the code of any policy: errors of every kind
-        raise ManipError(f"{path}: LeRobot cannot load it: {type(error).__name__}: {line_of(error)}") from error
+        raise ManipError(f"{path}: LeRobot cannot load it: {type(error).__name__}: {checks.one_line(error)}") from error
 
 
 def _load(checkpoint: Checkpoint, device: str) -> tuple[PreTrainedPolicy, Any, Any]:
@@ -149,9 +144,3 @@ def _load(checkpoint: Checkpoint, device: str) -> tuple[PreTrainedPolicy, Any, A
     overrides = {_DEVICE_STEP: {"device": device}} if placed else {}
     before, after = make_pre_post_processors(config, str(checkpoint.path), preprocessor_overrides=overrides)
     return policy, before, after
-
-
-def line_of(error: Exception) -> str:
-    """Return another program's message in one short line."""
-    text = " ".join(str(error).split())
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

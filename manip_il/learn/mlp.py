@@ -24,7 +24,6 @@ from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.action_spaces import ARM, GRIPPER
 from manip_il.learn.fit_config import MLPOptions
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
@@ -136,7 +135,7 @@ class MLPPolicy(PreTrainedPolicy):
     `action` (B, n), all raw ([rad], [m]).
 
     dataset_meta: LeRobot's, given by `make_policy` for training, or with a `table` of the columns; the statistics are
-    then theirs, and frames without a valid label are left out of the loss.
+    then theirs, those of frames with a valid label.
     """
 
     config_class = MLPConfig  # type: ignore[assignment]
@@ -146,7 +145,6 @@ class MLPPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})]
-        self._by_index: dict[str, Tensor] = {}  # of every frame of the data, by its `index`
         if config.scales and not config.scaled and dataset_meta is not None:
             config.scaled = self._offsets(config, dataset_meta.features)
         self._build(config)
@@ -154,19 +152,10 @@ class MLPPolicy(PreTrainedPolicy):
             self._learn_columns(self._columns(config, dataset_meta))
 
     @override
-    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Return the mean loss of rows with a valid label; with `reduction="none"` each row's, (B,), 0 without one.
-
-        When it does not train, the mean absolute errors of acting, too: of the arm [rad] and the gripper [m].
-        """
-        inputs = self.network_inputs(batch)
-        losses, valid = self._row_losses(inputs, batch), self._of_frames(LABEL_VALID, batch)
-        # `where`, as 0 * inf is NaN
-        losses = losses if valid is None else torch.where(valid, losses, torch.zeros_like(losses))
-        if reduction == "none":
-            return losses, {}
-        count = len(losses) if valid is None else valid.sum().clamp(min=1)
-        return losses.sum() / count, {} if self.training else self._errors(inputs.detach(), batch)
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
+        """Return the mean loss."""
+        losses = self._row_losses(self.network_inputs(batch), batch)
+        return losses.sum() / len(losses), {}
 
     @override
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
@@ -206,25 +195,9 @@ class MLPPolicy(PreTrainedPolicy):
         targets = self.model.encode_targets(self.model.relative(batch[ACTION], inputs))
         return self.model.row_losses(self.model.encode(inputs), targets)
 
-    def _errors(self, inputs: Tensor, batch: dict[str, Tensor]) -> dict[str, float]:
-        error = (self.model.act(inputs) - batch[ACTION]).abs().mean(0)
-        return {"arm_error": error[ARM].mean().item(), "gripper_error": error[GRIPPER].item()}
-
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
         """Return the network's inputs (B, d) of a batch of observations."""
         return torch.cat([batch[key] for key in self.inputs], dim=-1)
-
-    def _of_frames(self, name: str, batch: dict[str, Tensor]) -> Tensor | None:
-        """What is known of the frames of a batch, (B, ...): of these LeRobot's preprocessor keeps `index` alone."""
-        if name not in self._by_index or batch.get(INDEX) is None:
-            return None
-        return self._by_index[name][batch[INDEX].reshape(-1).cpu()].to(batch[STATE].device)
-
-    def _remember(self, name: str, columns: Table, values: Tensor) -> None:
-        """Keep values (N, ...) of all frames of the data."""
-        index = torch.from_numpy(columns[INDEX].reshape(-1))
-        self._by_index[name] = values.new_zeros((int(index.max()) + 1, *values.shape[1:]))
-        self._by_index[name][index] = values
 
     def _columns(self, config: MLPConfig, dataset_meta: Any) -> Table:
         """The columns of the data that is learnt from; those that nobody has read yet are read."""
@@ -244,14 +217,13 @@ class MLPPolicy(PreTrainedPolicy):
         return ()
 
     def _learn_columns(self, columns: Table) -> None:
-        """Take statistics and valid labels from a dataset's columns."""
+        """Take statistics from a dataset's columns."""
         valid = torch.from_numpy(valid_frames(columns))
         seen = torch.cat([torch.from_numpy(columns[key])[valid] for key in self.inputs], dim=1).float()
         actions = torch.from_numpy(columns[ACTION])[valid].float()
         targets = self.model.relative(actions, seen)
         inputs = self.model.expanded(seen).numpy()
         self.model.set_statistics(fit_statistics(inputs, targets.numpy(), self.model.loss))
-        self._remember(LABEL_VALID, columns, valid)
 
 
 def make_mlp_pre_post_processors(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
@@ -77,21 +76,19 @@ class LearnedPolicy:
         states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row,
         its seed: what the policy remembers of an episode, and what it draws in it, belong to that number; by default
         the row's place. An episode that is left out has ended. An action is the same bits whatever the other rows.
-        Raises `NotFiniteError` naming the row, `MismatchError` for numbers or pictures that are not the policy's.
+        Raises `NotFiniteError` naming the row for an action that is not finite, `MismatchError` for pictures that are
+        missing or of another size.
         """
-        rows = len(states)
-        episodes = range(rows) if episodes is None else episodes
-        if len(episodes) != rows:
-            raise MismatchError("rows", "the states", rows, "the episodes", len(episodes))
-        batch = self._numbers(states, environment_states) | self._pictures(rows, images or {})
-        if not rows:
+        if not len(states):
             return np.empty((0, self.checkpoint.action))
+        batch = self._numbers(states, environment_states) | self._pictures(images or {})
         with threads(1):
-            actions = self._policy.select(batch, episodes).cpu().numpy().astype(np.float64)
-        if actions.shape != (expected := (rows, self.checkpoint.action)):
-            raise MismatchError("shape of the actions", CONFIG, expected, "the policy", actions.shape)
-        _require_finite_rows("the policy's action", actions)
-        return actions
+            actions = self._policy.select(batch, range(len(states)) if episodes is None else episodes)
+        found = actions.cpu().numpy().astype(np.float64)
+        if not (finite := np.isfinite(found)).all():
+            row = int(np.argmin(finite.all(axis=1)))
+            raise NotFiniteError(f"the policy's action in row {row} is {found[row]}: not finite")
+        return found
 
     def reset(self, episodes: Iterable[int]) -> None:
         """Forget the past of episodes that begin."""
@@ -119,29 +116,23 @@ class LearnedPolicy:
             raise UsageError(NO_LIKELIHOOD)
 
     def _numbers(self, states: F32, environment_states: F32) -> Batch:
-        batch = {}
-        for key, values in ((STATE, states), (ENVIRONMENT_STATE, environment_states)):
-            if key not in self.checkpoint.numbers:
-                continue
-            values = np.ascontiguousarray(values, dtype=np.float32)
-            expected = (len(states), self.checkpoint.numbers[key])
-            if values.shape != expected:
-                raise MismatchError(f"shape of {key}", "the policy", expected, "the caller", values.shape)
-            _require_finite_rows(key, values)
-            batch[key] = torch.from_numpy(values)
-        return batch
+        given = {STATE: states, ENVIRONMENT_STATE: environment_states}
+        return {
+            key: torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+            for key, values in given.items()
+            if key in self.checkpoint.numbers
+        }
 
-    def _pictures(self, rows: int, images: Images) -> Batch:
+    def _pictures(self, images: Images) -> Batch:
         """Pictures as LeRobot's evaluation feeds them: float32 (B, 3, H, W), from 0 to 1."""
-        if missing := set(self.cameras) - set(images):
-            what = f"cameras ({', '.join(sorted(missing))})"
-            raise MismatchError(what, "the policy", sorted(self.cameras), "the caller", sorted(images))
         batch = {}
         for camera, size in self.checkpoint.pictures.items():
-            if (given := images[camera].shape) != (expected := (rows, *size, 3)):
-                raise MismatchError(f"shape of the pictures of {camera}", "the policy", expected, "the caller", given)
-            picture = torch.from_numpy(np.ascontiguousarray(images[camera])).permute(0, 3, 1, 2)
-            batch[IMAGES + camera] = picture.contiguous().to(torch.float32) / 255
+            picture = images.get(camera, np.empty((0, 0, 0, 3), np.uint8))
+            if picture.shape[1:3] != size:
+                what = f"size of the pictures of {camera}"
+                raise MismatchError(what, "the policy", size, "the caller", picture.shape[1:3])
+            levels = torch.from_numpy(np.ascontiguousarray(picture)).permute(0, 3, 1, 2)
+            batch[IMAGES + camera] = levels.contiguous().to(torch.float32) / 255
         return batch
 
 
@@ -185,10 +176,3 @@ class _Perceptron:
 
     def _inputs(self, batch: Batch) -> torch.Tensor:
         return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
-
-
-def _require_finite_rows(what: str, values: NDArray[Any]) -> None:
-    finite = np.isfinite(values)
-    if not finite.all():
-        row = int(np.flatnonzero(~finite.all(axis=1))[0])
-        raise NotFiniteError(f"{what} in row {row} is {values[row]}: not finite")

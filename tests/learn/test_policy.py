@@ -97,15 +97,6 @@ def test_actions_that_are_not_finite_are_refused_by_row(checkpoint):
         LearnedPolicy.load(checkpoint).act(states, environments)
 
 
-def test_observations_that_are_not_finite_or_of_another_width_are_refused(checkpoint):
-    policy, (states, environments) = LearnedPolicy.load(checkpoint), observations(3)
-    with pytest.raises(MismatchError, match=r"\(3, 6\).*\(3, 5\)"):
-        policy.act(states, environments[:, :5])
-    environments[2, 1] = np.inf
-    with pytest.raises(NotFiniteError, match=r"environment_state in row 2"):
-        policy.act(states, environments)
-
-
 def test_pictures_go_in_as_lerobot_feeds_them():
     class Seen:
         def select(self, batch, episodes):
@@ -123,10 +114,8 @@ def test_pictures_go_in_as_lerobot_feeds_them():
     assert all(torch.equal(inner.batch[key], theirs[key]) for key in theirs)
     assert inner.batch["observation.images.front"].is_contiguous()
     assert inner.episodes == [40, 30]
-    with pytest.raises(MismatchError, match=r"\['front'\].*\['wrist'\]"):
+    with pytest.raises(MismatchError, match="pictures of front"):
         policy.act(states, environments, {"wrist": picture})
-    with pytest.raises(MismatchError, match="the states has 2, the episodes has 1"):
-        policy.act(states, environments, {"front": picture}, [40])
 
 
 @pytest.mark.parametrize("loss", LIKELIHOODS)

@@ -88,7 +88,7 @@ def test_joined_frames_are_those_of_the_concatenation(shape):
     rng = np.random.default_rng(0)
     pieces = [rng.integers(0, 255, (count, 3, 2, 2), dtype=np.uint8) for count in (4, 1, 6)]
     rows = rng.integers(0, 11, shape)
-    np.testing.assert_array_equal(Pictures(pieces)[rows], np.concatenate(pieces)[rows])
+    np.testing.assert_array_equal(Pictures(pieces)[torch.from_numpy(rows)], np.concatenate(pieces)[rows])
 
 
 @pytest.mark.parametrize(

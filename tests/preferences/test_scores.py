@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from lerobot.rewards.sarm.rabc import RABCWeights
 
 from manip_il.errors import ManipError
-from manip_il.learn.weights import rabc_weights
+from manip_il.learn.samples import rabc_weights
 from manip_il.preferences.frames import Frames, read_frames
 from manip_il.preferences.scores import Scores, episode_scores, roc_auc, score_report, write_weights
 
