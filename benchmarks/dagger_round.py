@@ -18,8 +18,9 @@ from pathlib import Path
 from _machine import describe_machine
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import DATASET, round_folder, run_algorithm
-from manip_il.algorithms.rounds import RoundResult
+from manip_il.algorithms.imitation import DATASET, ImitationRun
+from manip_il.algorithms.rounds import round_folder
+from manip_il.algorithms.run import Result
 from manip_il.collect.expert import Expert
 from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.dataset import Dataset
@@ -49,18 +50,18 @@ def main() -> int:
     workers = default_workers()
     print(describe_machine())
     with tempfile.TemporaryDirectory() as name, Engine(workers) as engine:
-        for result in run_algorithm(config, Path(name), engine):
+        for result in ImitationRun(config, Path(name), engine).results():
             report(result, Path(name), config, workers)
     return 0
 
 
-def report(result: RoundResult, folder: Path, config: RunConfig, workers: int) -> None:
+def report(result: Result, folder: Path, config: RunConfig, workers: int) -> None:
     """One line a round."""
     whole = sum(result.seconds.values())
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in result.seconds.items())
-    line = f"round {result.round}: {whole:.1f} s ({stages}), {whole / LIMIT:.2f} of the limit"
-    if result.round:
-        labelling = seconds_to_label(round_folder(folder, result.round) / DATASET, config) / workers
+    line = f"round {result.number}: {whole:.1f} s ({stages}), {whole / LIMIT:.2f} of the limit"
+    if result.number:
+        labelling = seconds_to_label(round_folder(folder, result.number) / DATASET, config) / workers
         line += f"; labelling {labelling:.2f} s, {labelling / whole:.1%} of it (limit {SHARE:.0%})"
     print(f"{line}; success {result.validation.success}", flush=True)
 

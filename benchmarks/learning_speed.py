@@ -74,7 +74,7 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
     if command(["record", *words, "--workers=1", "--quiet"]):
         raise SystemExit("recording failed")
     env = EnvConfig(robot, task)
-    config = LearningConfig(env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
+    config = LearningConfig(method="gail", env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
     run = LearningRun(config, folder, Engine())
     recorded = [Recorded(env, None) for _ in range(config.episodes)]
     run.envs.episodes = recorded

@@ -25,7 +25,7 @@ from pathlib import Path
 from _machine import describe_machine
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import run_algorithm
+from manip_il.algorithms.imitation import ImitationRun
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.parsing import from_yaml
 from manip_il.collect.workers import Engine, default_workers
@@ -64,10 +64,12 @@ def reach_goals(config: RunConfig, limit: float | None) -> list[float]:
     print("round  labels  success (200 validation seeds)  seconds without evaluation")
     left, started, evaluation = list(GOALS), time.monotonic(), 0.0
     with tempfile.TemporaryDirectory() as folder, Engine(default_workers()) as engine:
-        for result in run_algorithm(config, Path(folder), engine):
+        for result in ImitationRun(config, Path(folder), engine).results():
             evaluation += result.seconds["validate"]
             spent = time.monotonic() - started - evaluation
-            print(f"{result.round:5d}  {result.labels:6d}  {result.validation.success!s:30s}  {spent:6.1f}", flush=True)
+            print(
+                f"{result.number:5d}  {result.labels:6d}  {result.validation.success!s:30s}  {spent:6.1f}", flush=True
+            )
             while left and result.validation.success.rate >= left[0]:
                 ratio = "" if limit is None else f": {spent / limit:.2f} of imitation's time"
                 print(f"{left.pop(0):.1%} after {spent:.1f} s and {result.labels:,} labels{ratio}")

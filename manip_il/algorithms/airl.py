@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.algorithms.learning_run import Iteration, LearningRun
+from manip_il.algorithms.learning_run import LearningRun
+from manip_il.algorithms.run import Result
 from manip_il.learn.discriminators import AirlDiscriminator
 
 
-def airl(run: LearningRun, c: LearningConfig) -> Iterator[Iteration]:
+def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
     """Yield every iteration: roll out the learner, fit f by D = exp f / (exp f + pi), improve it by f - log pi."""
     d = run.keep(lambda actor: AirlDiscriminator(c.discriminator, actor, c.discount))
     for i in run.iterations():

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.imitation import ImitationRun
-from manip_il.algorithms.rounds import Rollouts, RoundResult
+from manip_il.algorithms.rounds import Rollouts
+from manip_il.algorithms.run import Result
 
 
-def cloning(run: ImitationRun, c: RunConfig) -> Iterator[RoundResult]:
+def cloning(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
     """Yield every round: demonstrate, fit to all demonstrations, validate."""
     data: list[Rollouts] = []
     for i in range(c.rounds + 1):

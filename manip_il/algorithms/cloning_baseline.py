@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import fit_round, round_fit, round_folder
+from manip_il.algorithms.rounds import fit_round, round_fit, round_folder
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import MAX_TRIES, collect_successes, provenance, record
 from manip_il.collect.workers import Engine

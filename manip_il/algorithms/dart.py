@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.imitation import ImitationRun
-from manip_il.algorithms.rounds import RoundResult
+from manip_il.algorithms.run import Result
 from manip_il.collect.drivers import NoisyExpertDriver
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
@@ -19,7 +19,7 @@ from manip_il.learn.policy import LearnedPolicy
 F64 = NDArray[np.float64]
 
 
-def dart(run: ImitationRun, c: RunConfig) -> Iterator[RoundResult]:
+def dart(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
     """Yield every round: demonstrate under noise like the learner's errors, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)

@@ -11,55 +11,38 @@ best/, dataset/        the round with the highest validation success, and all ro
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import logging
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import override
 
-import numpy as np
-from numpy.typing import NDArray
-
-from manip_il.algorithms.config import RunConfig, Sampling, check_labels
-from manip_il.algorithms.rounds import Fitted, Rollouts, RoundResult, best_round
-from manip_il.algorithms.run import Run, Watch
+from manip_il.algorithms.config import RunConfig, check_labels
+from manip_il.algorithms.rounds import Fitted, Rollouts, fit_round, round_fit, round_folder
+from manip_il.algorithms.run import Result, Run, Watch, best_result
 from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver
 from manip_il.collect.edits import Source, Target, redraw_dataset
-from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.query import Query, action_gap
+from manip_il.collect.query import Query
 from manip_il.collect.record import MAX_TRIES, collect, collect_successes, journal_of, provenance, record
 from manip_il.collect.scenes import CHUNK, Scenes
 from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, dataset_sha256, merge_datasets
-from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, list_episodes, read_journal
-from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, LABEL_VALID, ROUND
+from manip_il.data.schema import LABEL_VALID
 from manip_il.errors import NothingToLearnError
-from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.learn.fit_config import LEROBOT, FitConfig
+from manip_il.evaluation.results import FILE_NAME
 from manip_il.learn.training_state import PRETRAINED_MODEL
-from manip_il.mdp import Actor, Episode
-from manip_il.seeding import stream_base, stream_seeds
+from manip_il.mdp import Episode
+from manip_il.seeding import stream_seeds
 from manip_il.sim.events import standard_in
 
-F64 = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 DATASET, HELD_OUT, JOURNALS, POLICY, REDRAWN = "dataset", "held_out", "journals", "policy", "redrawn"
-CHUNK_STEPS = 20_000  # of a round, for LeRobot's policies, if none are given
-CORRECTION = 0.25  # of the longest step: if expert and learner differ by more, the label corrects
-_SAMPLED_BY = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)
-
-
-def run_algorithm(config: RunConfig, folder: Path, engine: Engine, watch: Watch | None = None) -> Iterator[RoundResult]:
-    """Run, or go on with, the rounds of `config.method`; see `ImitationRun.follow`."""
-    loop = getattr(importlib.import_module(f"manip_il.algorithms.{config.method}"), config.method)
-    run = ImitationRun(config, folder, engine, watch)
-    return run.follow(loop(run, config))
 
 
 def mixture(policy: Fitted, beta: float) -> PolicyDriver:
@@ -70,10 +53,11 @@ def mixture(policy: Fitted, beta: float) -> PolicyDriver:
 class ImitationRun(Run):
     """The steps of one run in `folder`. Raises `UsageError` for labels that the policy cannot learn from."""
 
+    config: RunConfig
+
     def __init__(self, config: RunConfig, folder: Path, engine: Engine, watch: Watch | None = None):
         check_labels(config)
-        super().__init__(folder, engine, watch)
-        self.config = config
+        super().__init__(config, folder, engine, watch)
         self._made: dict[int, Rollouts] = {}
         self._held_out_steps = 0
         self._fitted: Fitted | None = None
@@ -142,52 +126,51 @@ class ImitationRun(Run):
         self._fitted = Fitted(round_, tuple(members), config.fit.trust)
         return self._fitted
 
-    def validate(self, policy: Fitted) -> RoundResult:
+    def validate(self, policy: Fitted) -> Result:
         """Measure a round's policy on the validation's seeds, which ends the round."""
-        round_, config, path = policy.round, self.config, self._folder(policy.round) / FILE_NAME
+        round_, config = policy.round, self.config
         self._watch.on_stage("validate", round_, config.validation_episodes)
-        with self._timed("validate"):
-            if path.is_file():
-                validation = EvalResult.read(path)
-            else:
-                driver = PolicyDriver((policy.path,), trust=config.fit.trust)
-                job = RolloutJob(config.env, driver, config.hold, label="last", conditions=config.conditions)
-                name = f"DAgger round {round_}"
-                validation = self._evaluate(job, name, config.validation_episodes, config.seed)
-                validation.write(path)
+        options = {"conditions": config.conditions, "trust": config.fit.trust}
+        path, name = self._folder(round_) / FILE_NAME, f"DAgger round {round_}"
+        validation = self._validate(policy.path, path, name, config.hold, **options)
         here, so_far = self._made[round_], [one for one in self._made.values() if one.round <= round_]
-        return RoundResult(
-            round=round_,
-            beta=here.beta,
-            labels=sum(one.labels for one in so_far),
-            queries=sum(one.queries for one in so_far) + self._held_out_steps,
-            episodes=sum(one.episodes for one in so_far),
+        return Result(
+            unit="round",
+            number=round_,
             steps=sum(one.steps for one in so_far) + self._held_out_steps,
-            rollout_success=here.successes / max(1, here.episodes),
+            episodes=sum(one.episodes for one in so_far),
+            metrics={
+                "beta": here.beta,
+                "labels": sum(one.labels for one in so_far),
+                # More than labels if it must answer to decide (`safety`, the held-out episodes of `dart`).
+                "queries": sum(one.queries for one in so_far) + self._held_out_steps,
+                "rollout_success": here.successes / max(1, here.episodes),
+            },
             policy=policy.path,
-            validation=validation,
-            seconds=self._take_seconds(2),
+            validated=validation,
+            seconds=self._take_seconds(),
         )
 
-    def follow(self, rounds: Iterator[RoundResult]) -> Iterator[RoundResult]:
+    @override
+    def follow(self, results: Iterator[Result]) -> Iterator[Result]:
         """Yield an algorithm's rounds, the finished ones again first, until it ends or the label budget is spent.
 
         Then `best/pretrained_model` holds the round with the highest validation success (the later of equals) and
         `dataset` the aggregated LeRobot dataset.
         """
-        results: list[RoundResult] = []
-        for result in rounds:
-            results.append(result)
+        rounds: list[Result] = []
+        for result in results:
+            rounds.append(result)
             yield result
-            if self._left(result.round + 1) == 0:
+            if self._left(result.number + 1) == 0:
                 break
-        best, root = best_round(results), self.folder / DATASET
+        best, root = best_result(rounds), self.folder / DATASET
         self._keep_best(best.policy)
         made = [one.dataset for one in self._made.values() if one.dataset is not None]
         if made and not (root.is_dir() and _episodes(root) == sum(map(_episodes, made))):
             shutil.rmtree(root, ignore_errors=True)
             name = f"local/{self.config.env.robot}_{self.config.env.task}_dagger"
-            merge_datasets(made, root, repo_id=name, provenance={"best_round": best.round})
+            merge_datasets(made, root, repo_id=name, provenance={"best_round": best.number})
 
     def _folder(self, round_: int) -> Path:
         return round_folder(self.folder, round_)
@@ -288,67 +271,9 @@ class ImitationRun(Run):
         return root
 
 
-def fit_round(
-    config: RunConfig,
-    roots: Sequence[Path],
-    folder: Path,
-    init_from: Path | None = None,
-    on_log: Callable[[dict[str, Any]], None] | None = None,
-    member: int = 0,
-    weights: F64 | None = None,
-) -> Path:
-    """Fit, or go on with fitting, a policy to datasets; return the checkpoint's `pretrained_model`.
-
-    init_from: start there (see `refit`). on_log: sees the metrics, {} at a step without. member: of the ensemble,
-    each from a seed of its own. weights: how often each frame is drawn, (N,); by default as the run's `sampling` says.
-    """
-    from manip_il.learn.sources import Sources
-    from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
-
-    if weights is None and not config.sampling.is_even:
-        scale = env_actions(config.env).scale
-        weights = frame_weights(config.sampling, joined_columns(roots, _SAMPLED_BY), scale)
-    trainer = Trainer(
-        Sources(tuple(map(Dataset.open, roots))),
-        round_fit(config, init_from, member),
-        folder,
-        spec=env_spec(config.env, config.cameras),
-        fingerprint=env_fingerprint(config.env, config.cameras),
-        look=asdict(config.cameras.look) if config.cameras is not None else None,
-        resume=True,
-        weights=weights,
-    )
-    return trainer.fit(on_log)
-
-
-def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
-    """Return the options of one round's fit. init_from: where a warm one starts from. member: of the ensemble.
-
-    Any other starts from the run's start policy, if there is one.
-    """
-    steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
-    if init_from is not None:
-        steps = config.refit_steps or steps
-    seed = stream_base("training", config.seed) + member
-    return replace(config.fit, steps=steps, seed=seed, init_from=init_from or config.start)
-
-
-def frame_weights(sampling: Sampling, table: Mapping[str, NDArray[Any]], scale: F64) -> F64:
-    """Return how often each frame of a table is drawn, (N,). scale: the longest step of an action, (n,)."""
-    gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
-    by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
-    later = np.where(by_expert | (gap > CORRECTION), sampling.corrections, sampling.rollouts)
-    return np.where(table[ROUND].reshape(-1) == 0, sampling.demonstrations, later).astype(np.float64)
-
-
 def _count_labels(root: Path) -> int:
     return int(Dataset.open(root).columns([LABEL_VALID])[LABEL_VALID].sum())
 
 
 def _episodes(root: Path) -> int:
     return Dataset.open(root).info.episodes
-
-
-def round_folder(folder: Path, round_: int) -> Path:
-    """Return the folder of a round: its journals, dataset, policy and evaluation."""
-    return folder / f"round_{round_:03d}"

@@ -16,7 +16,7 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
-from manip_il.rewards.demonstrations import Demonstration
+from manip_il.rewards.paths import Demonstration
 from manip_il.robots.table import get_robot
 from manip_il.sim.scene import build_scene
 from manip_il.tasks.furnishing import EDGE, observed_layout, space_of

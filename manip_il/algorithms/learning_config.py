@@ -16,14 +16,17 @@ LONGER = 1.5  # times the longest demonstration, by default
 
 @dataclass(frozen=True, kw_only=True)
 class LearningConfig:
-    """Options of `LearningRun`. datasets: demonstrations. start: the `pretrained_model` folder of a clone.
+    """Options of `LearningRun`. method: `gail`, `airl` or `ppo`. datasets: demonstrations.
 
+    start, reward: `pretrained_model` folders of a clone, and of the reward that `ppo` learns from.
     Raises `UsageError` for a number out of range.
     """
 
+    method: str
     env: EnvConfig
     datasets: tuple[Path, ...] = ()
     start: Path | None = None
+    reward: Path | None = None
     steps: int = option(200_000, "simulated control steps in all")
     episodes: int = option(32, "of an iteration, side by side")
     episode_steps: int = option(

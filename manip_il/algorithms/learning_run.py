@@ -13,23 +13,21 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, override
 
 import numpy as np
 
 from manip_il.algorithms.learning_config import LONGER, LearningConfig
-from manip_il.algorithms.run import Run, Watch
+from manip_il.algorithms.run import Result, Run, Watch
 from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
-from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
-from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import dataset_sha256
 from manip_il.data.dataset import Dataset
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import Origin
@@ -54,62 +52,22 @@ from manip_il.seeding import rng_for, stream_base, stream_seeds
 
 Kept = TypeVar("Kept", bound=Discriminator)
 VALIDATION = "validation"
-STAGES = ("collect", "fit", "validate")
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """Outcome of an iteration; number 0 is what it began with. validation: of its policy, None if none was due.
-
-    steps, episodes: simulated so far. seconds: what collecting, fitting and validating took, 0 of one that was found
-    finished on disk.
-    """
-
-    number: int
-    steps: int
-    episodes: int
-    metrics: dict[str, float]
-    policy: Path
-    validation: EvalResult | None
-    seconds: dict[str, float]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the line of `metrics.jsonl`."""
-        success = None if self.validation is None else self.validation.success
-        return {
-            "iteration": self.number,
-            "steps": self.steps,
-            "episodes": self.episodes,
-            **self.metrics,
-            "validation_success": None if success is None else success.rate,
-            "validation_episodes": None if success is None else success.n,
-            "seconds": self.seconds,
-        }
 
 
 class LearningRun(Run):
-    """The steps of one run in `folder`. absorbing: episodes end after success, as the demonstrations do.
+    """The steps of one run in `folder`. Raises what `start_conversion` and `read_demonstrations` raise.
 
-    reward: the folder of the reward that it learns from, if one was given. Raises what `start_conversion` and
-    `read_demonstrations` raise, `UsageError` for options that do not fit those.
+    Also `UsageError` for options that do not fit those.
     """
 
-    def __init__(
-        self,
-        config: LearningConfig,
-        folder: Path,
-        engine: Engine,
-        watch: Watch | None = None,
-        *,
-        absorbing: bool = True,
-        reward: Path | None = None,
-    ):
-        super().__init__(folder, engine, watch)
-        self.config = config
+    config: LearningConfig
+
+    def __init__(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch | None = None):
+        super().__init__(config, folder, engine, watch)
         self._modules: dict[str, Discriminator] = {}
         self._number, self._simulated, self._validated_at = 0, 0, 0
         self._metrics: dict[str, float] = {}
-        policies = [one for one in (config.start, reward) if one is not None]
+        policies = [one for one in (config.start, config.reward) if one is not None]
         self._given = [*map(dataset_sha256, config.datasets), *map(policy_sha256, policies)]
         self._spec = spec = Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
         self.conversion = start_conversion(config.start, config.action_space, spec)
@@ -117,7 +75,7 @@ class LearningRun(Run):
         self.horizon = config.episode_steps or config.env.horizon
         if demonstrations and not config.episode_steps:
             self.horizon = min(self.horizon, math.ceil(LONGER * demonstrations.longest))
-        hold = demonstrations.hold if demonstrations and absorbing else None
+        hold = demonstrations.hold if demonstrations else None
         with threads(1), lent_generators(self._stream(0, "weights")):
             seed, rows = stream_base("training", config.seed), demonstrations.stacked if demonstrations else None
             self._policy = start_policy(config.start, self.conversion.space, spec, seed, rows)
@@ -134,23 +92,26 @@ class LearningRun(Run):
             self._modules["discriminator"] = made = make(self._policy.model)
         return made
 
-    def begin(self) -> Iteration | None:
-        """Return what the run goes on from: its last finished iteration, or the policy that it begins with, if any."""
+    @override
+    def follow(self, results: Iterator[Result]) -> Iterator[Result]:
+        """Yield what the run goes on from, its last finished iteration or the policy it begins with, and what follows.
+
+        So the line of an iteration is not lost that ended before it was written.
+        """
         checkpoint = last_checkpoint(self.folder, resume=True)
         if checkpoint is not None:
-            step = read_step(checkpoint)
-            with readable_state(checkpoint):
-                number, steps, metrics = int(step["step"]), int(step["simulated"]), dict(step["metrics"])
-            return self._iteration(number, steps, metrics, checkpoint / PRETRAINED_MODEL, self._validation(number))
-        if self.config.start is None:
-            return None
-        return self._iteration(0, 0, {}, self.config.start, self._validate(0, self.config.start))
+            self._go_on_from(checkpoint)
+            policy = checkpoint / PRETRAINED_MODEL
+            yield self._result(policy, self._validate_if_due(policy))
+        elif self.config.start is not None:
+            yield self._result(self.config.start, self._validate_kept(self.config.start))
+        yield from results
 
     def iterations(self) -> Iterator[int]:
         """Yield the numbers, from 1 or from the last finished iteration's on, until all steps are simulated."""
-        self._resume()
-        if self._number == 0:
-            self.begin()
+        if checkpoint := last_checkpoint(self.folder, resume=True):
+            with readable_state(checkpoint), threads(1):
+                self._learner.load(checkpoint / TRAINING_STATE, self._modules)
         while self._simulated < self.config.steps:
             self._number += 1
             self._metrics = {}
@@ -203,7 +164,7 @@ class LearningRun(Run):
         with self._timed("fit"), threads(1), lent_generators(self._stream(self._number, "updates")):
             self._metrics |= self._learner.improve(rewards, actor=moves, remaining=remaining)
 
-    def finish(self) -> Iteration:
+    def finish(self) -> Result:
         """Write the iteration, which ends it; validate its policy where that is due."""
         config = self.config
         fingerprint, space = env_fingerprint(config.env), self.conversion.space
@@ -219,61 +180,46 @@ class LearningRun(Run):
                 shutil.rmtree(other, ignore_errors=True)
         self._watch.on_step()
         policy = self.folder / "checkpoints" / "last" / PRETRAINED_MODEL
-        validation = self._validate_if_due(policy)
-        return self._iteration(self._number, self._simulated, self._metrics, policy, validation)
+        return self._result(policy, self._validate_if_due(policy))
 
-    def _iteration(
-        self, number: int, steps: int, metrics: dict[str, float], policy: Path, validation: EvalResult | None
-    ) -> Iteration:
-        seconds = dict.fromkeys(STAGES, 0.0) | self._take_seconds(3)
-        return Iteration(number, steps, number * self.config.episodes, metrics, policy, validation, seconds)
+    def _result(self, policy: Path, validated: EvalResult | None) -> Result:
+        episodes, seconds = self._number * self.config.episodes, self._take_seconds()
+        return Result("iteration", self._number, self._simulated, episodes, self._metrics, policy, validated, seconds)
 
     def _validate_if_due(self, policy: Path) -> EvalResult | None:
         every = self.config.validation_every
         if self._simulated < self.config.steps and self._simulated // every == self._validated_at // every:
             return None
         self._validated_at = self._simulated
-        return self._validate(self._number, policy)
+        return self._validate_kept(policy)
 
-    def _validate(self, number: int, policy: Path) -> EvalResult:
-        """Evaluate a policy on the validation's seeds, unless that has been done; keep it if it is the best."""
-        config = self.config
-        if (found := self._validation(number)) is None:
-            job = RolloutJob(config.env, PolicyDriver((policy,)), HOLD, label="last")
-            with self._timed("validate"):
-                found = self._evaluate(job, f"iteration {number}", config.validation_episodes, config.seed)
-            with new_folder(validated(self.folder, number)) as new:
+    def _validate_kept(self, policy: Path) -> EvalResult:
+        """Evaluate a policy, of which the run keeps a copy, unless that has been done; keep it if it is the best."""
+        number = self._number
+        here = self.folder / VALIDATION / f"{number:06d}"
+        if not here.is_dir():
+            with new_folder(here) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
-                found.write(new / FILE_NAME)
+        found = self._validate(policy, here / FILE_NAME, f"iteration {number}", HOLD)
         if number == best_validation(validations(self.folder)):
             self._keep_best(policy)
         return found
 
-    def _validation(self, number: int) -> EvalResult | None:
-        path = validated(self.folder, number) / FILE_NAME
-        return EvalResult.read(path) if path.is_file() else None
-
-    def _resume(self) -> None:
-        """Go on from the last finished iteration, whose validation is made up for where it is missing."""
-        checkpoint = last_checkpoint(self.folder, resume=True)
-        if checkpoint is None:
-            return
+    def _go_on_from(self, checkpoint: Path) -> None:
+        """Read where the last finished iteration ended. Raises `MismatchError` if it learnt from something else."""
         step = read_step(checkpoint)
-        given = step.get("given", ())
-        given = list(given.values()) if isinstance(given, dict) else list(given)  # by path, in runs from before
-        if given != self._given:
+        if (given := step.get("given", [])) != self._given:
             ours, theirs = (", ".join(one[:12] for one in hashes) for hashes in (self._given, given))
             run = f"the run in {self.folder}"
             raise MismatchError("content of datasets and policies (sha256)", "what is given", ours, run, theirs)
-        with readable_state(checkpoint), threads(1):
-            self._learner.load(checkpoint / TRAINING_STATE, self._modules)
+        with readable_state(checkpoint):
             self._number, self._simulated = int(step["step"]), int(step["simulated"])
-            self._validated_at = int(step["validated_at"])
-        self._validate_if_due(checkpoint / PRETRAINED_MODEL)
+            self._metrics, self._validated_at = dict(step["metrics"]), int(step["validated_at"])
 
     def _options(self) -> dict[str, Any]:
         """The options that a checkpoint names."""
-        kept = {name: value for name, value in asdict(self.config).items() if name not in ("env", "datasets", "start")}
+        left_out = ("method", "env", "datasets", "start", "reward")
+        kept = {name: value for name, value in asdict(self.config).items() if name not in left_out}
         names = [root.resolve().name for root in self.config.datasets]
         start = self.config.start
         return kept | {"datasets": names, "init": None if start is None else start.resolve().name}
@@ -289,13 +235,6 @@ def validations(folder: Path) -> dict[int, EvalResult]:
     return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
 
 
-def validated(folder: Path, number: int) -> Path:
-    """Return the folder of a validated iteration: its policy and `eval.json`."""
-    return folder / VALIDATION / f"{number:06d}"
-
-
 def best_validation(found: dict[int, EvalResult]) -> int:
     """Return the iteration with the highest validation success, the later of equals."""
-    if not found:
-        raise ManipError("the run has no validation; expected one at its end")
     return max(found, key=lambda number: (found[number].success.rate, number))

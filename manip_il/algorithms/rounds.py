@@ -1,14 +1,28 @@
-"""The parts of a round of imitation: its rollouts, the policy that is fitted, and how good that is."""
+"""The parts of a round of imitation: its rollouts, and the policy that is fitted to those of all rounds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:  # read for help, too, before anything heavy is imported
-    from manip_il.evaluation.results import EvalResult
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.algorithms.config import RunConfig, Sampling
+from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
+from manip_il.collect.query import action_gap
+from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
+from manip_il.learn.fit_config import LEROBOT, FitConfig
+from manip_il.mdp import Actor
+from manip_il.seeding import stream_base
+
+F64 = NDArray[np.float64]
+CHUNK_STEPS = 20_000  # of a round, for LeRobot's policies, if none are given
+CORRECTION = 0.25  # of the longest step: if expert and learner differ by more, the label corrects
+_SAMPLED_BY = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)
 
 
 @dataclass(frozen=True)
@@ -46,38 +60,59 @@ class Fitted:
         return self.members[0]
 
 
-@dataclass(frozen=True)
-class RoundResult:
-    """One finished round. policy: its checkpoint. Times in [s].
+def round_folder(folder: Path, round_: int) -> Path:
+    """Return the folder of a round: its journals, dataset, policy and evaluation."""
+    return folder / f"round_{round_:03d}"
 
-    labels: sound labels learnt from so far. queries: states in which the expert was queried so far, which is more where
-    it must answer to decide (`safety`, `dart`'s held-out episodes). episodes: rollouts so far. steps: control steps
-    simulated so far. rollout_success: of this round's rollouts.
+
+def fit_round(
+    config: RunConfig,
+    roots: Sequence[Path],
+    folder: Path,
+    init_from: Path | None = None,
+    on_log: Callable[[dict[str, Any]], None] | None = None,
+    member: int = 0,
+    weights: F64 | None = None,
+) -> Path:
+    """Fit, or go on with fitting, a policy to datasets; return the checkpoint's `pretrained_model`.
+
+    init_from: start there (see `refit`). on_log: sees the metrics, {} at a step without. member: of the ensemble,
+    each from a seed of its own. weights: how often each frame is drawn, (N,); by default as the run's `sampling` says.
     """
+    from manip_il.learn.sources import Sources
+    from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
 
-    round: int
-    beta: float
-    labels: int
-    queries: int
-    episodes: int
-    steps: int
-    rollout_success: float
-    policy: Path
-    validation: EvalResult
-    seconds: dict[str, float]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return one line of `metrics.jsonl`."""
-        success = self.validation.success
-        first = ("round", "beta", "labels", "queries", "episodes", "steps", "rollout_success")
-        return {name: getattr(self, name) for name in first} | {
-            "validation_success": success.rate,
-            "validation_interval": list(success.interval),
-            "validation_episodes": success.n,
-            "seconds": self.seconds,
-        }
+    if weights is None and not config.sampling.is_even:
+        scale = env_actions(config.env).scale
+        weights = frame_weights(config.sampling, joined_columns(roots, _SAMPLED_BY), scale)
+    trainer = Trainer(
+        Sources(tuple(map(Dataset.open, roots))),
+        round_fit(config, init_from, member),
+        folder,
+        spec=env_spec(config.env, config.cameras),
+        fingerprint=env_fingerprint(config.env, config.cameras),
+        look=asdict(config.cameras.look) if config.cameras is not None else None,
+        resume=True,
+        weights=weights,
+    )
+    return trainer.fit(on_log)
 
 
-def best_round(results: Sequence[RoundResult]) -> RoundResult:
-    """Return the highest validation success; of equals the later, which has seen more."""
-    return max(results, key=lambda result: (result.validation.success.rate, result.round))
+def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
+    """Return the options of one round's fit. init_from: where a warm one starts from. member: of the ensemble.
+
+    Any other starts from the run's start policy, if there is one.
+    """
+    steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
+    if init_from is not None:
+        steps = config.refit_steps or steps
+    seed = stream_base("training", config.seed) + member
+    return replace(config.fit, steps=steps, seed=seed, init_from=init_from or config.start)
+
+
+def frame_weights(sampling: Sampling, table: Mapping[str, NDArray[Any]], scale: F64) -> F64:
+    """Return how often each frame of a table is drawn, (N,). scale: the longest step of an action, (n,)."""
+    gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
+    by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
+    later = np.where(by_expert | (gap > CORRECTION), sampling.corrections, sampling.rollouts)
+    return np.where(table[ROUND].reshape(-1) == 0, sampling.demonstrations, later).astype(np.float64)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, Sampling, check_labels
-from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_given, require_dataset, round_policy
 from manip_il.cli.options import Given, command_line, given, group, to_plain
@@ -20,6 +19,7 @@ from manip_il.option import option
 from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
+    from manip_il.algorithms.run import Result
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.figures import Curve
     from manip_il.evaluation.report import Report
@@ -81,6 +81,8 @@ class DaggerOptions:
 
     def run(self) -> None:
         """Run, or go on with, all rounds."""
+        from manip_il.algorithms.run import best_result
+
         config = self.config()
         with self.output.open(self) as folder:
             kept = f"every finished episode and round, in {folder}"
@@ -94,10 +96,10 @@ class DaggerOptions:
         say(f"report: {folder / REPORT_FILE}")
         test = f"manip-il eval --policy.path={best}{common.own_robot(config.env.robot)} --output_dir={folder}/test"
         remedies = f"more --steps ({config.fit.total_steps:,} a round now), or more --demonstrations"
-        say_policy(best, best_round(results).validation, test, remedies)
+        say_policy(best, best_result(results).validation, test, remedies)
 
     def config(self) -> RunConfig:
-        """Return what `run_algorithm` takes; raises for what does not go together, or does not fit what is given."""
+        """Return what `ImitationRun` takes; raises for what does not go together, or does not fit what is given."""
         from manip_il.collect.query import parse_query  # which imports numpy
         from manip_il.evaluation.suites import varied
 
@@ -134,44 +136,45 @@ class DaggerOptions:
         return observation or Checkpoint.open(start).observation, cameras or policy_cameras(start)
 
 
-def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
+def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Result]:
     """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
-    from manip_il.algorithms.imitation import run_algorithm
+    from manip_il.algorithms.imitation import ImitationRun
     from manip_il.collect.environments import env_fingerprint
     from manip_il.evaluation.results import write_json
 
     fingerprint = env_fingerprint(config.env, config.cameras)
     write_json(folder / FINGERPRINT_FILE, fingerprint)
-    results: list[RoundResult] = []
-    for result in run_algorithm(config, folder, engine, stages.watch()):
+    results: list[Result] = []
+    for result in ImitationRun(config, folder, engine, stages.watch()).results():
         stages.close()
         # Unless it is there from before an interruption, with the seconds of then.
-        if all(record.get("round") != result.round for record in read_lines(folder / METRICS_FILE)):
+        if all(record.get("round") != result.number for record in read_lines(folder / METRICS_FILE)):
             append_line(folder / METRICS_FILE, result.to_json())
         results.append(result)
         took = f"{sum(result.seconds.values()):.0f} s"
         success = f"validation success {result.validation.success}"
-        say(f"round {result.round}: {result.labels:,} labels, {success}, {took}")
+        say(f"round {result.number}: {result.labels:,} labels, {success}, {took}")
         stages.check()
     return results
 
 
-def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> Report:
+def _report(options: DaggerOptions, config: RunConfig, results: list[Result]) -> Report:
+    from manip_il.algorithms.run import best_result
     from manip_il.evaluation.eval_report import run_report
     from manip_il.evaluation.results import compare_results
     from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
 
-    best, folder = best_round(results), options.output.output_dir
+    best, folder = best_result(results), options.output.output_dir
     kind = ALGORITHMS[config.method].title
     first = "cloning" if config.start is None else "the policy given"
-    names = [f"{first} (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
+    names = [f"{first} (round 0)", *(f"{kind}, round {result.number}" for result in results[1:])]
     rows = [
-        PolicyRow(name, result.validation, result.labels, colour=DAGGER if result.round else CLONING)
+        PolicyRow(name, result.validation, result.labels, colour=DAGGER if result.number else CLONING)
         for name, result in zip(names, results, strict=True)
     ]
     facts = []
-    if best.round > 0:
-        comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.round]))
+    if best.number > 0:
+        comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.number]))
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
     return run_report(
         rows,
@@ -186,13 +189,15 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
     )
 
 
-def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
+def best_verdict(names: Sequence[str], results: Sequence[Result]) -> str:
     """Return which round is chosen, and its validation success. names: of the rounds."""
-    best = best_round(results)
+    from manip_il.algorithms.run import best_result
+
+    best = best_result(results)
     success = best.validation.success
     if not success.successes:
         return f"No round of {len(results)} succeeds in any of {success.n:,} validation episodes."
-    return f"{names[best.round]} is chosen of {len(results)}: {success} success on {success.n:,} validation episodes."
+    return f"{names[best.number]} is chosen of {len(results)}: {success} success on {success.n:,} validation episodes."
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> Curve:

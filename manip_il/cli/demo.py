@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.cli import common_options as common
 from manip_il.cli.dagger import DaggerOptions, learning_curve, round_timings, run_rounds
 from manip_il.cli.options import Given, command_line, given, group, to_plain
@@ -20,6 +19,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 
 if TYPE_CHECKING:
+    from manip_il.algorithms.run import Result
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.report import Film, Report
     from manip_il.evaluation.results import EvalResult
@@ -109,11 +109,12 @@ class _Demo:
             f"next: manip-il eval --policy.path={contestants[-1].policy} --eval.films=3 --output_dir={self.folder}_eval"
         )
 
-    def _contestants(self, results: list[RoundResult]) -> list[Contestant]:
+    def _contestants(self, results: list[Result]) -> list[Contestant]:
         from manip_il.algorithms.cloning_baseline import clone_with_labels
+        from manip_il.algorithms.run import best_result
         from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 
-        first, best = results[0], best_round(results)
+        first, best = results[0], best_result(results)
         policy, labels = clone_with_labels(
             self.config, results[-1].labels, self.folder / "dagger", self.folder / "cloning", self.engine, self.stages
         )
@@ -121,7 +122,7 @@ class _Demo:
             Contestant("expert", "expert", EXPERT),
             Contestant("cloned", "cloning", CLONING, first.policy, first.labels),
             Contestant("cloned_more", "cloning, as many labels", CLONING, policy, labels),
-            Contestant("dagger", f"DAgger (round {best.round})", DAGGER, best.policy, best.labels),
+            Contestant("dagger", f"DAgger (round {best.number})", DAGGER, best.policy, best.labels),
         ]
 
     def _trial(self, folder: str, seeds: range) -> Trial:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -21,8 +19,6 @@ from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.learning_run import Iteration, LearningRun
-    from manip_il.algorithms.run import Watch
     from manip_il.collect.workers import Engine
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.checkpoint import Origin
@@ -48,7 +44,7 @@ class Learning:
     """Base of these commands: a run of a method, its progress and its page."""
 
     title: ClassVar[str]
-    name: ClassVar[str]
+    method: ClassVar[str]
     first: ClassVar[tuple[str, ...]] = _FIRST
     settings: Given
     ppo: PPOConfig
@@ -58,15 +54,13 @@ class Learning:
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
         from manip_il.algorithms.learning_run import best_validation, validations
-        from manip_il.algorithms.run import Watch
         from manip_il.collect.workers import Engine
 
         config = self.learning_config()
         with self.output.open(self) as folder:
             kept = f"every finished iteration, in {folder}"
             with Stages(kept) as stages, Engine(self.workers) as engine:
-                watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
-                self._learn(config, self.learning_run(config, folder, engine, watch), stages)
+                self._learn(config, folder, engine, stages)
             self._report(config, folder)
         say(f"report: {folder / REPORT_FILE}")
         robot = common.own_robot(config.env.robot)
@@ -79,35 +73,28 @@ class Learning:
         """Return what the run takes; raises for what is wrong with datasets and policy together."""
         raise NotImplementedError
 
-    def learning_run(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> LearningRun:
-        """Return the run, which `iterations` continues."""
+    def _learn(self, config: LearningConfig, folder: Path, engine: Engine, stages: Stages) -> None:
         from manip_il.algorithms.learning_run import LearningRun
+        from manip_il.algorithms.run import Watch
 
-        return LearningRun(config, folder, engine, watch)
-
-    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
-        """Return the iterations that are left."""
-        raise NotImplementedError
-
-    def _learn(self, config: LearningConfig, run: LearningRun, stages: Stages) -> None:
-        metrics, iterations = run.folder / METRICS_FILE, self.iterations(run, config)
+        watch, metrics = Watch(on_episode=lambda _: stages.check(), on_step=stages.check), folder / METRICS_FILE
+        results = LearningRun(config, folder, engine, watch).results()
         stages.start(f"{self.title}, steps", config.steps)
         written = {record["iteration"] for record in read_lines(metrics)}
-        first = run.begin()  # what it goes on from, which may have ended before its line was written
-        for result in itertools.chain([first] if first else [], iterations):
+        for result in results:
             if result.number not in written:
                 append_line(metrics, result.to_json())
             shown = {name: result.metrics[name] for name in ("success", "kl") if name in result.metrics}
             stages.reach(result.steps, **shown)
-            if result.validation is not None:
-                say(f"{result.steps:,} steps: validation success {result.validation.success}")
+            if result.validated is not None:
+                say(f"{result.steps:,} steps: validation success {result.validated.success}")
 
     def _report(self, config: LearningConfig, folder: Path) -> None:
         from manip_il.algorithms.adversarial_report import adversarial_report
         from manip_il.algorithms.learning_run import validations
 
         title = f"{self.title} on {config.env.robot} {config.env.task}"
-        records, command = read_lines(folder / METRICS_FILE), command_line(self.name, self)
+        records, command = read_lines(folder / METRICS_FILE), command_line(f"rl {self.method}", self)
         report = adversarial_report(title, validations(folder), records, command, to_plain(self))
         report.write(folder / REPORT_FILE)
 
@@ -122,7 +109,7 @@ class GailOptions(Learning):
     """
 
     title: ClassVar[str] = "GAIL"
-    name: ClassVar[str] = "rl gail"
+    method: ClassVar[str] = "gail"
     example: ClassVar[str] = "manip-il rl gail --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/gail"
     dataset: GivenGroup
     init: Path | None = option(None, f"{_INIT}; by default a new policy", check=find_policy)
@@ -143,6 +130,7 @@ class GailOptions(Learning):
         for one in opened:
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
         return LearningConfig(
+            method=self.method,
             env=env,
             datasets=tuple(self.dataset.root),
             start=None if self.init is None else find_policy(self.init),
@@ -150,12 +138,6 @@ class GailOptions(Learning):
             discriminator=self.discriminator,
             **self.settings,
         )
-
-    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
-        """Return the iterations that are left."""
-        from manip_il.algorithms.gail import gail
-
-        return gail(run, config)
 
 
 @dataclass
@@ -166,16 +148,10 @@ class AirlOptions(GailOptions):
     """
 
     title: ClassVar[str] = "AIRL"
-    name: ClassVar[str] = "rl airl"
+    method: ClassVar[str] = "airl"
     example: ClassVar[str] = "manip-il rl airl --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/airl"
     settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
     output: ResumableOutput = group(ResumableOutput(Path("runs/airl")), prefix="")
-
-    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
-        """Return the iterations that are left."""
-        from manip_il.algorithms.airl import airl
-
-        return airl(run, config)
 
 
 @dataclass
@@ -187,7 +163,7 @@ class PpoOptions(Learning):
     """
 
     title: ClassVar[str] = "PPO"
-    name: ClassVar[str] = "rl ppo"
+    method: ClassVar[str] = "ppo"
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
     init: Path = option(MISSING, _INIT, check=find_policy)
     reward: Path = option(MISSING, "the reward: a folder of manip-il reward fit", check=exists(REWARD))
@@ -204,19 +180,8 @@ class PpoOptions(Learning):
         origin = reward.origin
         env = _known_env(str(self.reward), origin)
         reward.check_fits("the environment", env_spec(env))
-        return LearningConfig(env=env, start=find_policy(self.init), ppo=self.ppo, **self.settings)
-
-    def learning_run(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> LearningRun:
-        """Return the run, which `iterations` continues."""
-        from manip_il.algorithms.learning_run import LearningRun
-
-        return LearningRun(config, folder, engine, watch, absorbing=False, reward=reward_folder(self.reward))
-
-    def iterations(self, run: LearningRun, config: LearningConfig) -> Iterator[Iteration]:
-        """Return the iterations that are left."""
-        from manip_il.algorithms.ppo import ppo
-
-        return ppo(run, load_reward(self.reward))
+        paths = {"start": find_policy(self.init), "reward": reward_folder(self.reward)}
+        return LearningConfig(method=self.method, env=env, ppo=self.ppo, **paths, **self.settings)
 
 
 def _known_env(name: str, spec: RobotTaskSpec | Origin) -> EnvConfig:

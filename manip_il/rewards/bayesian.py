@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.rewards.demonstrations import Demonstration, add_rivals, rivals
+from manip_il.rewards.paths import Demonstration, add_rivals, rivals
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 Density = Callable[[F64], F64]  # logarithms (C,) at points (C, K)

@@ -4,20 +4,25 @@ Of all distributions over paths whose expected features are the demonstrations',
 p(path) = exp(-w . features(path)) / Z(w). Its weights are those of the greatest likelihood, which is concave; the
 gradient is the difference between expected and demonstrated features. Who always takes the cheapest path leaves the
 scale of the weights open, so a normal prior holds it.
+
+The sum Z over paths of every length solves z = M z + e_goal, M = exp(-cost) of every edge. It is found by summing over
+ever longer paths, relative to the cheapest path's cost, so that nothing underflows: on a grid of 10,000 nodes with 26
+neighbours in 5 ms, where a sparse LU decomposition of I - M takes 170 ms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from manip_il.rewards.demonstrations import LENGTH, Demonstration, stages
-from manip_il.rewards.soft import soft_plan
+from manip_il.errors import ManipError
+from manip_il.rewards.paths import LENGTH, Demonstration, PathProblem, plan, stages
 
 F64 = NDArray[np.float64]
 PRIOR = 300.0  # standard deviation of a weight [1/m]
@@ -25,16 +30,81 @@ _MOST_STEPS = 200
 _ENOUGH, _SAME = 1e-4, 1e-6  # gradient [m] and relative gain of a step at which it ends
 _LEAST_UNIT, _TINY = 1e-2, 1e-300  # of a feature, in the largest
 _ABOVE = 1.001  # times the least weight for which the sum over all paths is finite
+_NO_MORE = 1e-14  # share that longer paths may still add
+_MOST_EDGES = 20_000  # of a path
 
 
 @dataclass(frozen=True)
-class Entropy:
-    """weights: (K,) [1/m], their scale the certainty. expected, demonstrated: mean features of a path, (K,) [m]."""
+class SoftPlan:
+    """Distribution of the paths to a goal.
 
-    weights: F64
-    expected: F64
-    demonstrated: F64
-    evaluations: int
+    values: soft cost-to-go -log Z of every node, (S,), infinite where no path leads to the goal. chances: with which
+    each edge is taken by who is at its beginning, (E,).
+    """
+
+    problem: PathProblem
+    values: F64
+    chances: F64
+
+    @cached_property
+    def _moves(self) -> Any:
+        return self.problem.backwards(self.chances)
+
+    def visits(self, start: int) -> F64:
+        """Return how often every edge is passed on the way from a start, expected, (E,) (Ziebart et al. 2008, alg. 1).
+
+        Raises `ManipError` where no path leads to the goal.
+        """
+        if not np.isfinite(self.values[start]):
+            raise ManipError(f"no path leads from node {start} to the goal")
+        now = np.zeros(self.problem.nodes)
+        now[start] = 1.0
+        total = now.copy()
+        for _ in range(_MOST_EDGES):
+            now = self._moves @ now
+            total += now
+            if now.sum() - now[self.problem.goal] <= _NO_MORE:
+                return total[self.problem.edges[:, 0]] * self.chances
+        raise ManipError(f"paths of more than {_MOST_EDGES} edges are likely; expected higher costs")
+
+    def features(self, start: int) -> F64:
+        """Return the expected sums of the features on the way from a start, (K,)."""
+        return self.visits(start) @ self.problem.features
+
+
+def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
+    """Return the distribution of paths for weights (K,); the larger they are, the closer it is to the cheapest path.
+
+    Raises `ManipError` where the sum over all paths is infinite, because steps cost less than the choice between them
+    adds (the spectral radius of M is 1 or more).
+    """
+    costs, edges = problem.costs(weights), problem.edges
+    hard = plan(problem, weights).costs
+    known = np.where(np.isfinite(hard), hard, 0.0)
+    leads = np.isfinite(hard)[edges[:, 1]] & (edges[:, 0] != problem.goal)
+    shares = np.where(leads, np.exp(-(costs + known[edges[:, 1]] - known[edges[:, 0]]).clip(min=0.0)), 0.0)
+    sums = _sum_paths(problem, shares)
+    ahead, reached = sums[edges[:, 1]], sums > 0
+    chances = shares * ahead / np.where(reached, sums, 1.0)[edges[:, 0]]
+    values = np.where(reached, known - np.log(np.where(reached, sums, 1.0)), np.inf)
+    return SoftPlan(problem, values, chances)
+
+
+def _sum_paths(problem: PathProblem, shares: F64) -> F64:
+    """Solve z = M z + e_goal for the matrix of `shares` (E,), (S,)."""
+    matrix = problem.matrix(shares)
+    found, end = np.zeros(problem.nodes), np.zeros(problem.nodes)
+    end[problem.goal] = 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_MOST_EDGES):
+            before, found = found, matrix @ found + end
+            if not np.isfinite(found[problem.goal]) or not np.isfinite(found).all():
+                break
+            if (found - before <= _NO_MORE * found).all():
+                return found
+    raise ManipError(
+        "the sum over all paths is infinite: steps cost less than the choice between them adds; expected higher weights"
+    )
 
 
 def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR) -> tuple[float, F64, F64]:
@@ -66,10 +136,11 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     return found
 
 
-def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> Entropy:
-    """Return the most likely weights, each 0 or more, by L-BFGS-B. prior: [1/m].
+def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> tuple[F64, F64, int]:
+    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B; the larger, the surer. prior: [1/m].
 
-    It begins from twice the least weights on a few of the demonstrations, and goes on from there on all.
+    Beside them the mean features of a path that they expect, (K,) [m], and the number of evaluations. It begins from
+    twice the least weights on a few of the demonstrations, and goes on from there on all.
     """
     least = least_weights(demonstrations)
     weights, evaluations = np.maximum(2 * least, least.max() / 2), 0
@@ -77,7 +148,7 @@ def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> Entrop
         weights, more = _minimise(some, weights, least, prior)
         evaluations += more
     *_, expected = loss_of(demonstrations, weights, prior)
-    return Entropy(weights, expected, np.mean([one.sums for one in demonstrations], axis=0), evaluations)
+    return weights, expected, evaluations
 
 
 def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, prior: float) -> tuple[F64, int]:

@@ -7,13 +7,11 @@ subgradient is the demonstration's features less those of the path that is cheap
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.rewards.demonstrations import LENGTH, Demonstration, stages
-from manip_il.rewards.paths import cheapest_path, plan_edges
+from manip_il.rewards.paths import LENGTH, Demonstration, cheapest_path, plan_edges, stages
 
 F64 = NDArray[np.float64]
 MARGIN = 0.05  # of a path's length: by how much less is paid for what is off the demonstration
@@ -21,14 +19,6 @@ RIDGE = 1e-4  # times half the squared weights, beside a demonstration's metres
 _STEPS = 50  # of each stage
 _RATE = 1.0  # of AdaGrad: the first step of every weight
 _FLAT = 1e-12
-
-
-@dataclass(frozen=True)
-class Margin:
-    """weights: (K,), that of length at least 1. losses: the objective at every step, on a few first, (n,) [m]."""
-
-    weights: F64
-    losses: F64
 
 
 def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) -> tuple[float, F64]:
@@ -46,11 +36,11 @@ def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) 
     return float(demonstration.sums @ weights - planned.costs[demonstration.start]), demonstration.sums - sums
 
 
-def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> Margin:
-    """Return the weights of maximum margin planning: the mean of the second half of projected subgradient steps.
+def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> tuple[F64, F64]:
+    """Return the weights (K,) of maximum margin planning: the mean of the second half of projected subgradient steps.
 
     Every weight is at least 0 and length's at least 1, which sets the scale. Steps are AdaGrad's; the first ones see a
-    few of the demonstrations.
+    few of the demonstrations. Beside them the objective at every step, (n,) [m].
     """
     least = np.eye(demonstrations[0].problem.features.shape[1])[LENGTH]
     weights, losses = least, list[float]()
@@ -64,4 +54,4 @@ def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> Marg
             weights = np.maximum(weights - _RATE * gradient / np.sqrt(squares + _FLAT), least)
             kept.append(weights)
         weights = np.mean(kept[_STEPS // 2 :], axis=0)
-    return Margin(weights, np.array(losses))
+    return weights, np.array(losses)

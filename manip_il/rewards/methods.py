@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.rewards import bayesian, max_entropy, max_margin
-from manip_il.rewards.demonstrations import LENGTH, Demonstration, open_features, rivals
+from manip_il.rewards.paths import LENGTH, Demonstration, open_features, rivals
 
 F64 = NDArray[np.float64]
 LEVEL = 0.9  # of intervals
@@ -49,18 +49,18 @@ Found = tuple[F64, F64 | None, tuple[str, ...]]  # weights (K,), their intervals
 
 
 def _max_margin(shown: Sequence[Demonstration], _rng: np.random.Generator) -> Found:
-    found = max_margin.fit(shown)
-    return found.weights, None, (f"The demonstrations miss their margins by {found.losses[-1]:.3g} m of path.",)
+    weights, losses = max_margin.fit(shown)
+    return weights, None, (f"The demonstrations miss their margins by {losses[-1]:.3g} m of path.",)
 
 
 def _max_entropy(shown: Sequence[Demonstration], _rng: np.random.Generator) -> Found:
-    found = max_entropy.fit(shown)
-    apart = float(np.abs(found.expected - found.demonstrated).max())
+    weights, expected, evaluations = max_entropy.fit(shown)
+    apart = float(np.abs(expected - np.mean([one.sums for one in shown], axis=0)).max())
     facts = (
-        f"Expected and demonstrated features differ by {apart:.2g} m at most, after {found.evaluations} evaluations.",
-        f"A metre of path is weighed {found.weights[LENGTH]:.0f} fold: the larger, the surer was the demonstrator.",
+        f"Expected and demonstrated features differ by {apart:.2g} m at most, after {evaluations} evaluations.",
+        f"A metre of path is weighed {weights[LENGTH]:.0f} fold: the larger, the surer was the demonstrator.",
     )
-    return found.weights, None, facts
+    return weights, None, facts
 
 
 def _bayesian(shown: Sequence[Demonstration], rng: np.random.Generator) -> Found:

@@ -10,8 +10,8 @@ import pytest
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.imitation import ImitationRun, mixture
-from manip_il.algorithms.rounds import Rollouts, RoundResult
-from manip_il.algorithms.run import Watch
+from manip_il.algorithms.rounds import Rollouts
+from manip_il.algorithms.run import Result, Watch
 from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
@@ -32,13 +32,13 @@ CONFIG = RunConfig(
 )
 
 
-def expert_only(run: ImitationRun, c: RunConfig) -> Iterator[RoundResult]:
+def expert_only(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
     """Fit to the expert's demonstrations, once."""
     policy = run.fit([run.demonstrations(c.demonstrations)])
     yield run.validate(policy)
 
 
-def halves(run: ImitationRun, c: RunConfig) -> Iterator[RoundResult]:
+def halves(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
     """Let expert and learner drive half of the steps each, and learn from the latest rollouts alone."""
     data: Rollouts = run.demonstrations(c.demonstrations)
     for i in range(1, c.rounds + 1):
@@ -48,7 +48,7 @@ def halves(run: ImitationRun, c: RunConfig) -> Iterator[RoundResult]:
     yield run.validate(run.fit([data]))
 
 
-def follow(algorithm, folder: Path, watch: Watch | None = None) -> list[RoundResult]:
+def follow(algorithm, folder: Path, watch: Watch | None = None) -> list[Result]:
     run = ImitationRun(CONFIG, folder, Engine(), watch)
     return list(run.follow(algorithm(run, CONFIG)))
 
@@ -56,8 +56,8 @@ def follow(algorithm, folder: Path, watch: Watch | None = None) -> list[RoundRes
 @pytest.mark.parametrize(("algorithm", "betas"), [(expert_only, [1.0]), (halves, [1.0, 0.5, 0.5])])
 def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorithm, betas, tmp_path, monkeypatch):
     whole, rounds = follow(algorithm, tmp_path / "whole"), len(betas)
-    assert [result.round for result in whole] == list(range(rounds))
-    assert [result.beta for result in whole] == betas
+    assert [result.number for result in whole] == list(range(rounds))
+    assert [result.metrics["beta"] for result in whole] == betas
     assert [result.episodes for result in whole] == [2, 4, 6][:rounds]
     assert [result.labels for result in whole] == sorted({result.labels for result in whole})
     assert Dataset.open(tmp_path / "whole/dataset").info.episodes == 2 * rounds

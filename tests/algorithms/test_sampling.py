@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from manip_il.algorithms.config import Sampling
-from manip_il.algorithms.imitation import frame_weights
+from manip_il.algorithms.rounds import frame_weights
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor
 

@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import chisquare
 
 from manip_il.rewards.bayesian import Choices, Posterior, draw_posterior, fit, prior_tastes, sample
-from manip_il.rewards.demonstrations import Demonstration, add_rivals, open_features, rivals
-from manip_il.rewards.paths import PathProblem
+from manip_il.rewards.paths import Demonstration, PathProblem, add_rivals, open_features, rivals
 from tests.rewards.grids import acyclic, all_paths, demonstrations, excess
 
 TRUTH = np.array([1.0, 4.0, 2.0])

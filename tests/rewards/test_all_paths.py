@@ -5,8 +5,8 @@ import pytest
 from scipy.special import logsumexp
 
 from manip_il.errors import ManipError
+from manip_il.rewards.max_entropy import soft_plan
 from manip_il.rewards.paths import PathProblem, plan
-from manip_il.rewards.soft import soft_plan
 from tests.rewards.grids import acyclic, all_paths, draw, grid
 
 WEIGHTS = np.array([1.0, 0.3, 2.0])
