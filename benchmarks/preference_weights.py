@@ -34,10 +34,9 @@ from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.learn.reward import LearnedReward
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
-from manip_il.preferences.choose import choose_pairs, open_supply
 from manip_il.preferences.fitting import TIE, true_difference
 from manip_il.preferences.frames import find_datasets
-from manip_il.preferences.pairs import Clips
+from manip_il.preferences.pairs import Clips, choose_pairs, open_supply
 
 AGREEMENT, AREA, POINTS, P_VALUE = 0.90, 0.95, 0.15, 0.001
 _FRESH, _CLIP, _DRAWS = 2_000, 20, 5

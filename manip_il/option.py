@@ -37,3 +37,9 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
     if not low <= value <= high:
         wanted = f"at least {low}" if high == math.inf else f"{low} to {high:,}"
         raise UsageError(f"{name} is {value}; expected {wanted}")
+
+
+def check_bounds(options: Any, prefix: str = "") -> None:
+    """Raise `UsageError` for a field of a dataclass's instance that is out of the bounds in its metadata."""
+    for one in fields(options):
+        check_bound(prefix + one.name, getattr(options, one.name), one.metadata)

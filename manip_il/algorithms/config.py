@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig, MLPOptions
-from manip_il.option import option
+from manip_il.option import check_bounds, option
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.stock.table import ROBOT as STOCK
 
@@ -94,15 +93,14 @@ class Sampling:
     executed action by more than a quarter of the longest step. rollouts: the others of later rounds.
     """
 
-    demonstrations: float = option(1.0, "weight of a frame of round 0")
-    corrections: float = option(1.0, "weight of a later frame where the expert drove or would have acted differently")
-    rollouts: float = option(1.0, "weight of the other later frames")
+    demonstrations: float = option(1.0, "weight of a frame of round 0", at_least=0)
+    corrections: float = option(
+        1.0, "weight of a later frame where the expert drove or would have acted differently", at_least=0
+    )
+    rollouts: float = option(1.0, "weight of the other later frames", at_least=0)
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
-            if not 0 <= value < math.inf:
-                raise UsageError(f"sampling.{one.name} is {value}; expected 0 or more")
+        check_bounds(self, "sampling.")
         if self.demonstrations == 0:
             raise UsageError("sampling.demonstrations is 0, but round 0 has nothing else to learn from")
 
@@ -112,10 +110,6 @@ class Sampling:
         return self.demonstrations == self.corrections == self.rollouts
 
 
-_AT_LEAST_1 = (
-    *("demonstrations", "episodes_per_round", "validation_episodes", "ensemble", "patience"),
-    *("label_budget", "branch_steps", "refit_steps"),
-)
 _LEARNER_ALONE = BetaSchedule("constant", 0.0)
 
 
@@ -127,26 +121,17 @@ class RunConfig:
     that is round 0's policy, in place of cloning; without datasets, round 0 then has no demonstrations. Later rounds
     begin with its weights, and have its architecture.
 
-    rounds: after round 0, fewer if label_budget, the sound labels of all rounds together, is reached before. beta: the
-    share of a round's steps that the expert drives. label, branch_steps: what the expert gives in a state in which it
-    is queried, see `RolloutJob`; branch_steps None: as many as the policy plans. query_rule: in which states; None: the
-    default of the label mode, see `query`. ensemble: policies fitted every round, of which the first drives.
-
-    refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
-    the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
-    many steps after success. patience: end a rollout in which every state is labelled after this many steps without
-    progress: what follows are the same states again. disturbed_share: of a round's learner rollouts that run under
-    `manip_il.sim.events.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
-    redraw: policies learn from scenes drawn anew of every round's states, which are then recorded without pictures.
-    conditions: what the worlds of all episodes differ in, validation's too.
+    query_rule: None is the default of the label mode, see `query`. hold: of validation's rollouts, too. patience: what
+    follows are the same states again. disturbed_share: under `manip_il.sim.events.STANDARD`. cameras: what is pictured;
+    with redraw, no pictures are recorded. conditions: what the worlds of all episodes differ in, validation's too.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
     method: str = "dagger"
-    demonstrations: int = option(50, "successful expert episodes to begin with (round 0)")
+    demonstrations: int = option(50, "successful expert episodes to begin with (round 0)", at_least=1)
     rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more", grows=True)
-    episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones")
-    label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")
+    episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones", at_least=1)
+    label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends", at_least=1)
     beta: BetaSchedule = option(
         lambda: _LEARNER_ALONE, "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B"
     )
@@ -155,21 +140,31 @@ class RunConfig:
         "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
     )
     query_rule: Query | None = None
-    branch_steps: int | None = option(None, "control steps of a branch; by default as many as the policy plans")
-    ensemble: int = option(1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND")
+    branch_steps: int | None = option(
+        None, "control steps of a branch; by default as many as the policy plans", at_least=1
+    )
+    ensemble: int = option(
+        1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND", at_least=1
+    )
     sampling: Sampling = field(default_factory=Sampling)
     refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
-    refit_steps: int | None = option(None, "gradient steps in later rounds, with --refit=warm; by default as many")
+    refit_steps: int | None = option(
+        None, "gradient steps in later rounds, with --refit=warm; by default as many", at_least=1
+    )
     fit: FitConfig = field(default_factory=FitConfig)
-    validation_episodes: int = option(200, "unseen episodes that choose the best round")
+    validation_episodes: int = option(200, "unseen episodes that choose the best round", at_least=1)
     hold: int = option(10, "control steps of a rollout after success")
-    patience: int = option(100, "control steps without progress after which a rollout with a label a state ends")
+    patience: int = option(
+        100, "control steps without progress after which a rollout with a label a state ends", at_least=1
+    )
     disturbed_share: float = option(
-        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
+        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions", at_least=0, at_most=1
     )
     cameras: CameraConfig | None = None
     redraw: int = option(
-        0, "scenes drawn anew from round 0's states for a policy on pictures, and as many a state in later rounds"
+        0,
+        "scenes drawn anew from round 0's states for a policy on pictures, and as many a state in later rounds",
+        at_least=0,
     )
     conditions: tuple[Condition, ...] = ()
     seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
@@ -179,17 +174,11 @@ class RunConfig:
     def __post_init__(self) -> None:
         from manip_il.seeding import MAX_ROUNDS
 
-        for name in _AT_LEAST_1:
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise UsageError(f"{name} is {value}; expected at least 1")
-        if not 0 <= self.disturbed_share <= 1:
-            raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 to 1")
+        check_bounds(self)
         if self.disturbed_share and self.env.robot == STOCK:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
         if not 0 <= self.rounds < MAX_ROUNDS:
             raise UsageError(f"rounds is {self.rounds}; expected 0 or more, fewer than {MAX_ROUNDS}")
-        if self.redraw < 0:
-            raise UsageError(f"redraw is {self.redraw}; expected the number of scenes")
         if self.redraw and (self.cameras is None or self.label != "per_state" or not self.sampling.is_even):
             raise UsageError("redraw is for policies on pictures, with --label=per_state and even sampling")
         if self.refit_steps is not None and self.refit == "scratch":

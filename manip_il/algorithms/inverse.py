@@ -1,13 +1,16 @@
-"""Inverse reinforcement learning on `carry`: a dataset's paths on the grids of their layouts, and their weights.
+"""Inverse reinforcement learning on `carry`: a dataset's paths on the grids of their layouts, and what they tell.
 
 Layouts, goals and the object's places are read from what the environment shows; nothing else of a dataset is used.
+What comes out are the weights of a reward, `reward.json`, and the page of `manip-il reward irl`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +19,11 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
-from manip_il.rewards.paths import Demonstration
+from manip_il.evaluation.figures import CLONING, DAGGER, SOFT, Figure, drawing, to_figure
+from manip_il.evaluation.report import Report, Section
+from manip_il.evaluation.tables import Table
+from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
+from manip_il.rewards.paths import Demonstration, cheapest_path, plan
 from manip_il.robots.table import get_robot
 from manip_il.sim.scene import build_scene
 from manip_il.tasks.furnishing import EDGE, observed_layout, space_of
@@ -24,10 +31,20 @@ from manip_il.tasks.grid import Grid
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.layout import THINGS
 from manip_il.tasks.pick_place import OBJECT
+from manip_il.tasks.reward import FEATURES
 
 F64 = NDArray[np.float64]
 CARRY = "carry"
 _MOVED = 0.004  # from where it stood, at which an object is on its way [m]
+FILE_NAME = "reward.json"
+_ASSUMES = {
+    "max_margin": "min over w of  λ/2 |w|² + mean over demonstrations of  "
+    "[ w·f(demonstration) - min over paths (w·f - margin) ]",
+    "bayesian": "p(w) = Π exp(-w_k / m) / m;   p(demonstration | w) = exp(-w·f) / Σ over its rivals exp(-w·f)",
+    "max_entropy": "p(path) = exp(-w·f) / Z(w);   gradient = f(demonstrations) - E[f]",
+}
+_PANELS = 3
+_SIDE = 80  # points along a side of the map
 
 
 @dataclass(frozen=True)
@@ -95,3 +112,148 @@ def _places(root: Path, spec: schema.RobotTaskSpec) -> dict[str, int]:
             f"{root} is of the task {spec.task}; expected a dataset of manip-il record --task.type={CARRY}"
         )
     return {name: column for column, name in enumerate(spec.environment_state_names)}
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """Weights and whom they were learnt of. source: the dataset, in words."""
+
+    source: str
+    carried: tuple[Carried, ...]
+    learnt: Learnt
+
+    @property
+    def open_names(self) -> tuple[str, ...]:
+        """Features of which nothing is known."""
+        return tuple(FEATURES[k] for k in self.learnt.open)
+
+    @cached_property
+    def weights(self) -> F64:
+        """Weights to plan with, (K,): those of which nothing is known are 0."""
+        found = self.learnt.weights.copy()
+        found[list(self.learnt.open)] = 0.0
+        return found
+
+    @cached_property
+    def replanned(self) -> tuple[tuple[NDArray[np.int64], F64], ...]:
+        """The cheapest paths in the demonstrations' places: nodes (n,) and features (K,)."""
+        shown = [one.demonstration for one in self.carried]
+        return tuple(cheapest_path(one.problem, plan(one.problem, self.weights), one.start) for one in shown)
+
+    @property
+    def means(self) -> tuple[F64, F64]:
+        """Mean features of the demonstrations and of the re-planned paths, (K,) [m]."""
+        shown = np.mean([one.demonstration.sums for one in self.carried], axis=0)
+        return shown, np.mean([sums for _, sums in self.replanned], axis=0)
+
+    @property
+    def excess(self) -> float:
+        """Share that the demonstrations cost above the re-planned paths for these weights."""
+        shown, planned = self.means
+        return float(shown @ self.weights / (planned @ self.weights) - 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything for `reward.json`, whose `names` and `weights` a reward is read from."""
+        known = [k for k in range(len(FEATURES)) if k not in self.learnt.open]
+        intervals = self.learnt.intervals
+        return {
+            "names": [FEATURES[k] for k in known],
+            "weights": [float(self.weights[k]) for k in known],
+            "intervals": None if intervals is None else [intervals[k].tolist() for k in known],
+            "level": None if intervals is None else LEVEL,
+            "not_identified": {name: list(prior_interval()) for name in self.open_names},
+            "method": self.learnt.method,
+            "demonstrations": len(self.carried),
+            "source": self.source,
+            "excess": self.excess,
+        }
+
+
+def weight_table(found: Inverse) -> Table:
+    """Return the weights, one row a feature."""
+    learnt, (shown, planned), rows = found.learnt, found.means, []
+    for k, name in enumerate(FEATURES):
+        weight, interval = f"{learnt.weights[k]:.2f}", ""
+        if k in learnt.open:
+            weight, interval = "not identified", "[{:.2g}, {:.2g}] (prior)".format(*prior_interval())
+        elif learnt.intervals is not None:
+            interval = "[{:.2f}, {:.2f}]".format(*learnt.intervals[k])
+        rows.append((name.replace("_", " "), weight, interval, f"{shown[k]:.3f}", f"{planned[k]:.3f}"))
+    columns = ("per metre", "weight", f"{LEVEL:.0%} interval", "shown [m]", "planned [m]")
+    return Table(columns, tuple(rows)).filled()
+
+
+def open_line(found: Inverse) -> str:
+    """Return which weights are not identified, as a sentence; empty if all are."""
+    if not found.open_names:
+        return ""
+    return (
+        f"All demonstrations agree in {', '.join(found.open_names)}: nothing tells these weights, which are left out "
+        "of the reward (0 when it is planned with)."
+    )
+
+
+def inverse_report(found: Inverse, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
+    """Return the report of what was learnt."""
+    order = [k for k in np.argsort(-found.weights).tolist() if k != 0 and found.weights[k] > 0][:3]
+    words = ", ".join(f"{found.weights[k]:.1f} {FEATURES[k].replace('_', ' ')}" for k in order)
+    weights = Section(
+        "What a metre costs",
+        formulas=(_ASSUMES[found.learnt.method],),
+        tables=(weight_table(found),),
+        notes=tuple(one for one in (*found.learnt.facts, open_line(found)) if one),
+    )
+    costs = Section(
+        "The cost over the table",
+        figures=(_cost_figure(found),),
+        notes=(
+            "Cost of a metre of path at the height at which the object was carried, from above; things in grey. "
+            "Solid: as demonstrated. Dashed: the cheapest path for these weights.",
+        ),
+    )
+    return Report(
+        title="What the demonstrations care about",
+        verdict=f"{len(found.carried)} demonstrations pay {found.excess:.1%} more than the cheapest paths for the "
+        "weights that were learnt of them; a metre that costs 1 for its length costs besides: "
+        f"{words or 'nothing'}.",
+        command=command,
+        config=config,
+        timings=timings,
+        sections=(weights, costs),
+    )
+
+
+def _cost_figure(found: Inverse) -> Figure:
+    """The cost of a metre over the table in the layouts with the most on it, with both paths."""
+    count = [len(one.grid.layout.places) + (one.grid.layout.edge is not None) for one in found.carried]
+    chosen = np.argsort(-np.array(count), kind="stable")[:_PANELS].tolist()
+    with drawing(len(chosen), size=(3.0, 3.1)) as (drawn, axes):
+        for axis, number in zip(axes[0], chosen, strict=True):
+            one = found.carried[number]
+            image = _draw_cost(axis, one, found.weights)
+            path = one.grid.points[found.replanned[number][0]]
+            axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, lw=1.8, label="demonstrated")
+            axis.plot(*path[:, :2].T, "--", color=CLONING, lw=1.6, label="re-planned")
+            axis.plot(*one.grid.layout.goal[:2], "o", color=CLONING, ms=5)
+            drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8, pad=0.02)
+            axis.set(title=f"episode {one.episode}", xticks=[], yticks=[], aspect="equal")
+            axis.grid(visible=False)
+        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+        return to_figure(drawn, "Cost of a metre of path over the table, with demonstrated and re-planned paths")
+
+
+def _draw_cost(axis: Any, one: Carried, weights: F64) -> Any:
+    """The cost of a metre from above, at the height of the path's middle, and the things."""
+    layout, points = one.grid.layout, one.grid.points
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    x, y = (np.linspace(low[k], high[k], _SIDE) for k in (0, 1))
+    height = float(np.median(one.positions[:, 2]))
+    places = np.stack([*(part.ravel() for part in np.meshgrid(x, y)), np.full(_SIDE**2, height)], axis=1)
+    cost = (layout.densities(places) @ weights).reshape(_SIDE, _SIDE)
+    image = axis.imshow(cost, origin="lower", extent=(low[0], high[0], low[1], high[1]), cmap="Greens")
+    for name, (px, py) in layout.places:
+        half = layout.scale * np.array(THINGS[name].half)
+        box_x, box_y = px + half[0] * np.array([-1, 1, 1, -1, -1]), py + half[1] * np.array([-1, -1, 1, 1, -1])
+        axis.fill(box_x, box_y, color=SOFT, alpha=0.6, lw=0)
+        axis.annotate(name, (px, py), ha="center", va="center", fontsize=6.5)
+    return image

@@ -7,10 +7,9 @@ from pathlib import Path
 
 from manip_il.errors import UsageError
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
-from manip_il.option import option
+from manip_il.option import check_bounds, option
 from manip_il.sim.config import EnvConfig
 
-_AT_LEAST_1 = ("steps", "episodes", "validation_every", "validation_episodes")
 LONGER = 1.5  # times the longest demonstration, by default
 
 
@@ -27,11 +26,12 @@ class LearningConfig:
     datasets: tuple[Path, ...] = ()
     start: Path | None = None
     reward: Path | None = None
-    steps: int = option(200_000, "simulated control steps in all")
-    episodes: int = option(32, "of an iteration, side by side")
+    steps: int = option(200_000, "simulated control steps in all", at_least=1)
+    episodes: int = option(32, "of an iteration, side by side", at_least=1)
     episode_steps: int = option(
         0,
         "control steps of an episode while learning; 0: 1.5 times the longest demonstration's, or the horizon",
+        at_least=0,
     )
     action_space: str | None = option(
         None, "what the policy's actions are: ee_delta, joint_delta or joint_target; by default ee_delta, or --init's"
@@ -39,31 +39,24 @@ class LearningConfig:
     log_std: float | None = option(
         None,
         "log of the first spread of actions, in deviations of the demonstrations'; by default -0.5, or -1 of a clone",
+        at_least=-4,
+        at_most=2,
     )
     warmup: int | None = option(
-        None, "iterations in which critic and discriminator learn alone; by default 0, or 10 with --init"
+        None, "iterations in which critic and discriminator learn alone; by default 0, or 10 with --init", at_least=0
     )
     ppo: PPOConfig = field(default_factory=PPOConfig)
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
-    validation_every: int = option(20_000, "steps from one validation to the next")
-    validation_episodes: int = option(200, "episodes of a validation, by which the best policy is chosen")
+    validation_every: int = option(20_000, "steps from one validation to the next", at_least=1)
+    validation_episodes: int = option(200, "episodes of a validation, by which the best policy is chosen", at_least=1)
     seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
 
     def __post_init__(self) -> None:
-        from manip_il.seeding import stream_base  # here, as help needs no numpy
-
-        for name in _AT_LEAST_1:
-            if getattr(self, name) < 1:
-                raise UsageError(f"{name} is {getattr(self, name)}; expected at least 1")
+        check_bounds(self)
         if self.episodes % self.ppo.minibatches:
             raise UsageError(f"episodes is {self.episodes}; expected a multiple of ppo.minibatches")
-        if self.episode_steps < 0 or self.episode_steps > self.env.horizon:
+        if self.episode_steps > self.env.horizon:
             raise UsageError(f"episode_steps is {self.episode_steps}; expected at most the horizon, {self.env.horizon}")
-        if self.log_std is not None and not -4 <= self.log_std <= 2:
-            raise UsageError(f"log_std is {self.log_std}; expected -4 to 2")
-        if self.warmup is not None and self.warmup < 0:
-            raise UsageError(f"warmup is {self.warmup}; expected at least 0")
-        stream_base("reinforcement", self.seed)
 
     @property
     def discount(self) -> float:

@@ -25,15 +25,13 @@ from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
-from manip_il.data.build import dataset_sha256
 from manip_il.data.dataset import Dataset
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork
-from manip_il.learn.policy_files import policy_sha256
 from manip_il.learn.ppo import Learner, lent_generators
 from manip_il.learn.start import save_policy, start_conversion, start_policy
 from manip_il.learn.threads import threads
@@ -67,8 +65,6 @@ class LearningRun(Run):
         self._modules: dict[str, Discriminator] = {}
         self._number, self._simulated, self._validated_at = 0, 0, 0
         self._metrics: dict[str, float] = {}
-        policies = [one for one in (config.start, config.reward) if one is not None]
-        self._given = [*map(dataset_sha256, config.datasets), *map(policy_sha256, policies)]
         self._spec = spec = Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
         self.conversion = start_conversion(config.start, config.action_space, spec)
         demonstrations = read_demonstrations(config.datasets, self.conversion.encode) if config.datasets else None
@@ -100,8 +96,10 @@ class LearningRun(Run):
         """
         checkpoint = last_checkpoint(self.folder, resume=True)
         if checkpoint is not None:
-            self._go_on_from(checkpoint)
-            policy = checkpoint / PRETRAINED_MODEL
+            step, policy = read_step(checkpoint), checkpoint / PRETRAINED_MODEL
+            with readable_state(checkpoint):
+                self._number, self._simulated = int(step["step"]), int(step["simulated"])
+                self._metrics, self._validated_at = dict(step["metrics"]), int(step["validated_at"])
             yield self._result(policy, self._validate_if_due(policy))
         elif self.config.start is not None:
             yield self._result(self.config.start, self._validate_kept(self.config.start))
@@ -174,7 +172,7 @@ class LearningRun(Run):
             save_policy(self._policy, self.conversion, new / PRETRAINED_MODEL)
             (new / TRAINING_STATE).mkdir()
             self._learner.save(new / TRAINING_STATE, self._modules)
-            write_own_files(new, origin, step | {"validated_at": self._validated_at, "given": self._given})
+            write_own_files(new, origin, step | {"validated_at": self._validated_at})
         for other in (self.folder / "checkpoints").iterdir():
             if not other.is_symlink() and other.name != f"{self._number:06d}":
                 shutil.rmtree(other, ignore_errors=True)
@@ -204,17 +202,6 @@ class LearningRun(Run):
         if number == best_validation(validations(self.folder)):
             self._keep_best(policy)
         return found
-
-    def _go_on_from(self, checkpoint: Path) -> None:
-        """Read where the last finished iteration ended. Raises `MismatchError` if it learnt from something else."""
-        step = read_step(checkpoint)
-        if (given := step.get("given", [])) != self._given:
-            ours, theirs = (", ".join(one[:12] for one in hashes) for hashes in (self._given, given))
-            run = f"the run in {self.folder}"
-            raise MismatchError("content of datasets and policies (sha256)", "what is given", ours, run, theirs)
-        with readable_state(checkpoint):
-            self._number, self._simulated = int(step["step"]), int(step["simulated"])
-            self._metrics, self._validated_at = dict(step["metrics"]), int(step["validated_at"])
 
     def _options(self) -> dict[str, Any]:
         """The options that a checkpoint names."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -110,14 +110,17 @@ class _Demo:
         )
 
     def _contestants(self, results: list[Result]) -> list[Contestant]:
-        from manip_il.algorithms.cloning_baseline import clone_with_labels
+        from manip_il.algorithms.cloning import clone_with_labels
         from manip_il.algorithms.run import best_result
         from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 
         first, best = results[0], best_result(results)
-        policy, labels = clone_with_labels(
-            self.config, results[-1].labels, self.folder / "dagger", self.folder / "cloning", self.engine, self.stages
+        watch = replace(
+            self.stages.watch(),
+            on_stage=lambda stage, _, total: self.stages.start(f"cloning with as many labels, {stage}", total),
         )
+        dagger, folder = self.folder / "dagger", self.folder / "cloning"
+        policy, labels = clone_with_labels(self.config, results[-1].labels, dagger, folder, self.engine, watch)
         return [
             Contestant("expert", "expert", EXPERT),
             Contestant("cloned", "cloning", CLONING, first.policy, first.labels),

@@ -50,14 +50,13 @@ class IrlOptions:
 
     def run(self) -> None:
         """Read, learn, write the reward and the page, print the weights."""
-        from manip_il.algorithms.inverse import read_carried
-        from manip_il.algorithms.inverse_report import (
+        from manip_il.algorithms.inverse import (
             FILE_NAME,
-            PAGE,
             Inverse,
             inverse_report,
             open_line,
-            summary_lines,
+            read_carried,
+            weight_table,
         )
         from manip_il.data.dataset import Dataset
         from manip_il.evaluation.results import write_json
@@ -74,12 +73,12 @@ class IrlOptions:
         found = Inverse(str(self.dataset), tuple(carried), learnt)
         with self.output.open(self) as folder:
             write_json(folder / FILE_NAME, found.to_json())
-            inverse_report(found, command_line("reward irl", self), to_plain(self), timings).write(folder / PAGE)
-        for line in summary_lines(found):
+            inverse_report(found, command_line("reward irl", self), to_plain(self), timings).write(folder / REPORT_FILE)
+        for line in weight_table(found).aligned_lines():
             say(line)
         if line := open_line(found):
             warn(line)
-        say(f"report: {folder / PAGE}")
+        say(f"report: {folder / REPORT_FILE}")
         robot = "" if dataset.spec.robot == "panda" else f"--robot.type={dataset.spec.robot} "
         say(f"next: manip-il eval --policy.type=expert {robot}--task.type=carry --task.reward={folder / FILE_NAME}")
 
@@ -110,8 +109,8 @@ class PairsOptions:
     def run(self) -> None:
         """Read the sources, choose, and write the pairs."""
         from manip_il.evaluation.results import write_json
-        from manip_il.preferences.choose import choose_pairs, open_supply
         from manip_il.preferences.frames import find_datasets
+        from manip_il.preferences.pairs import choose_pairs, open_supply
         from manip_il.seeding import rng_for, stream_base
 
         reward = load_reward(self.reward) if self.reward else None
@@ -179,7 +178,7 @@ class AnswerOptions:
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        from manip_il.preferences.teachers import Teacher
+        from manip_il.preferences.answers import Teacher
 
         Teacher.parse(self.teacher)
         _require_new_file(self.output, ".json", self.overwrite)
@@ -187,8 +186,8 @@ class AnswerOptions:
     def run(self) -> None:
         """Compare every pair and write the answers."""
         from manip_il.evaluation.results import write_json
+        from manip_il.preferences.answers import Teacher, answer_pairs
         from manip_il.preferences.pairs import Pairs, read_clips
-        from manip_il.preferences.teachers import Teacher, answer_pairs
         from manip_il.seeding import rng_for, stream_base
 
         clips = read_clips(Pairs.read(self.pairs))

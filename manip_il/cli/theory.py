@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import exists
 from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import Output
+from manip_il.cli.outputs import REPORT_FILE, Output
 from manip_il.cli.progress import Progress, say
 from manip_il.option import option
 
@@ -44,7 +44,7 @@ class TheoryOptions:
         from manip_il.theory.bounds import all_curves
         from manip_il.theory.linear import drifts
         from manip_il.theory.processes import PROCESSES
-        from manip_il.theory.report import FILE_NAME, PAGE, Theory, summary_lines, theory_report
+        from manip_il.theory.report import FILE_NAME, Theory, slope_table, theory_report
 
         timings, begin = dict[str, float](), time.monotonic()
         with self.output.open(self) as folder:
@@ -61,10 +61,10 @@ class TheoryOptions:
             timings["theorems"] = time.monotonic() - begin
             write_json(folder / FILE_NAME, theory.to_json())
             report = theory_report(theory, command_line("theory", self), to_plain(self), timings)
-            report.write(folder / PAGE)
-        for line in summary_lines(theory):
+            report.write(folder / REPORT_FILE)
+        for line in [*slope_table(theory).aligned_lines(), f"policies above their bound: {theory.above}"]:
             say(line)
-        say(f"report: {folder / PAGE}")
+        say(f"report: {folder / REPORT_FILE}")
 
     def _shift(self, run: Path) -> Shift:
         from manip_il.collect.workers import Engine

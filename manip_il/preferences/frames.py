@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import schema
-from manip_il.data.dataset import UNKNOWN_TASK, Dataset
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
-from manip_il.data.schema import RobotTaskSpec, check_same_spec
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import ManipError, UsageError
 from manip_il.learn.samples import require_finite
+from manip_il.learn.sources import check_same_sources
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 _ROUNDS = "round_*/dataset"  # of a run
@@ -84,11 +85,7 @@ def read_frames(root: Path) -> Frames:
 def read_all(roots: Sequence[Path]) -> list[Frames]:
     """Return the frames of datasets. Raises `MismatchError` unless they are of one task and their columns agree."""
     found = [read_frames(root) for root in roots]
-    first, own = str(roots[0]), found[0].spec
-    for root, one in zip(roots, found, strict=True):
-        check_same_spec(first, own, str(root), one.spec)
-        if own.task != one.spec.task and UNKNOWN_TASK not in (own.task, one.spec.task):
-            raise MismatchError("task", first, own.task, str(root), one.spec.task)
+    check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
     return found
 
 

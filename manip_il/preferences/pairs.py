@@ -1,4 +1,4 @@
-"""Pairs of clips to compare: `pairs.json`, and the frames of the datasets that it names."""
+"""Pairs of clips to compare: which are chosen, evenly or where rewards disagree; `pairs.json`, and its frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.preferences.frames import Frames, read_all
 
-I64 = NDArray[np.int64]
+F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
+Members = Callable[[F32], F64]  # rewards (M, B) of inputs (B, d)
+POOL = 10  # pairs that each is chosen from, by disagreement
+_TRIES = 100  # draws of a pair that is not there yet
 FILE_NAME = "pairs.json"
 FORMAT, VERSION = "manip_il pairs", 1
 _LARGEST = 64 * 1024 * 1024  # [bytes]
@@ -128,12 +131,12 @@ class Clips:
         return np.cumsum([0, *(len(one.states) for one in self.frames)])[:-1]
 
     @cached_property
-    def inputs(self) -> NDArray[np.float32]:
+    def inputs(self) -> F32:
         """Inputs of a reward, of all frames, (N, d)."""
         return np.concatenate([one.inputs for one in self.frames])
 
     @cached_property
-    def progress(self) -> NDArray[np.float64] | None:
+    def progress(self) -> F64 | None:
         """True progress of all frames, (N,); None if a source has none."""
         found = [one.progress for one in self.frames]
         return None if any(one is None for one in found) else np.concatenate([one for one in found if one is not None])
@@ -174,3 +177,84 @@ def read_clips(pairs: Pairs) -> Clips:
         if (found := dataset_sha256(root)) != source.sha256:
             raise MismatchError(f"sha256 of {root}", "the file of pairs", source.sha256[:12], "the dataset", found[:12])
     return Clips(pairs, tuple(read_all([Path(source.root) for source in pairs.sources])))
+
+
+@dataclass(frozen=True, eq=False)
+class Supply:
+    """Datasets that clips of `length` control steps are drawn from."""
+
+    roots: tuple[Path, ...]
+    frames: tuple[Frames, ...]
+    length: int
+
+    @property
+    def too_short(self) -> int:
+        """Number of episodes that no clip is from."""
+        return sum(int((one.lengths < self.length).sum()) for one in self.frames)
+
+    def draw(self, source: int, rng: np.random.Generator) -> Clip:
+        """Return one clip of a source: every episode alike, every place in it alike."""
+        lengths = self.frames[source].lengths
+        episode = int(rng.choice(np.flatnonzero(lengths >= self.length)))
+        return Clip(source, episode, int(rng.integers(0, int(lengths[episode]) - self.length + 1)))
+
+
+def open_supply(roots: Sequence[Path], length: int) -> Supply:
+    """Read datasets. Raises `MismatchError` unless they are of one task, `ManipError` if all episodes are short."""
+    supply = Supply(tuple(roots), tuple(read_all(roots)), length)
+    longest = max(int(one.lengths.max()) for one in supply.frames)
+    if longest < length:
+        raise ManipError(f"--clip is {length} control steps; the longest episode has {longest}")
+    return supply
+
+
+def choose_pairs(
+    supply: Supply, count: int, seed: int, rng: np.random.Generator, members: Members | None = None
+) -> Pairs:
+    """Return pairs; with `members`, those of `POOL` times as many about which the ensemble disagrees most.
+
+    The disagreement about a pair is the standard deviation over the ensemble of P(left is better) (Christiano et al.
+    2017, section 2.2.4; Lee et al. 2021).
+    """
+    drawn = _draw(supply, count * (POOL if members is not None else 1), rng)
+    if len(drawn) < count:
+        raise ManipError(f"--count is {count}; {len(drawn)} pairs of clips of {supply.length} steps were found")
+    spec = supply.frames[0].spec
+    made = Pairs(
+        robot=spec.robot,
+        task=spec.task,
+        control_hz=spec.fps,
+        length=supply.length,
+        sources=tuple(
+            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.states))
+            for root, one in zip(supply.roots, supply.frames, strict=True)
+        ),
+        pairs=tuple(drawn),
+        seed=seed,
+    )
+    if members is None:
+        return made
+    doubt = disagreement(Clips(made, supply.frames), members)
+    kept = np.sort(np.argsort(-doubt, kind="stable")[:count])
+    return replace(made, pairs=tuple(made.pairs[place] for place in kept.tolist()), chosen="where rewards disagree")
+
+
+def disagreement(clips: Clips, members: Members) -> F64:
+    """Return the standard deviation of P(left is better) over an ensemble, of every pair (P,)."""
+    rows = clips.rows
+    rewards = members(clips.inputs[rows.reshape(-1)])
+    returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
+    return (1 / (1 + np.exp(-np.clip(returns[:, :, 0] - returns[:, :, 1], -50, 50)))).std(axis=0)
+
+
+def _draw(supply: Supply, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
+    """Different pairs of clips; every source is in as many as any other, with another or itself."""
+    found = dict[tuple[Clip, Clip], None]()
+    sources = [number for number, one in enumerate(supply.frames) if one.lengths.max() >= supply.length]
+    for left, right in rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist():
+        for _ in range(_TRIES):
+            pair = supply.draw(left, rng), supply.draw(right, rng)
+            if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
+                found[pair] = None
+                break
+    return list(found)

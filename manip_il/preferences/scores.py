@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from scipy.stats import rankdata
+from scipy.stats import mannwhitneyu, spearmanr
 
 from manip_il.data.atomic import writing
 from manip_il.data.lerobot_layout import EPISODE_INDEX
@@ -85,7 +85,8 @@ class Scores:
         """Spearman's correlation of the frames' scores with true progress; None if there is none."""
         if self.data.progress is None or np.ptp(self.data.progress) == 0 or np.ptp(self.frames) == 0:
             return None
-        return float(np.corrcoef(rankdata(self.frames), rankdata(self.data.progress))[0, 1])
+        found: Any = spearmanr(self.frames, self.data.progress)
+        return float(found.statistic)
 
     def worst(self, count: int) -> list[int]:
         """Return the numbers of the episodes with the lowest scores, lowest first."""
@@ -133,8 +134,9 @@ def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
     """
     if succeeded is None or succeeded.all() or not succeeded.any():
         return None
-    good, bad = scores[succeeded][:, None], scores[~succeeded][None]
-    return float(((good > bad) + 0.5 * (good == bad)).mean())
+    good, bad = scores[succeeded], scores[~succeeded]
+    found: Any = mannwhitneyu(good, bad, method="asymptotic")
+    return float(found.statistic / (len(good) * len(bad)))
 
 
 def write_weights(path: Path, scores: Scores) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from manip_il.errors import ManipError
 
-F64, I64, I32 = NDArray[np.float64], NDArray[np.int64], NDArray[np.int32]
+F64, I64 = NDArray[np.float64], NDArray[np.int64]
 NOWHERE = -1  # as the node that follows: none
 LENGTH = 0  # the feature that every edge has, over whose weight the others are given
 _FIFTH, _FEW = 5, 5  # of how many demonstrations one is a beginning, and how many are that at least
@@ -39,29 +40,14 @@ class PathProblem:
     goal: int
 
     @cached_property
-    def order(self) -> I32:
-        """Edges sorted by the node they leave, then by the one they lead to, (E,)."""
-        return np.argsort(self._keys, kind="stable").astype(np.int32)
+    def _numbers(self) -> Any:
+        """Numbers of the edges, from 1 on, as a sparse matrix from -> to, (S, S)."""
+        return csr_array((np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes))
 
     @cached_property
-    def _keys(self) -> I64:
-        """One number an edge, (E,)."""
-        return self.edges[:, 0] * self.nodes + self.edges[:, 1]
-
-    @cached_property
-    def _outgoing(self) -> tuple[I32, I32]:
-        """The nodes that the edges in `order` lead to (E,), and where each node's edges begin there (S + 1,)."""
-        return self.edges[self.order, 1].astype(np.int32), self._starts(0)
-
-    @cached_property
-    def _incoming(self) -> tuple[I32, I32, I32]:
-        """Edges sorted by the node they lead to (E,), the nodes they leave (E,), where each node's begin (S + 1,)."""
-        order = np.argsort(self.edges[:, 1], kind="stable").astype(np.int32)
-        return order, self.edges[order, 0].astype(np.int32), self._starts(1)
-
-    def _starts(self, side: int) -> I32:
-        counts = np.bincount(self.edges[:, side], minlength=self.nodes)
-        return np.append(0, np.cumsum(counts)).astype(np.int32)
+    def _numbers_back(self) -> Any:
+        """The same to -> from."""
+        return self._numbers.T.tocsr()
 
     def costs(self, weights: F64) -> F64:
         """Return what every edge costs, (E,), for weights (K,), 0 or more."""
@@ -69,24 +55,27 @@ class PathProblem:
 
     def matrix(self, values: F64) -> Any:
         """Return values of the edges (E,) as a sparse matrix from -> to, (S, S). Zeros stay entries."""
-        return csr_array((values[self.order], *self._outgoing), shape=(self.nodes, self.nodes))
+        return _filled(self._numbers, values)
 
     def backwards(self, values: F64) -> Any:
         """Return values of the edges (E,) as a sparse matrix to -> from, (S, S). Zeros stay entries."""
-        order, before, starts = self._incoming
-        return csr_array((values[order], before, starts), shape=(self.nodes, self.nodes))
+        return _filled(self._numbers_back, values)
 
     def edges_of(self, path: I64) -> I64:
         """Return the edges along a path of nodes (n,), (n - 1,). Raises `ManipError` if two are not joined."""
-        wanted, keys = path[:-1] * self.nodes + path[1:], self._keys[self.order]
-        at = np.searchsorted(keys, wanted).clip(max=len(keys) - 1)
-        if (keys[at] != wanted).any():
+        numbers = self._numbers
+        found = np.array([numbers[pair] for pair in pairwise(path.tolist())], np.int64) - 1
+        if (found < 0).any():
             raise ManipError("a path goes where no edge leads")
-        return self.order[at].astype(np.int64)
+        return found
 
     def sums(self, path: I64) -> F64:
         """Return the features of a path of nodes (n,), summed over its edges, (K,)."""
         return self.features[self.edges_of(path)].sum(axis=0)
+
+
+def _filled(numbers: Any, values: F64) -> Any:
+    return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
 
 @dataclass(frozen=True)

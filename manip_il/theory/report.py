@@ -17,7 +17,7 @@ from manip_il.theory.linear import GUST, SYSTEMS, Drift
 from manip_il.theory.processes import PROCESSES
 from manip_il.theory.shift import WRONG, RoundShift, Shift
 
-PAGE, FILE_NAME = "report.html", "theory.json"
+FILE_NAME = "theory.json"
 _FITS = {"worst": "fitted", "even": "fitted, ties even", "constructed": "constructed"}
 _LOOKS = {"cloning": (CLONING, "o"), "DAgger": (DAGGER, "s")}
 _SIZES = {"scalar": "one dimension", "plane": "two, demonstrations on a line"}
@@ -65,11 +65,6 @@ def slope_table(theory: Theory) -> Table:
     return Table(
         ("process", "recoverability u", "cloning, theorem", "DAgger, theorem", "cloning", "DAgger"), tuple(rows)
     )
-
-
-def summary_lines(theory: Theory) -> Sequence[str]:
-    """Return the slopes as a table, and how many policies are above their bound, as plain lines."""
-    return [*slope_table(theory).aligned_lines(), f"policies above their bound: {theory.above}"]
 
 
 def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
@@ -225,13 +220,13 @@ def _arm(shift: Shift) -> list[Section]:
     )
     rows = [
         (
-            _name(one),
+            one.name,
             str(one.success),
             "" if one.on_expert is None else format_percent(one.on_expert.rate),
             format_percent(one.on_own.rate),
             f"{one.distance:.2f}",
-            f"{shift.gap(one):.1f}",
-            f"{shift.bound(one):,.0f}",
+            f"{one.gap:.1f}",
+            f"{one.bound:,.0f}",
         )
         for one in shift.rounds
     ]
@@ -268,10 +263,6 @@ def _shift_fact(shift: Shift) -> str:
     )
 
 
-def _name(one: RoundShift) -> str:
-    return "cloning (round 0)" if one.round == 0 else f"round {one.round}"
-
-
 def _errors_figure(shift: Shift) -> Figure:
     """The share of wrong actions at each step, in the expert's states and in the policy's own: round 0, best round."""
     best = max(range(len(shift.rounds)), key=lambda index: (shift.rounds[index].success.rate, index))
@@ -282,7 +273,7 @@ def _errors_figure(shift: Shift) -> Figure:
             axis.plot(100 * np.array(one.on_own.by_step), color=colour, lw=1.8, label="in its own states")
             if one.on_expert is not None:
                 axis.plot(100 * np.array(one.on_expert.by_step), color=SOFT, lw=1.4, label="in the expert's states")
-            axis.set(xlabel="control step", title=_name(one), ylim=(0, 100), xlim=(0, shift.env.horizon))
+            axis.set(xlabel="control step", title=one.name, ylim=(0, 100), xlim=(0, shift.env.horizon))
             axis.legend(loc="upper right")
         axes[0, 0].set_ylabel("wrong actions [%]")
         return to_figure(drawn, "Share of wrong actions by step, for cloning and for the best round")
@@ -301,7 +292,7 @@ def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
                     axis.scatter(*shown[:, across].T, s=2.5, color=colour, alpha=0.55, lw=0, rasterized=True)
                 axis.set_aspect("equal", adjustable="box")
                 axis.tick_params(labelsize=7.5)
-            axes[0, column].set_title(_name(one), fontsize=9.5)
+            axes[0, column].set_title(one.name, fontsize=9.5)
         axes[0, 0].invert_xaxis()
         axes[0, 0].set_ylabel("from above: x over y [m]", fontsize=8.5)
         axes[1, 0].set_ylabel("from the side: z over x [m]", fontsize=8.5)

@@ -70,7 +70,8 @@ class Errors:
 class RoundShift:
     """One round's policy. on_expert: None for a policy on pictures; on_own: in the states that it visits itself.
 
-    distance: of its states from the data, median to the nearest; of the expert's, in new episodes, it is 1. cost:
+    distance: of its states from the data, median to the nearest; of the expert's, in new episodes, it is 1. cost, gap:
+    its own, and above the expert's; bound: what Theorem 8.2 allows that to be, u times its wrong actions an episode
     [control steps]. data, hand: where the hand was in the data and in its rollouts, (N, 3) [m].
     """
 
@@ -80,8 +81,26 @@ class RoundShift:
     on_own: Errors
     distance: float
     cost: float
+    gap: float
+    bound: float
     data: F64
     hand: F64
+
+    @property
+    def name(self) -> str:
+        """Name of the policy."""
+        return "cloning (round 0)" if self.round == 0 else f"round {self.round}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all numbers but the places."""
+        return {
+            "round": self.round,
+            "success": self.success.rate,
+            "interval": list(self.success.interval),
+            "on_expert": None if self.on_expert is None else vars(self.on_expert),
+            "on_own": vars(self.on_own),
+            **{name: getattr(self, name) for name in ("distance", "cost", "gap", "bound")},
+        }
 
 
 @dataclass(frozen=True)
@@ -93,14 +112,6 @@ class Shift:
     u: int
     rounds: tuple[RoundShift, ...]
 
-    def gap(self, one: RoundShift) -> float:
-        """Return what a round's policy costs more than the expert [control steps]."""
-        return one.cost - self.expert_cost
-
-    def bound(self, one: RoundShift) -> float:
-        """Return what Theorem 8.2 allows it to cost more: u times its wrong actions an episode [control steps]."""
-        return self.u * one.on_own.per_episode
-
     def to_json(self) -> dict[str, Any]:
         """Return all numbers but the places."""
         return {
@@ -109,20 +120,7 @@ class Shift:
             "horizon": self.env.horizon,
             "expert_cost": self.expert_cost,
             "u": self.u,
-            "rounds": [self._round(one) for one in self.rounds],
-        }
-
-    def _round(self, one: RoundShift) -> dict[str, Any]:
-        return {
-            "round": one.round,
-            "success": one.success.rate,
-            "interval": list(one.success.interval),
-            "on_expert": None if one.on_expert is None else vars(one.on_expert),
-            "on_own": vars(one.on_own),
-            "distance": one.distance,
-            "cost": one.cost,
-            "gap": self.gap(one),
-            "bound": self.bound(one),
+            "rounds": [one.to_json() for one in self.rounds],
         }
 
 
@@ -155,23 +153,26 @@ def measure_shift(
     names = env_spec(env).environment_state_names
     seeds = stream_seeds("theory", episodes)
     expert = _run(engine, RolloutJob(env, hold=0), seeds, on_episode)
-    fresh, found = _visited(expert, names), list[RoundShift]()
+    fresh, expert_cost, found = _visited(expert, names), _cost(expert, env.horizon), list[RoundShift]()
     for one in rounds:
         learner = _run(engine, RolloutJob(env, PolicyDriver((one.policy,)), hold=0), seeds, on_episode)
-        states, data = _visited(learner, names), _stored(one, names)
+        states, data, cost = _visited(learner, names), _stored(one, names), _cost(learner, env.horizon)
+        on_own = _errors([episode.columns[schema.EXECUTED_ACTION] for episode in learner], learner, env)
         found.append(
             RoundShift(
-                one.round,
-                Proportion.of([episode.success for episode in learner]),
-                _errors_on(one.policy, expert, env),
-                _errors([episode.columns[schema.EXECUTED_ACTION] for episode in learner], learner, env),
-                relative_distance(states.observed, data.observed, fresh.observed),
-                _cost(learner, env.horizon),
-                data.hand,
-                states.hand,
+                round=one.round,
+                success=Proportion.of([episode.success for episode in learner]),
+                on_expert=_errors_on(one.policy, expert, env),
+                on_own=on_own,
+                distance=relative_distance(states.observed, data.observed, fresh.observed),
+                cost=cost,
+                gap=cost - expert_cost,
+                bound=u * on_own.per_episode,
+                data=data.hand,
+                hand=states.hand,
             )
         )
-    return Shift(env, _cost(expert, env.horizon), u, tuple(found))
+    return Shift(env, expert_cost, u, tuple(found))
 
 
 def _run(engine: Engine, job: RolloutJob, seeds: Sequence[int], on_episode: OnEpisode) -> list[Episode]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -127,21 +126,11 @@ def test_a_reward_that_is_given_sees_steps_as_datasets_have_them(config, cloned,
     assert seen == [[40, 8, 8]] * 2
 
 
-def test_a_run_does_not_go_on_with_other_demonstrations_or_another_start(config, cloned, tmp_path):
-    demos, start = tmp_path / "demos", tmp_path / "start"
-    shutil.copytree(config.datasets[0], demos)
-    shutil.copytree(cloned, start)
-    config = replace(config, datasets=(demos,), start=start, validation_every=10**6)
+def test_no_file_of_a_run_names_the_machines_folders(config, tmp_path):
     run(config, tmp_path / "run", count=1)
-    for changed in (demos / "meta" / "stats.json", start / "config.json"):
-        before = changed.read_text()
-        changed.write_text(before + " ")
-        with pytest.raises(MismatchError, match="content of datasets and policies"):
-            run(config, tmp_path / "run", count=1)
-        changed.write_text(before)
     for path in (tmp_path / "run").rglob("*.json"):
-        assert str(tmp_path) not in path.read_text(), "no file of a run names the machine's folders"
-    assert [one.number for one in run(config, tmp_path / "run", count=1)] == [2]
+        assert str(tmp_path) not in path.read_text()
+        assert str(config.datasets[0]) not in path.read_text()
 
 
 def test_what_cannot_begin_is_refused(config, cloned, tmp_path):

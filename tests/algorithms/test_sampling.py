@@ -32,7 +32,10 @@ def test_frames_weigh_what_their_kind_does(table):
 
 @pytest.mark.parametrize(
     ("values", "says"),
-    [({"corrections": -1}, "sampling.corrections is -1"), ({"demonstrations": 0}, "nothing else to learn from")],
+    [
+        ({"corrections": -1}, "sampling.corrections is -1"),
+        ({"demonstrations": 0}, "nothing else to learn from"),
+    ],
 )
 def test_weights_that_make_no_sense_are_refused(values, says: str):
     with pytest.raises(UsageError, match=says):

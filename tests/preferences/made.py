@@ -10,8 +10,7 @@ import numpy as np
 
 from manip_il.data import schema as s
 from manip_il.mdp import Episode
-from manip_il.preferences.choose import choose_pairs, open_supply
-from manip_il.preferences.pairs import Clips
+from manip_il.preferences.pairs import Clips, choose_pairs, open_supply
 
 
 def brought(episode: Episode, spec: s.RobotTaskSpec, well: bool) -> Episode:

@@ -14,9 +14,8 @@ from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.reward import LearnedReward, RewardNetwork, RewardShape, joints_of, shape_for, ways_of, write_reward
 from manip_il.learn.reward_fit import Compared, answer_losses, deal, fit_reward
-from manip_il.preferences.answers import join_answers
+from manip_il.preferences.answers import Teacher, answer_pairs, join_answers
 from manip_il.preferences.fitting import fit_answers, fit_report
-from manip_il.preferences.teachers import Teacher, answer_pairs
 
 SHAPE = RewardShape(members=3, width=16)
 

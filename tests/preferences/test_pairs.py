@@ -10,9 +10,8 @@ import pytest
 
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.preferences.answers import Answer, Preferences
-from manip_il.preferences.choose import choose_pairs, disagreement, open_supply
 from manip_il.preferences.frames import find_datasets
-from manip_il.preferences.pairs import Clips, Pairs, join_pairs, read_clips
+from manip_il.preferences.pairs import Clips, Pairs, choose_pairs, disagreement, join_pairs, open_supply, read_clips
 
 from .made import clips_of
 
