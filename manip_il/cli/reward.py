@@ -261,7 +261,7 @@ class FitOptions:
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
         fingerprint = Dataset.open(Path(clips.pairs.sources[0].root)).fingerprint
-        options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.length}
+        options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
         write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
         write_json(folder / "fit.json", found.to_json())
 

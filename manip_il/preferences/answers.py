@@ -138,7 +138,7 @@ class Teacher:
         """Return what it answers about every pair. Raises `ManipError` if the sources have no true progress."""
         if clips.progress is None:
             raise ManipError("the sources have no column progress, by which teachers compare; ask people")
-        discounts = self.gamma ** np.arange(clips.pairs.length - 1, -1, -1)
+        discounts = self.gamma ** np.arange(clips.pairs.clip - 1, -1, -1)
         returns = (clips.progress[clips.rows] * discounts).sum(-1)
         difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
         mistaken = rng.random(len(returns)) < self.epsilon

@@ -59,13 +59,7 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
         "pairs": pairs.sha256,
         "films": [[base64.b64encode(film).decode("ascii") for film in pair] for pair in films],
     }
-    environment = Environment(
-        loader=PackageLoader("manip_il.preferences"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-    )
+    environment = Environment(loader=PackageLoader("manip_il.preferences"), autoescape=True, undefined=StrictUndefined)
     return environment.get_template("ask.html.j2").render(
         title=f"{pairs.robot} {pairs.task}",
         instruction=instruction,

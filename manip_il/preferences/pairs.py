@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +37,7 @@ class Source:
     frames: int
 
 
-@dataclass(frozen=True)
-class Clip:
+class Clip(NamedTuple):
     """The beginning of a clip: number of the source, of its episode, and of the episode's frame."""
 
     source: int
@@ -46,22 +45,22 @@ class Clip:
     first: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Pairs:
     """Pairs of clips of one length, the left one and the right one, in the datasets of one task.
 
-    length: of every clip [control steps]. With clips of different lengths the longer one would collect the reward's
-    constant more often, which no comparison tells. chosen: how, in words.
+    clip: length of every clip [control steps]. With clips of different lengths the longer one would collect the
+    reward's constant more often, which no comparison tells. chosen: how, in words.
     """
 
     robot: str
     task: str
     control_hz: int
-    length: int
-    sources: tuple[Source, ...]
-    pairs: tuple[tuple[Clip, Clip], ...]
+    clip: int
     seed: int = 0
     chosen: str = "evenly"
+    sources: tuple[Source, ...]
+    pairs: tuple[tuple[Clip, Clip], ...]
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -73,32 +72,14 @@ class Pairs:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything for `pairs.json`, a clip as [source, episode, first frame]."""
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "robot": self.robot,
-            "task": self.task,
-            "control_hz": self.control_hz,
-            "clip": self.length,
-            "seed": self.seed,
-            "chosen": self.chosen,
-            "sources": [asdict(source) for source in self.sources],
-            "pairs": [[[clip.source, clip.episode, clip.first] for clip in pair] for pair in self.pairs],
-        }
+        return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Pairs:
         """Return the inverse of `to_json`."""
-        return cls(
-            robot=data["robot"],
-            task=data["task"],
-            control_hz=data["control_hz"],
-            length=data["clip"],
-            sources=tuple(Source(**one) for one in data["sources"]),
-            pairs=tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"]),
-            seed=data.get("seed", 0),
-            chosen=data.get("chosen", ""),
-        )
+        plain = {name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen") if name in data}
+        sources = tuple(Source(**one) for one in data["sources"])
+        return cls(**plain, sources=sources, pairs=tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"]))
 
     @classmethod
     def read(cls, path: Path) -> Pairs:
@@ -148,21 +129,21 @@ class Clips:
             [self.offsets[clip.source] + self.frames[clip.source].firsts[clip.episode] + clip.first for clip in pair]
             for pair in self.pairs.pairs
         ]
-        return np.array(begin, np.int64).reshape(-1, 2, 1) + np.arange(self.pairs.length)
+        return np.array(begin, np.int64).reshape(-1, 2, 1) + np.arange(self.pairs.clip)
 
 
 def join_pairs(given: Sequence[Pairs]) -> Pairs:
     """Return the pairs of several files, numbered on. Raises `MismatchError` for two lengths of clips."""
     first = given[0]
     for other in given[1:]:
-        if first.length != other.length:
-            raise MismatchError("length", "the first file of pairs", first.length, "another", other.length)
+        if first.clip != other.clip:
+            raise MismatchError("length", "the first file of pairs", first.clip, "another", other.clip)
     sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
     joined: list[tuple[Clip, Clip]] = []
     for one in given:
         place = [sources.index(source) for source in one.sources]
         joined += [
-            (replace(left, source=place[left.source]), replace(right, source=place[right.source]))
+            (left._replace(source=place[left.source]), right._replace(source=place[right.source]))
             for left, right in one.pairs
         ]
     return replace(first, sources=sources, pairs=tuple(joined))
@@ -224,7 +205,7 @@ def choose_pairs(
         robot=spec.robot,
         task=spec.task,
         control_hz=spec.fps,
-        length=supply.length,
+        clip=supply.length,
         sources=tuple(
             Source(str(root), dataset_sha256(root), len(one.firsts), len(one.states))
             for root, one in zip(supply.roots, supply.frames, strict=True)
