@@ -71,16 +71,9 @@ class Member:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        success = self.test.success
-        return {
-            "name": self.name,
-            "policy": None if self.policy is None else str(self.policy),
-            "chosen": None if self.chosen is None else self.chosen.to_json(),
-            "success_rate": success.rate,
-            "interval": list(success.interval),
-            "n_episodes": success.n,
-            "evaluation": str(self.file),
-        }
+        policy, chosen = self.policy and str(self.policy), self.chosen and self.chosen.to_json()
+        known = {"name": self.name, "policy": policy, "chosen": chosen}
+        return known | self.test.success.to_json() | {"evaluation": str(self.file)}
 
 
 @dataclass(frozen=True)

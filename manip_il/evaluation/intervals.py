@@ -47,6 +47,10 @@ class Proportion:
         """Wilson's (low, high), or that of a confidence sequence."""
         return (confidence_sequence if self.sequential else wilson_interval)(self.successes, self.n)
 
+    def to_json(self) -> dict[str, Any]:
+        """Return rate, interval and number as the files of results hold them."""
+        return {"success_rate": self.rate, "interval": list(self.interval), "n_episodes": self.n}
+
     def __str__(self) -> str:
         low, high = self.interval
         return f"{format_percent(self.rate)} [{100 * low:.1f}, {100 * high:.1f}]"

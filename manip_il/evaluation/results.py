@@ -198,10 +198,7 @@ class EvalResult:
             "n_episodes": len(self.episodes),
             "success_at_end_rate": self.success_at_end.rate,
             "until_width": self.until_width,
-            "by_condition": {
-                name: {"success_rate": part.rate, "interval": list(part.interval), "n_episodes": part.n}
-                for name, part in ((name, part.success) for name, part in self.by_condition.items() if name)
-            },
+            "by_condition": {name: part.success.to_json() for name, part in self.by_condition.items() if name},
             "policy": self.policy,
             "policy_sha256": self.policy_sha256,
             "robot": self.robot,

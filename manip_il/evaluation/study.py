@@ -141,10 +141,7 @@ class Study:
             "test_success": arm.test_rate,
             "validation_success": fmean(one.chosen.validation.rate for one in arm.members if one.chosen),
             "against_baseline": comparison.to_json() if comparison else None,
-            "expert": {
-                name: {"success_rate": one.rate, "interval": list(one.interval), "n_episodes": one.n}
-                for name, one in ((name, found.success) for name, found in self.experts.get(arm.name, {}).items())
-            },
+            "expert": {name: found.success.to_json() for name, found in self.experts.get(arm.name, {}).items()},
             "training_seeds": [
                 {"seed": member.training_seed}
                 | member.to_json()
