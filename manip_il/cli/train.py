@@ -106,10 +106,11 @@ class TrainOptions:
         """Return the datasets, which must agree with the first."""
         from manip_il.data.dataset import Dataset
         from manip_il.learn.names import PLAIN
-        from manip_il.learn.sources import Sources
+        from manip_il.learn.sources import Sources, check_same_sources
 
         sources = Sources(tuple(map(Dataset.open, self.dataset.root)), tuple(self.dataset.weights))
-        sources.check_alike(pictures=config.takes_images, language=config.kind not in PLAIN)
+        specs, language = [one.spec for one in sources.datasets], config.kind not in PLAIN
+        check_same_sources(sources.roots, specs, pictures=config.takes_images, language=language)
         for one in sources.datasets:
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
             odd = [key for key in one.cameras if config.takes_images and not one.features[key].is_rgb]

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +79,9 @@ class Origin:
         options: Mapping[str, Any] | None = None,
         observation: str = "state",
         look: Mapping[str, Any] | None = None,
-        datasets: Sequence[Mapping[str, Any]] = (),
-        action_space: str | None = None,
+        **more: Any,
     ) -> Origin:
-        """Return the origin of a policy trained on data of `spec`. datasets: `Sources.to_json`."""
+        """Return the origin of a policy trained on data of `spec`. more: `datasets` and `action_space`."""
         pictured = observation != "state"
         return cls(
             **{name: getattr(spec, name) for name in ("task", *_MUST_AGREE)},
@@ -93,8 +91,7 @@ class Origin:
             cameras=spec.cameras if pictured else (),
             image_size=spec.image_size if pictured else (0, 0),
             look=None if look is None or not pictured else dict(look),
-            datasets=[dict(one) for one in datasets],
-            action_space=action_space,
+            **more,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -184,17 +181,12 @@ class Checkpoint:
         """LeRobot's name for the policy."""
         return self.config["type"]
 
-    @cached_property
-    def columns(self) -> tuple[str, ...]:
-        """All inputs by LeRobot's names."""
-        return (*self.numbers, *(IMAGES + camera for camera in self.pictures))
-
     @property
     def observation(self) -> str:
         """The one of `OBSERVATIONS` that the policy takes."""
-        if not any(key.startswith(IMAGES) for key in self.columns):
+        if not self.pictures:
             return "state"
-        return "both" if ENVIRONMENT_STATE in self.columns else "images"
+        return "both" if ENVIRONMENT_STATE in self.numbers else "images"
 
     @property
     def mlp_options(self) -> dict[str, Any] | None:
@@ -208,22 +200,15 @@ class Checkpoint:
         """Raise `MismatchError` naming both unless an environment of `spec` has every input and takes the action."""
         if self.origin is not None:
             self.origin.check_fits(spec)
-        environment = f"{spec.robot}/{spec.task}"
-        have = {STATE: len(spec.joint_names), ENVIRONMENT_STATE: len(spec.environment_state_names)}
-        known = [*have, *spec.image_keys]
-        if any(key not in known for key in self.columns):
-            raise MismatchError("inputs", "the policy", ", ".join(self.columns), environment, ", ".join(known))
-        for key, width in self.numbers.items():
-            if width != have[key]:
-                raise MismatchError(f"width of {key}", "the policy", width, environment, have[key])
-        if self.robot not in ("", spec.robot):
-            raise MismatchError("robot, whose hand moves,", "the policy", self.robot, environment, spec.robot)
-        if self.action != have[STATE]:
-            raise MismatchError("width of the action", "the policy", self.action, environment, have[STATE])
-        for camera, size in self.pictures.items():
-            if size != spec.image_size:
-                what = f"size of the pictures of {camera}"
-                raise MismatchError(what, "the policy", size, environment, spec.image_size)
+        environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
+        has: dict[str, Any] = {"robot of the inverse kinematics": spec.robot, STATE: joints, ACTION: joints}
+        has |= {ENVIRONMENT_STATE: len(spec.environment_state_names)} | dict.fromkeys(spec.image_keys, spec.image_size)
+        needs: dict[str, Any] = {**self.numbers, ACTION: self.action}
+        needs |= {IMAGES + camera: size for camera, size in self.pictures.items()}
+        needs |= {"robot of the inverse kinematics": self.robot} if self.robot else {}
+        for what, needed in needs.items():
+            if has.get(what) != needed:
+                raise MismatchError(what, "the policy", needed, environment, has.get(what))
 
     def require_trust(self, trust: bool) -> None:
         """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""

@@ -77,11 +77,6 @@ class Sources:
             for one, weight in zip(self.datasets, weights, strict=True)
         ]
 
-    def check_alike(self, *, pictures: bool, language: bool) -> None:
-        """Raise `MismatchError` unless the datasets can be learnt from as one; see `check_same_sources`."""
-        specs = [dataset.spec for dataset in self.datasets]
-        check_same_sources(self.roots, specs, pictures=pictures, language=language)
-
 
 def check_same_sources(
     roots: Sequence[Path], specs: Sequence[RobotTaskSpec], *, pictures: bool, language: bool

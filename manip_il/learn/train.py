@@ -108,8 +108,8 @@ class Trainer:
             self.options,
             config.observes,
             sources.looks[0] if look is None else look,
-            sources.to_json(),
-            conversion.space,
+            datasets=sources.to_json(),
+            action_space=conversion.space,
         )
         self.pipeline = self.lerobot.pipeline(self.meta.repo_id, sources.roots[-1], output_dir)
         self.steps, self.batch_size, self.step = config.total_steps, config.samples_per_step, 0

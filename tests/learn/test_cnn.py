@@ -15,7 +15,8 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 from manip_il.data.schema import features
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn import mlp
-from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder, heat_map_losses
+from manip_il.learn.cnn import CNNConfig, CNNPolicy
+from manip_il.learn.keypoints import KeypointEncoder, heat_map_losses
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
 

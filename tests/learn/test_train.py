@@ -27,7 +27,7 @@ from manip_il.learn.lerobot_policy import usable_statistics
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.metrics import METRICS_FILE, json_lines
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import Sources, input_columns, recorded_look
+from manip_il.learn.sources import Sources, check_same_sources, input_columns, recorded_look
 from manip_il.learn.train import Trainer
 
 from .conftest import LENGTH, make_table, write_table
@@ -318,9 +318,10 @@ def test_datasets_that_mean_other_things_are_refused_with_both_named(spec, write
         ({"cameras": ("front",), "image_size": (32, 32), "video": False}, r"cameras differs"),
     ):
         other = write(table, f"{next(iter(change))}/other", replace(spec, **change)).datasets[0]
+        both = (one.root, other.root), (one.spec, other.spec)
         with pytest.raises(MismatchError, match=words):
-            Sources((one, other)).check_alike(pictures=True, language=False)
-    Sources((one, other)).check_alike(pictures=False, language=False)
+            check_same_sources(*both, pictures=True, language=False)
+    check_same_sources(*both, pictures=False, language=False)
 
 
 def test_curves_for_tensorboard_and_weights_and_biases(fit, tmp_path, curves):
