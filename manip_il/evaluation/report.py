@@ -112,7 +112,7 @@ def _plain(value: object) -> str:
 def _prose(words: str) -> Markup:
     """Words in which a number keeps its unit, and a comparison its sign, on one line; paths break after a slash."""
     kept = re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", words)
-    return escape(kept).replace("/", Markup("/<wbr>"))
+    return Markup(re.sub(r"(?<=\w)/(?=\w)", "/<wbr>", escape(kept)))
 
 
 def _split_interval(cell: str) -> tuple[str, str]:
