@@ -161,12 +161,12 @@ def test_a_dataset_from_before_is_read_and_said_to_lack_its_looks(tmp_path: Path
         merge_datasets([root, tmp_path / "newer"], tmp_path / "both", repo_id="local/both")
 
 
-def test_the_doctor_tells_what_was_drawn_and_what_is_no_draw(tmp_path: Path, capsys):
+def test_the_doctor_tells_what_is_no_draw(tmp_path: Path, capsys):
     job = RolloutJob(REACH, conditions=(Condition("soft", actuator_gain=(0.7, 0.7), posture=(0.1, 0.1)),))
     root, about = tmp_path / "soft", {"fingerprint": env_fingerprint(REACH)}
     write_dataset(job.run([1, 2]), root, env_spec(REACH), repo_id="local/soft", **about)
     assert main(["data", "check", str(root)]) == 0
-    assert "its episodes draw actuator_gain 0.7, posture 0.1\n" in capsys.readouterr().out
+    capsys.readouterr()
     [path] = root.glob(layout.EPISODES_FILES)
     table = pq.read_table(path)
     wrong = table.set_column(table.column_names.index(layout.DRAWN), layout.DRAWN, [["[1]", "{}"]])
@@ -197,8 +197,8 @@ def test_episodes_of_any_shape_have_the_shapes_that_are_asked_for_and_say_so(tmp
         "--dataset.repo_id=a/b",
     ]
     assert main([*words, f"--vary={tmp_path / 'round.yaml'}", f"--dataset.root={tmp_path / 'round'}"]) == 0
-    assert main(["data", "check", str(tmp_path / "round")]) == 0
-    assert "shape cylinder or sphere, size 0.0" in capsys.readouterr().out
+    drawn = Dataset.open(tmp_path / "round").episodes.drawn.values()
+    assert {one["shape"] for one in drawn} == {"cylinder", "sphere"}
     assert main([*words, f"--dataset.root={tmp_path / 'any'}"]) == 0
     assert {one["shape"] for one in Dataset.open(tmp_path / "any").episodes.drawn.values()} == set(SHAPES)
 

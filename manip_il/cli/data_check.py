@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.inputs import dataset_differences, exists
 from manip_il.cli.progress import say
@@ -79,7 +79,7 @@ def _examine(root: Path) -> list[Finding]:
 
 
 def _say_verdict(root: Path, findings: list[Finding]) -> None:
-    """Print how much is whole, and what its episodes draw; raises `NotWhole` with the numbers after errors."""
+    """Print how much is whole; raises `NotWhole` with the numbers after errors."""
     from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import NotWhole
 
@@ -91,22 +91,6 @@ def _say_verdict(root: Path, findings: list[Finding]) -> None:
     dataset = Dataset.open(root)
     whole = f"{dataset.info.episodes:,} episodes, {dataset.info.frames:,} frames: whole"
     say(f"{root}: {', '.join([whole, *counts])}")
-    drawn: dict[str, list[Any]] = {}
-    for one in dataset.episodes.drawn.values():
-        for name, value in one.items():
-            drawn.setdefault(name, []).append(value)
-    if drawn:
-        say(f"its episodes draw {', '.join(name + _span(values) for name, values in sorted(drawn.items()))}")
-
-
-def _span(values: list[Any]) -> str:
-    """Return the range of what was drawn, or the words; nothing for anything else."""
-    if all(isinstance(value, str) for value in values):
-        return f" {' or '.join(sorted(set(values)))}"
-    if not all(isinstance(value, int | float) for value in values):
-        return ""
-    low, high = min(values), max(values)
-    return f" {low:.3g}" if low == high else f" {low:.3g} to {high:.3g}"
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:

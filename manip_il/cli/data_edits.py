@@ -47,14 +47,11 @@ class BuildOptions:
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded", check=require_repo_id)
     overwrite: bool = option(False, "replace an existing dataset")
 
-    def check(self) -> None:
-        """Refuse what the paths show to be wrong."""
-        check_output(self.dataset, overwrite=self.overwrite)
-
     def run(self) -> None:
         """Build the dataset; `ManipError` if a journal could not be read."""
         from manip_il.data.build import build
 
+        check_output(self.dataset, overwrite=self.overwrite)
         with exclusive(self.dataset):
             result = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
         say(f"built {result.info.episodes:,} episodes, {result.info.frames:,} frames; {left_out(result.failed)}")
@@ -116,7 +113,6 @@ class RenderOptions:
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         _require_target(self.source, self.target, overwrite=self.overwrite)
-        _cameras(self.cameras, self.image, self.look)
 
     def run(self) -> None:
         """Render every episode; TARGET appears when all are there."""
@@ -201,17 +197,9 @@ class RedrawOptions:
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         _require_target(self._dataset(), self.target, overwrite=self.overwrite)
-        _cameras(self.cameras, self.image, small=True)
 
     def run(self) -> None:
         """Draw all frames; TARGET appears when they are there."""
-        self.make()
-        policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
-        train = f"manip-il train --dataset.root={self.target} --policy.type={policy}"
-        say(f"next: {train} --output_dir=runs/{self.target.name}")
-
-    def make(self) -> None:
-        """Draw all frames, and say nothing of what comes next."""
         from manip_il.collect.edits import Target, open_source, redraw_dataset
         from manip_il.collect.scenes import CHUNK, Scenes
         from manip_il.collect.workers import default_workers
@@ -228,6 +216,9 @@ class RedrawOptions:
         left, drawn = self.frames - info.episodes, f"{info.episodes:,} scenes, {info.frames:,} frames"
         say(f"redrew {drawn}: {_pictures_text(cameras)}; {left:,} left out, without a sound label")
         say(f"dataset: {self.target}")
+        policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
+        train = f"manip-il train --dataset.root={self.target} --policy.type={policy}"
+        say(f"next: {train} --output_dir=runs/{self.target.name}")
 
     def _dataset(self) -> Path:
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source

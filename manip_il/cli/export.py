@@ -7,9 +7,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from manip_il.cli.outputs import check_new_file
 from manip_il.cli.progress import say, warn
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
@@ -26,41 +27,15 @@ class ExportOptions:
     """
 
     example: ClassVar[str] = "manip-il export runs/dagger --output=policy.onnx"
-    policy: Path = option(
-        MISSING,
-        "a run, a checkpoint or a pretrained_model folder",
-        positional=True,
-        check=find_policy,
-    )
+    policy: Path = option(MISSING, "a run, a checkpoint or its pretrained_model", positional=True, check=find_policy)
     format: Literal["onnx"] = option("onnx", "for onnxruntime and others")
     output: Path = option(Path("policy.onnx"), "the file")
     overwrite: bool = option(False, "replace an existing file")
 
     def run(self) -> None:
         """Export, compare, write."""
-        output, path = self.output, self._find(self.output)
-        from manip_il.learn.export import export_onnx
-        from manip_il.learn.policy_files import policy_sha256
-
-        exported = export_onnx(path, policy_sha256(path))
-        write_file(output, exported.data)
-        if "robot" not in exported.metadata:
-            warn(f"{path} was written by another tool: the file does not say robot, task, control rate and names")
-        say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
-        for direction, tensors in (("in", exported.metadata["inputs"]), ("out", exported.metadata["outputs"])):
-            for one in tensors:
-                say(f"{direction:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})")
-        say(f"exported: {output} ({len(exported.data):,} bytes)")
-
-    def _find(self, output: Path) -> Path:
-        """Return the policy; raise, before anything heavy is imported, if it cannot be exported, or not to there."""
-        if output.is_dir():
-            raise UsageError(f"--output is {output}, a folder; expected a file such as {output}/policy.onnx")
-        if output.exists() and not self.overwrite:
-            raise UsageError(f"{output} exists already; replace it with --overwrite=true, or choose another --output")
+        check_new_file(self.output, self.overwrite)
         path = find_policy(self.policy)
-        if output.resolve().is_relative_to(path.resolve()):
-            raise UsageError(f"--output is {output}, inside the policy's own folder {path}; choose another place")
         from manip_il.learn.checkpoint import read_config
 
         kind = read_config(path)["type"]
@@ -68,4 +43,15 @@ class ExportOptions:
             raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
         if missing := [name for name in ONNX_PACKAGES if find_spec(name) is None]:
             raise ManipError(f"an ONNX file needs {' and '.join(missing)}: pip install 'manip_il[export]'")
-        return path
+        from manip_il.learn.export import export_onnx
+        from manip_il.learn.policy_files import policy_sha256
+
+        exported = export_onnx(path, policy_sha256(path))
+        write_file(self.output, exported.data)
+        if "robot" not in exported.metadata:
+            warn(f"{path} was written by another tool: the file does not say robot, task, control rate and names")
+        say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
+        for direction, tensors in (("in", exported.metadata["inputs"]), ("out", exported.metadata["outputs"])):
+            for one in tensors:
+                say(f"{direction:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})")
+        say(f"exported: {self.output} ({len(exported.data):,} bytes)")

@@ -103,6 +103,12 @@ def check_output(folder: Path, *, resume: bool = False, overwrite: bool = False,
         raise UsageError(f"{folder} exists already; replace it with --overwrite=true")
 
 
+def check_new_file(path: Path, overwrite: bool) -> None:
+    """Raise `UsageError` if a command may not write its file: something is there that it may not replace."""
+    if path.is_dir() or (path.exists() and not overwrite):
+        raise UsageError(f"{path} exists already; choose another --output, or give --overwrite=true")
+
+
 def save_options(folder: Path, options: Any) -> None:
     """Write the resolved options to `folder/config.yaml`."""
     write_file(folder / CONFIG_FILE, dump_yaml(options).encode())

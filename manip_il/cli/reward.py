@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli.inputs import REWARD, exists, load_reward, require_dataset
 from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output
+from manip_il.cli.outputs import REPORT_FILE, Output, check_new_file
 from manip_il.cli.progress import Progress, say, warn
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -21,14 +21,8 @@ if TYPE_CHECKING:
 
     from manip_il.preferences.frames import Frames
 
-METHODS = ("max_margin", "bayesian", "max_entropy")
 PROGRESS = "progress"
 _PAIRS = "pairs.json of manip-il reward pairs"
-
-
-def _require_method(method: str) -> None:
-    if method not in METHODS:
-        raise UnknownName("method", method, METHODS)
 
 
 def _seed(what: str) -> Any:
@@ -44,7 +38,7 @@ class IrlOptions:
 
     example: ClassVar[str] = "manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl"
     dataset: Path = option(MISSING, "demonstrations of the task carry", positional=True, check=require_dataset)
-    method: str = option("max_entropy", ", ".join(METHODS), check=_require_method)
+    method: Literal["max_margin", "bayesian", "max_entropy"] = option("max_entropy", "how the weights are found")
     seed: int = _seed("what is drawn at random")
     output: Output = group(Output(Path("runs/irl")), prefix="")
 
@@ -74,8 +68,7 @@ class IrlOptions:
         with self.output.open(self) as folder:
             write_json(folder / FILE_NAME, found.to_json())
             inverse_report(found, command_line("reward irl", self), to_plain(self), timings).write(folder / REPORT_FILE)
-        for line in weight_table(found).aligned_lines():
-            say(line)
+        say(*weight_table(found).aligned_lines())
         if line := open_line(found):
             warn(line)
         say(f"report: {folder / REPORT_FILE}")
@@ -102,10 +95,6 @@ class PairsOptions:
     output: Path = option(Path("pairs.json"), "the file")
     overwrite: bool = option(False, "replace an existing file")
 
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        _require_new_file(self.output, ".json", self.overwrite)
-
     def run(self) -> None:
         """Read the sources, choose, and write the pairs."""
         from manip_il.evaluation.results import write_json
@@ -113,6 +102,7 @@ class PairsOptions:
         from manip_il.preferences.pairs import choose_pairs, open_supply
         from manip_il.seeding import rng_for, stream_base
 
+        check_new_file(self.output, self.overwrite)
         reward = load_reward(self.reward) if self.reward else None
         supply = open_supply(find_datasets(self.sources), self.clip)
         if reward is not None:
@@ -141,15 +131,12 @@ class AskOptions:
     robot: Path | None = option(None, "the YAML of the sources' robot, if that does not ship")
     overwrite: bool = option(False, "replace an existing file")
 
-    def check(self) -> None:
-        """Refuse what the paths show to be wrong."""
-        _require_new_file(self.output, ".html", self.overwrite)
-
     def run(self) -> None:
         """Render the films and write the page."""
         from manip_il.preferences.asking import render_films, render_page
         from manip_il.preferences.pairs import Pairs, read_clips
 
+        check_new_file(self.output, self.overwrite)
         clips = read_clips(Pairs.read(self.pairs))
         with Progress(len(clips.pairs), "render") as bar:
             films = render_films(clips, str(self.robot) if self.robot else None, bar.advance)
@@ -176,13 +163,6 @@ class AnswerOptions:
     output: Path = option(Path("preferences.json"), "the file")
     overwrite: bool = option(False, "replace an existing file")
 
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        from manip_il.preferences.answers import Teacher
-
-        Teacher.parse(self.teacher)
-        _require_new_file(self.output, ".json", self.overwrite)
-
     def run(self) -> None:
         """Compare every pair and write the answers."""
         from manip_il.evaluation.results import write_json
@@ -190,9 +170,11 @@ class AnswerOptions:
         from manip_il.preferences.pairs import Pairs, read_clips
         from manip_il.seeding import rng_for, stream_base
 
+        teacher = Teacher.parse(self.teacher)
+        check_new_file(self.output, self.overwrite)
         clips = read_clips(Pairs.read(self.pairs))
         rng = rng_for(stream_base("training", self.seed), "teacher")
-        found = answer_pairs(Teacher.parse(self.teacher), clips, rng)
+        found = answer_pairs(teacher, clips, rng)
         write_json(self.output, found.to_json())
         given = [one.answer for one in found.answers]
         counts = ", ".join(f"{given.count(answer):,} {answer}" for answer in dict.fromkeys(sorted(given)))
@@ -245,8 +227,7 @@ class FitOptions:
             page = folder / REPORT_FILE
             command = command_line("reward fit", self)
             fit_report(found, clips, answers, who, command, to_plain(self), timings).write(page)
-        for line in summary_lines(found, answers):
-            say(line)
+        say(*summary_lines(found, answers))
         if answers.contradictory:
             warn(f"{answers.contradictory:,} pairs are answered left and right: both answers count")
         say(f"report: {page}")
@@ -310,8 +291,7 @@ class ScoreOptions:
             page = folder / REPORT_FILE
             score_report(scores, command_line("data score", self), to_plain(self), timings).write(page)
         print_table(worst_table(scores))
-        for line in fact_lines(scores):
-            say(line)
+        say(*fact_lines(scores))
         say(f"report: {page}")
         weights = f"--weights={folder / WEIGHTS_FILE}"
         say(f"next: manip-il train --dataset.root={self.dataset} {weights} --output_dir=runs/weighted")
@@ -327,10 +307,3 @@ class ScoreOptions:
         reward = load_reward(Path(self.reward))
         reward.check_fits(str(self.dataset), data.spec)
         return np.clip(reward.of_inputs(data.inputs).astype(np.float64), 0.0, 1.0)
-
-
-def _require_new_file(path: Path, suffix: str, overwrite: bool) -> None:
-    if path.suffix != suffix:
-        raise UsageError(f"--output is {path}; expected a file, NAME{suffix}")
-    if path.is_dir() or (path.exists() and not overwrite):
-        raise UsageError(f"{path} exists already; choose another --output, or give --overwrite=true")

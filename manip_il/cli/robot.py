@@ -12,16 +12,15 @@ from manip_il import checks
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import exists, open_driver
 from manip_il.cli.options import Given, command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output
+from manip_il.cli.outputs import REPORT_FILE, Output, check_new_file
 from manip_il.cli.progress import Progress, say, warn
-from manip_il.errors import ManipError, RenderError, UnknownName, UsageError
+from manip_il.errors import ManipError, RenderError
 from manip_il.option import option
 from manip_il.tasks import NAMES
 
 if TYPE_CHECKING:
     from manip_il.evaluation.robot_check import RobotCheck
 
-SUFFIXES = (".yaml", ".yml")
 PAGE = "check.html"
 
 
@@ -40,16 +39,6 @@ class RobotNewOptions:
     output: Path | None = option(None, "the YAML; by default beside the model, with its name")
     overwrite: bool = option(False, "replace an existing file")
 
-    def check(self) -> None:
-        """Refuse what the paths show to be wrong."""
-        target = self._target()
-        if target.suffix not in SUFFIXES:
-            raise UsageError(f"--output is {target}; expected a file, NAME.yaml")
-        checks.name(f"the name of {target}, which will be the robot's,", target.stem)
-        exists(f"the folder of {target}")(target.parent)
-        if target.exists() and not self.overwrite:
-            raise UsageError(f"{target} exists already; choose another --output, or give --overwrite")
-
     def run(self) -> None:
         """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
         from manip_il.data.atomic import write_file
@@ -57,12 +46,13 @@ class RobotNewOptions:
         from manip_il.robots.suggest import found_lines, suggest, yaml_of
         from manip_il.robots.table import get_robot
 
-        target = self._target()
+        target = self.output or self.model.with_suffix(".yaml")
+        checks.name(f"the name of {target}, which will be the robot's,", target.stem)
+        check_new_file(target, self.overwrite)
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
         found = suggest(self.model, self.gripper)
         text = yaml_of(found, *paths)
-        for doubt in found.doubts:
-            say(f"look: {doubt}")
+        say(*(f"look: {doubt}" for doubt in found.doubts))
         write_file(target, text.encode())
         try:
             write_file(target, (text + found_lines(get_robot(str(target)))).encode())
@@ -73,14 +63,10 @@ class RobotNewOptions:
             target.unlink(missing_ok=True)
             raise
         say(f"wrote {target}. {verdict(checked)}")
-        for line in advice(checked):
-            say(f"change: {line}")
+        say(*(f"change: {line}" for line in advice(checked)))
         if len(checked.failed) == len(NAMES):
             raise ManipError(f"wrote {target}, with which no task can be done yet; see above")
         say(f"look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
-
-    def _target(self) -> Path:
-        return self.output or self.model.with_suffix(".yaml")
 
 
 def _measure(
@@ -93,11 +79,6 @@ def _measure(
         return check_robot(robot, tasks, episodes, engine, on_result)
 
 
-def _require_task(task: str) -> None:
-    if task not in NAMES:
-        raise UnknownName("task in --tasks:", task, NAMES)
-
-
 @dataclass
 class RobotCheckOptions:
     """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
@@ -108,27 +89,25 @@ class RobotCheckOptions:
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
     robot: str = option(MISSING, "its YAML, or the name of one that ships", positional=True)
-    tasks: list[str] = option(list, f"of {', '.join(NAMES)}; by default all", check=_require_task)
+    tasks: list[str] = option(list, f"of {', '.join(NAMES)}; by default all")
     episodes: int = option(
         50, "of the expert at each task, and as many with random actions; 0 for none", at_least=0, at_most=1_000_000
     )
     output: Output = group(Output(Path("runs/robot_check")), prefix="")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong, and a robot that cannot be used."""
-        self.output.check()
-        from manip_il.robots.gripper import sweep
-        from manip_il.robots.table import get_robot
-
-        sweep(get_robot(self.robot))
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` if a task cannot be done."""
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.robot_check import FILE_NAME
         from manip_il.evaluation.robot_page import check_report, looks
+        from manip_il.robots.gripper import sweep
+        from manip_il.robots.table import get_robot
+        from manip_il.tasks.table import get_task
 
+        sweep(get_robot(self.robot))  # refuses a robot that cannot be used before anything is written
         tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
+        for task in tasks:
+            get_task(task)
         with self.output.open(self) as folder:
             with Progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
                 found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
@@ -152,9 +131,7 @@ class RobotCheckOptions:
 
         say(home_line(found))
         print_table(task_table(found))
-        say(verdict(found))
-        for line in advice(found):
-            say(f"change: {line}")
+        say(verdict(found), *(f"change: {line}" for line in advice(found)))
 
 
 @dataclass
@@ -181,11 +158,6 @@ class CertifyOptions:
     trust: bool = common.trust_option()
     output: Output = group(Output(Path("runs/certificate")), prefix="")
 
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        self.output.check()
-        common.env_config(self.env)
-
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
         from manip_il.evaluation.certificate import FILE_NAME, certificate_report
@@ -205,7 +177,4 @@ class CertifyOptions:
             report.write(folder / REPORT_FILE)
         for table in certificate.tables():
             print_table(table, empty="-")
-        for line in certificate.facts():
-            say(line)
-        say(f"result: {folder / FILE_NAME}")
-        say(f"report: {folder / REPORT_FILE}")
+        say(*certificate.facts(), f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

@@ -62,8 +62,7 @@ class TheoryOptions:
             write_json(folder / FILE_NAME, theory.to_json())
             report = theory_report(theory, command_line("theory", self), to_plain(self), timings)
             report.write(folder / REPORT_FILE)
-        for line in [*slope_table(theory).aligned_lines(), f"policies above their bound: {theory.above}"]:
-            say(line)
+        say(*slope_table(theory).aligned_lines(), f"policies above their bound: {theory.above}")
         say(f"report: {folder / REPORT_FILE}")
 
     def _shift(self, run: Path) -> Shift:

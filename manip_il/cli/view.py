@@ -58,30 +58,30 @@ class ViewOptions:
     output: Path | None = option(None, "write a file of Rerun's, FILE.rrd, in place of showing anything")
 
     def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
+        """Refuse what does not go together."""
         if self.policy.path is not None and self.policy.type is not None:
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random|sliders")
-        self._seeds()
+        if self.output is not None and (self.output.suffix != SUFFIX or self.output.is_dir()):
+            raise UsageError(f"--output is {self.output}; expected a file, NAME{SUFFIX}")
         if self.output is not None:
-            if self.output.suffix != SUFFIX or self.output.is_dir():
-                raise UsageError(f"--output is {self.output}; expected a file, NAME{SUFFIX}")
             exists(f"the folder of --output={self.output}")(self.output.parent)
         if self.env.get("robot") == STOCK:
             raise UsageError(f'--robot.type={STOCK} cannot be viewed; gymnasium shows it: render_mode="human"')
-        common.env_config(self.env)
-        if self.policy.type == "sliders":
-            self._check_sliders()
+        if self.policy.type == "sliders" and not self._in_a_window:
+            raise UsageError("--policy.type=sliders needs a window: a DISPLAY, and no --output")
 
     def run(self) -> None:
         """Run episodes and show them."""
         from manip_il.collect.job import observed_cameras, run_steps
         from manip_il.evaluation.watch import outcome
+        from manip_il.seeding import BLOCK, stream_seeds
         from manip_il.sim.env import ManipEnv
 
         job = self._job()
+        seeds = stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)
         env = ManipEnv.of(job.env, observed_cameras(job), job.conditions)
         with contextlib.closing(self._screen(env)) as screen:
-            for step in run_steps(job, [env], self._seeds(), screen.act):
+            for step in run_steps(job, [env], seeds, screen.act):
                 if not screen.add(step):
                     break
                 if step.done:
@@ -89,22 +89,11 @@ class ViewOptions:
         if self.output is not None:
             say(f"next: rerun {self.output}")
 
-    def _seeds(self) -> range:
-        from manip_il.seeding import BLOCK, stream_seeds
+    @property
+    def _in_a_window(self) -> bool:
+        from manip_il.sim.window import has_display
 
-        return stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)
-
-    def _check_sliders(self) -> None:
-        """Raise `UsageError` if nobody can move sliders."""
-        from manip_il.sim.window import DISPLAYS, has_display
-
-        if self.output is not None:
-            raise UsageError("--policy.type=sliders needs a window; leave --output out")
-        if not has_display():
-            raise UsageError(
-                f"--policy.type=sliders needs a display, and neither {' nor '.join(DISPLAYS)} is set; "
-                "choose --policy.type=expert or random, or a --policy.path"
-            )
+        return self.output is None and has_display()
 
     def _job(self) -> RolloutJob:
         """Return the episodes to show; without pictures if no policy looks at any and a window is open."""
@@ -119,12 +108,6 @@ class ViewOptions:
         if self.policy.type == "sliders" and not self.env.get("horizon"):
             env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
         return RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
-
-    @property
-    def _in_a_window(self) -> bool:
-        from manip_il.sim.window import has_display
-
-        return self.output is None and has_display()
 
     def _cameras(self, env: EnvConfig) -> CameraConfig | None:
         """Return cameras for people, with shadows if nobody waits; None, with a warning, without OpenGL."""
