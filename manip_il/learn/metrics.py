@@ -33,7 +33,7 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
             writers.append(stack.enter_context(tensorboard(output_dir / TENSORBOARD_FOLDER, step)))
         if pipeline.wandb.enable:
             pipeline.resume = step > 0
-            writers.append(stack.enter_context(weights_and_biases(pipeline)))
+            writers.append(weights_and_biases(pipeline))
         yield writers
 
 
@@ -62,13 +62,12 @@ def tensorboard(folder: Path, step: int) -> Iterator[Writer]:
         yield write
 
 
-@contextmanager
-def weights_and_biases(config: TrainPipelineConfig) -> Iterator[Writer]:
-    """Give a function that adds a point by LeRobot's own logger. Raises `UsageError` if wandb is not installed."""
+def weights_and_biases(config: TrainPipelineConfig) -> Writer:
+    """Return a function that adds a point by LeRobot's own logger. Raises `UsageError` if wandb is not installed."""
     try:
         importlib.import_module("wandb")  # LeRobot's logger imports it, and says less
         from lerobot.common.wandb_utils import WandBLogger
     except ImportError as error:
         raise UsageError("--wandb.enable=true needs Weights & Biases: pip install wandb") from error
     logger = WandBLogger(config)
-    yield lambda record: logger.log_dict({k: v for k, v in record.items() if k != "step"}, record["step"])
+    return lambda record: logger.log_dict({k: v for k, v in record.items() if k != "step"}, record["step"])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, UsageError
 from manip_il.learn.checkpoint import META_FILE, Checkpoint
-from manip_il.sim.config import CAMERAS, CameraConfig, Look
+from manip_il.sim.config import CameraConfig, Look
 
 _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 
@@ -24,18 +24,13 @@ def policy_sha256(policy: Path) -> str:
 def policy_cameras(policy: Path) -> CameraConfig | None:
     """Return cameras, size and light of the pictures that a checkpoint was trained with; None for one without.
 
-    The light is the default if the checkpoint does not say. Raises `MismatchError` for cameras that environments do
-    not have or whose pictures differ in size, `ManipError` for a folder or a size that cannot be.
+    The light is the default if the checkpoint does not say. Raises `ManipError` for cameras that environments do not
+    have, and for a folder or a size that cannot be.
     """
     checkpoint = Checkpoint.open(policy)
     pictures, meta = checkpoint.pictures, checkpoint.origin
     if not pictures:
         return None
-    if not set(pictures) <= set(CAMERAS):
-        raise MismatchError("cameras", str(policy), ", ".join(pictures), "the environment", ", ".join(CAMERAS))
-    if len(set(pictures.values())) > 1:
-        sizes = ", ".join(f"{camera} {size}" for camera, size in pictures.items())
-        raise MismatchError("size of pictures", str(policy), sizes, "the environment", "one size for all cameras")
     as_recorded = meta is not None and set(meta.cameras) == set(pictures)
     names = meta.cameras if meta is not None and as_recorded else tuple(pictures)
     height, width = next(iter(pictures.values()))

@@ -141,7 +141,6 @@ class LearnedReward:
 
     def __init__(self, network: RewardNetwork, origin: Origin) -> None:
         self.network, self.origin = network.eval(), origin
-        self._widths = _widths(origin)
 
     @classmethod
     def load(cls, path: Path) -> LearnedReward:
@@ -171,15 +170,8 @@ class LearnedReward:
         self.origin.check_fits(spec)
 
     def __call__(self, states: F32, environment_states: F32, actions: F32) -> F32:
-        """Return the reward of every row, (B,): states (B, n), environment states (B, k), absolute actions (B, n).
-
-        Raises `MismatchError` for other widths.
-        """
-        given = (states, environment_states, actions)
-        for (key, width), one in zip(self._widths.items(), given, strict=True):
-            if one.shape != (len(states), width):
-                raise MismatchError(f"shape of {key}", "the reward", f"({len(states)}, {width})", "the rows", one.shape)
-        return self.of_inputs(np.concatenate(given, axis=1, dtype=np.float32))
+        """Return the reward of every row, (B,): states (B, n), environment states (B, k), absolute actions (B, n)."""
+        return self.of_inputs(np.concatenate([states, environment_states, actions], axis=1, dtype=np.float32))
 
     @torch.inference_mode()
     def of_inputs(self, inputs: F32) -> F32:

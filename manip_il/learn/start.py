@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE, RobotTaskSpec, features
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for
 from manip_il.learn.action_steps import add_steps, is_in_processors
 from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.mlp import MLPConfig, MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
 from manip_il.learn.network import fit_statistics, read_weights
@@ -53,11 +53,8 @@ def start_policy(
     options = (None if start is None else Checkpoint.open(start).mlp_options) or {}
     options |= {"loss": _GAUSSIAN, "action_space": space}
     config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
-    n, k = len(spec.joint_names), len(spec.environment_state_names)
-    config.input_features = {STATE: PolicyFeature(type=FeatureType.STATE, shape=(n,))}
-    if k:
-        config.input_features[ENVIRONMENT_STATE] = PolicyFeature(type=FeatureType.ENV, shape=(k,))
-    config.output_features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n,))}
+    inputs = [STATE, *([ENVIRONMENT_STATE] if spec.environment_state_names else [])]
+    config.input_features, config.output_features = policy_features(features(spec), inputs)
     with torch.random.fork_rng(devices=[]):  # torch initialises layers from its global generator: lend it one
         torch.manual_seed(seed)
         policy = MLPPolicy(config)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import NotFiniteError, UsageError
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Order, generator_of, pictures_to_float, prefetched
@@ -41,7 +41,6 @@ from manip_il.learn.sources import Sources, input_columns
 from manip_il.learn.threads import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
-    check_same_data,
     last_checkpoint,
     read_step,
     readable_state,
@@ -99,13 +98,12 @@ class Trainer:
         self.digest = self.data.digest
         if drawn is not None:
             self.digest = hashlib.sha256(self.digest.encode() + drawn.tobytes()).hexdigest()
-        self.options = self.lerobot.to_json()
-        if checkpoint is not None:
-            check_same_data(checkpoint, self.digest)
+        if checkpoint is not None and (learnt := read_step(checkpoint).get("data")) != self.digest:
+            raise MismatchError("training data", f"checkpoint {checkpoint}", learnt, "this run", self.digest)
         self.origin = Origin.of(
             spec,
             first.fingerprint if fingerprint is None else fingerprint,
-            self.options,
+            self.lerobot.to_json(),
             config.observes,
             sources.looks[0] if look is None else look,
             datasets=sources.to_json(),

@@ -22,7 +22,7 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.data.atomic import writing
-from manip_il.errors import FolderExistsError, ManipError, MismatchError
+from manip_il.errors import FolderExistsError, ManipError
 from manip_il.learn.checkpoint import META_FILE, Origin
 
 PRETRAINED_MODEL, TRAINING_STATE, STEP_FILE = "pretrained_model", "training_state", "training_step.json"
@@ -50,13 +50,6 @@ def read_step(checkpoint: Path) -> dict[str, Any]:
     values = checks.read_json(path, "the step of a run")
     checks.whole(f"{path}: step", values.get("step"), 0, 10**12)
     return values
-
-
-def check_same_data(checkpoint: Path, digest: str) -> None:
-    """Raise `MismatchError` unless the checkpoint's run learnt from the same data."""
-    saved = read_step(checkpoint).get("data")
-    if saved != digest:
-        raise MismatchError("training data", f"checkpoint {checkpoint}", saved, "this run", digest)
 
 
 @contextmanager

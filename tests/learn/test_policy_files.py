@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from manip_il.collect.environments import env_fingerprint, env_spec
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy_files import policy_cameras
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
@@ -34,11 +34,7 @@ def test_pictures_that_no_environment_has_are_refused(tmp_path):
         visual = {f"observation.images.{name}": {"type": "VISUAL", "shape": shape} for name, shape in pictures.items()}
         edit_config(folder, input_features=features | visual)
 
-    for pictures, kind, words in (
-        ({"top": [3, 32, 32]}, MismatchError, r"cameras .*top, the environment has front, side, wrist"),
-        ({"front": [3, 32, 32], "wrist": [3, 64, 64]}, MismatchError, "one size for all"),
-        ({"front": [3, 33, 32]}, ManipError, "height 33"),
-    ):
+    for pictures, words in (({"top": [3, 32, 32]}, "camera 'top'"), ({"front": [3, 33, 32]}, "height 33")):
         look_at(**pictures)
-        with pytest.raises(kind, match=words):
+        with pytest.raises(ManipError, match=words):
             policy_cameras(folder)
