@@ -54,7 +54,7 @@ COMMANDS = {
     "data relabel": Command("data_edits:RelabelOptions", "relabel a dataset with the current expert"),
     "data build": Command("data_edits:BuildOptions", "rebuild a dataset from its journals"),
     "data merge": Command("data_edits:MergeOptions", "merge datasets of one robot and task"),
-    "data score": Command("reward:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
+    "data score": Command("data_check:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
     "data to-mcap": Command("mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
     "data from-mcap": Command("mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
     "robot new": Command("robot:RobotNewOptions", "write a first YAML for an arm's MJCF"),

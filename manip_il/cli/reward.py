@@ -1,27 +1,19 @@
-"""`manip-il reward irl|pairs|ask|answer|fit` and `data score`: rewards from demonstrations and from preferences."""
+"""`manip-il reward irl|pairs|ask|answer|fit`: rewards from demonstrations and from preferences."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from manip_il.cli.inputs import REWARD, exists, load_reward, require_dataset
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output, check_new_file
 from manip_il.cli.progress import Progress, say, warn
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError
 from manip_il.option import option
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from manip_il.preferences.frames import Frames
-
-PROGRESS = "progress"
 _PAIRS = "pairs.json of manip-il reward pairs"
 
 
@@ -245,65 +237,3 @@ class FitOptions:
         options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
         write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
         write_json(folder / "fit.json", found.to_json())
-
-
-@dataclass
-class ScoreOptions:
-    """Score every frame and episode of a dataset by a reward, and list the worst episodes.
-
-    Writes scores.json, report.html, and rabc.parquet: weights of frames, for manip-il train --weights= and for
-    lerobot-train --sample_weighting.progress_path=. Where the dataset says which episodes failed, how well the score
-    finds them stands beside what true progress would find.
-    """
-
-    example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"
-    dataset: Path = option(MISSING, "the dataset's folder", positional=True, check=require_dataset)
-    reward: str = option(MISSING, "folder of manip-il reward fit; progress: true progress")
-    output: Output = group(Output(Path("runs/scores")), prefix="")
-
-    def check(self) -> None:
-        """Refuse what the paths show to be wrong."""
-        if self.reward != PROGRESS:
-            exists(f"{REWARD}, or the word progress")(Path(self.reward))
-        self.output.check()
-
-    def run(self) -> None:
-        """Score, print the worst episodes, write the files."""
-        from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.tables import print_table
-        from manip_il.preferences.frames import read_frames
-        from manip_il.preferences.scores import (
-            FILE_NAME,
-            WEIGHTS_FILE,
-            Scores,
-            fact_lines,
-            score_report,
-            worst_table,
-            write_weights,
-        )
-
-        begin, data = time.monotonic(), read_frames(self.dataset)
-        scores = Scores(str(self.dataset), self.reward, data, self._scores(data))
-        timings = {"scoring": time.monotonic() - begin}
-        with self.output.open(self) as folder:
-            write_json(folder / FILE_NAME, scores.to_json())
-            write_weights(folder / WEIGHTS_FILE, scores)
-            page = folder / REPORT_FILE
-            score_report(scores, command_line("data score", self), to_plain(self), timings).write(page)
-        print_table(worst_table(scores))
-        say(*fact_lines(scores))
-        say(f"report: {page}")
-        weights = f"--weights={folder / WEIGHTS_FILE}"
-        say(f"next: manip-il train --dataset.root={self.dataset} {weights} --output_dir=runs/weighted")
-
-    def _scores(self, data: Frames) -> NDArray[np.float64]:
-        """Score of every frame, (N,)."""
-        import numpy as np
-
-        if self.reward == PROGRESS:
-            if data.progress is None:
-                raise ManipError(f"{self.dataset} has no column progress; give --reward=FOLDER")
-            return data.progress
-        reward = load_reward(Path(self.reward))
-        reward.check_fits(str(self.dataset), data.spec)
-        return np.clip(reward.of_inputs(data.inputs).astype(np.float64), 0.0, 1.0)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.cli.main import main
-from manip_il.cli.options import Given, Open, command_line, expected, metavar, options_of, word
+from manip_il.cli.options import Given, Open, command_line, options_of, word
 from manip_il.cli.options import given as given_of
 from manip_il.cli.parsing import check_values, dump_yaml, from_layers, from_yaml, parse
 from manip_il.errors import UsageError
@@ -60,21 +60,15 @@ def fails(words: list[str], cls: type = Options) -> str:
     [
         ([], {}),
         (["--dataset.num_episodes=7"], {"dataset": Dataset(num_episodes=7)}),
-        (["--dataset.num_episodes", "7"], {"dataset": Dataset(num_episodes=7)}),
         (["--small.repo_id=a=b"], {"small": Dataset(repo_id="a=b", num_episodes=3)}),
         (["--dataset.root=x/y"], {"dataset": Dataset(root=Path("x/y"))}),
         (["--dataset.root=null"], {}),
         (["--dataset.root=~/x"], {"dataset": Dataset(root=Path.home() / "x")}),
-        (["--loss", "l1"], {"loss": "l1"}),
-        (["--device=CUDA"], {"device": "CUDA"}),
         (["--cameras=front,wrist"], {"cameras": ["front", "wrist"]}),
         (["--cameras=['front', 'wrist']"], {"cameras": ["front", "wrist"]}),
-        (["--cameras="], {}),
         (["--gains=1,2.5"], {"gains": [1.0, 2.5]}),
         (["--lr", "-1e-4"], {"lr": -1e-4}),
-        (["--beta=0.5"], {"beta": 0.5}),
         (["--note="], {"note": ""}),
-        (["--resume"], {"resume": True}),
         (["--resume", "--loss=l1"], {"resume": True, "loss": "l1"}),
         (["--resume", "false"], {}),
         (["--loss=l1", "--loss=mse"], {}),
@@ -88,7 +82,6 @@ def test_words_change_what_they_name(words, change):
     ("words", "parts"),
     [
         (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help=all lists all"]),
-        (["--num_epsiodes=1"], ["did you mean", "num_episodes"]),
         (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--dataset.repo_id' or '--small.repo_id'?)"]),
         (["--dataset=x"], ["--dataset is a group", "--dataset.num_episodes"]),
         (["--lr=fast"], ["--lr", "expected a number", "'fast'"]),
@@ -96,14 +89,11 @@ def test_words_change_what_they_name(words, change):
         (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "a whole number", "'1.5'"]),
         (["--dataset.num_episodes=0"], ["num_episodes is 0"]),
         (["--loss=l2"], ["one of mse, l1", "'l2'", "did you mean 'l1'"]),
-        (["--device=GPU"], ["one of CPU, CUDA"]),
         (["--resume=yes"], ["true or false", "'yes'"]),
         (["--dataset.root="], ["a path or null"]),
         (["--gains=1,x"], ["comma-separated list", "a number"]),
         (["--lr"], ["--lr has no value", "a number"]),
-        (["--lr", "--resume"], ["--lr has no value"]),
         (["lr=1"], ["unexpected 'lr=1'", "two dashes: --lr=1"]),
-        (["-lr=1"], ["unexpected '-lr=1'", "two dashes: --lr=1"]),
         (["data/x"], ["unexpected 'data/x'; options are written --name=value"]),
         (["--config_path=absent.yaml"], ["cannot read absent.yaml"]),
     ],
@@ -139,10 +129,7 @@ def test_words_beat_yaml_beats_defaults(tmp_path):
         ("dataset: 5", ["dataset: expected a mapping"]),
         ("resume: 1", ["resume: expected true or false, got 1"]),
         ("dataset: {num_episodes: true}", ["expected a whole number, got True"]),
-        ("dataset: {num_episodes: 2.0}", ["expected a whole number"]),
-        ("dataset: {num_episodes: null}", ["expected a whole number, got None"]),
         ("dataset: {repo_id: no}", ["expected text, got False", "quotes"]),
-        ("cameras: front", ["comma-separated list"]),
         ("- 1", ["expected a mapping"]),
         ("a: [", ["is not YAML"]),
     ],
@@ -190,19 +177,6 @@ def test_options_survive_the_command_line(options):
     options = replace(options, cameras=[], note=None)  # a comma in an item, and the text "null", need YAML
     words = [f"--{option.name}={word(option.value(options))}" for option in options_of(Options)]
     assert parse(Options, words) == options
-
-
-def test_a_groups_own_default_shows_in_the_list_of_options():
-    defaults = {option.name: option.default for option in options_of(Options)}
-    assert defaults["dataset.num_episodes"] == 50
-    assert defaults["small.num_episodes"] == 3
-
-
-def test_types_are_named_for_people():
-    assert metavar(Path | None) == "PATH"
-    assert metavar(list[float]) == "FLOAT,..."
-    assert metavar(Literal["cpu", "cuda"] | None) == "cpu|cuda"
-    assert expected(int | None) == "a whole number or null"
 
 
 @dataclass
@@ -254,20 +228,10 @@ def test_a_layers_error_says_which_layer():
         from_layers(Fit, [("x.yaml: arms.a", {"data": {"num_episodes": "many"}})])
 
 
-def test_an_open_options_dotted_name_may_stand_in_yaml(tmp_path):
-    (tmp_path / "c.yaml").write_text("policy.width: 16\npolicy: {depth: 2}\n")
-    assert from_yaml(tmp_path / "c.yaml", Fit).policy == {"width": 16, "depth": 2}
-
-
 @pytest.mark.parametrize(
     ("command", "text"),
-    [
-        ("record", "dataset: [" + "1, " * 10_000 + "1]"),
-        ("record", "seed: " + "x" * 100_000),
-        ("record", "cameras: {a: " + "y" * 100_000 + "}"),
-        ("demo", "x" * 1_000 + ": 1"),
-    ],
-    ids=["list", "text", "mapping", "name"],
+    [("record", "dataset: [" + "1, " * 10_000 + "1]"), ("demo", "x" * 1_000 + ": 1")],
+    ids=["list", "name"],
 )
 def test_an_error_prints_of_a_large_value_as_much_as_one_reads(command, text, tmp_path, error):
     (tmp_path / "x.yaml").write_text(text)
