@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import COMMANDS, Command, main
-from manip_il.robots import ROBOTS
 
 from . import fake_command
 
@@ -109,11 +108,3 @@ def test_a_reader_that_goes_away_is_no_error():
     assert process.wait(timeout=120) == 141
     assert process.stderr.read() == b""
     process.stderr.close()
-
-
-@pytest.mark.parametrize("command", ["record", "eval"])
-def test_help_says_every_kind_of_robot_and_the_stock_tasks(command, capsys):
-    assert main([command, "--help"]) == 0
-    [robot] = [line for line in capsys.readouterr().out.splitlines() if line.strip().startswith("--robot.type")]
-    for words in (*ROBOTS, "path of the YAML of an arm of your own", "fetch_stock: gymnasium-robotics' own Fetch"):
-        assert words in robot

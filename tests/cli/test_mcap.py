@@ -66,14 +66,3 @@ def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path
     words = ["data", "from-mcap", str(tmp_path / "a.mcap"), str(dataset), f"--mapping={mapping}"]
     assert main(words) == 2
     assert error().endswith("exists already; choose another folder, or delete it first")
-
-
-def test_help_of_two_words(capsys):
-    for words in (["data"], ["data", "--help"]):
-        assert main(words) == 0
-        out = capsys.readouterr().out
-        assert "usage: manip-il data COMMAND" in out
-        assert "  data from-mcap  " in out
-        assert "record" not in out
-    assert main(["data", "from-mcap", "--help"]) == 0
-    assert "usage: manip-il data from-mcap SOURCE DATASET [--option=value ...]" in capsys.readouterr().out

@@ -79,13 +79,6 @@ def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, error):
     assert mine.exists()
 
 
-def test_no_journals_are_an_error(here, error):
-    Path("empty.journals").mkdir()
-    assert main(["data", "build", "empty.journals", "x"]) == 1
-    assert "holds no readable episode" in error()
-    assert not Path("x").exists()
-
-
 @pytest.mark.slow
 @pytest.mark.gl
 def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_or_two(tmp_path):
@@ -149,9 +142,6 @@ def test_two_workers_write_the_bytes_of_one(demos):
     ("words", "code", "message"),
     [
         (["demos", "demos", "--overwrite=true"], 2, "TARGET demos overlaps SOURCE demos"),
-        (["demos", ".", "--overwrite=true"], 2, "overlaps SOURCE demos"),
-        (["demos", "demos/meta", "--overwrite=true"], 2, "overlaps SOURCE demos"),
-        (["demos", "full"], 2, "full exists already; replace it with --overwrite=true"),
         (["demos", "full", "--overwrite=true"], 2, "full holds something that manip-il did not make"),
     ],
 )

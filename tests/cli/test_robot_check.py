@@ -77,9 +77,7 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     [
         (["pnada"], "did you mean 'panda'"),
         (["panda", "--tasks=reahc"], "did you mean 'reach'"),
-        (["panda", "--episodes=-1"], "--episodes is -1"),
         (["no.yaml"], "no.yaml"),
-        ([], "ROBOT"),
     ],
 )
 def test_a_wrong_word_is_one_line_and_2(words: list[str], line: str, tmp_path: Path, capsys):
