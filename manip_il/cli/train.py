@@ -72,10 +72,16 @@ class TrainOptions:
     output: ResumableOutput = group(ResumableOutput(Path("runs/train")), prefix="")
 
     def check(self) -> None:
-        """Refuse what does not go together, and a folder that is taken."""
+        """Refuse what does not go together, datasets that lack what the policy looks at, and a folder that is taken."""
         check_weights(self.dataset.root, self.dataset.weights)
         if self.weights is not None and len(self.dataset.root) > 1:
             raise UsageError("--weights is for the frames of one dataset; give one --dataset.root")
+        from manip_il.data.info import read_info
+        from manip_il.learn.sources import input_columns  # at once, before LeRobot is imported, which takes seconds
+
+        config = self._fit_config()
+        for root in self.dataset.root:
+            input_columns(config, root, read_info(root))
         if _is_first_process():
             self.output.check()
 

@@ -9,14 +9,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from manip_il.errors import UnknownName, UsageError
-from manip_il.learn.names import ACTION_SPACES, CNN, CONVERTED, JOINT_TARGET, MLP, OBSERVATIONS
-from manip_il.option import option
+from manip_il.errors import UsageError
+from manip_il.learn.names import CNN, CONVERTED, JOINT_TARGET, MLP
+from manip_il.option import check_bounds, option
 
 if TYPE_CHECKING:  # it imports numpy
     from manip_il.learn.checkpoint import Checkpoint
-
-_AT_LEAST_1 = ("steps", "batch_size", "threads", "log_freq", "save_freq")
 
 
 class Defaults(NamedTuple):
@@ -57,7 +55,7 @@ class FitConfig:
     policy or its checkpoint names may be loaded. seed: of weights and batches. init_from: a `pretrained_model` folder
     whose weights to start from.
 
-    Raises `UsageError` for a number out of range, `UnknownName` for an action space or observation that is not there.
+    Raises `UsageError` for a number out of range.
     """
 
     policy: Mapping[str, Any] = option(
@@ -71,22 +69,26 @@ class FitConfig:
     observation: Literal["state", "images", "both"] | None = option(
         None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
     )
-    steps: int | None = option(None, f"gradient steps; {_by_default('steps')}", grows=True)
-    batch_size: int | None = option(None, f"frames per step; {_by_default('batch_size')}")
-    lr: float | None = option(None, "peak learning rate; by default the policy's own")
+    steps: int | None = option(None, f"gradient steps; {_by_default('steps')}", grows=True, at_least=1)
+    batch_size: int | None = option(None, f"frames per step; {_by_default('batch_size')}", at_least=1)
+    lr: float | None = option(None, "peak learning rate; by default the policy's own", at_least=1e-15)
     optimizer: Mapping[str, Any] = option(
         dict, "an option of an optimiser in place of the policy's own: type (adamw), weight_decay, ..."
     )
     scheduler: Mapping[str, Any] = option(
         dict, "an option of a schedule of the learning rate in place of the policy's own: type, ..."
     )
-    eval_split: float = option(0.05, "share of the episodes held out for val_loss", flag="dataset.eval_split")
+    eval_split: float = option(
+        0.05, "share of the episodes held out for val_loss", flag="dataset.eval_split", at_least=0, at_most=0.99
+    )
     image_augment: bool | None = option(
         None, "random crops and colour jitter of pictures while training; by default for all but cnn"
     )
-    threads: int = option(1, "PyTorch threads; more help only on free cores", free=True)
-    save_freq: int | None = option(None, f"steps between checkpoints; {_by_default('save_freq')}", free=True)
-    log_freq: int = option(200, "steps between metrics", free=True)
+    threads: int = option(1, "PyTorch threads; more help only on free cores", free=True, at_least=1)
+    save_freq: int | None = option(
+        None, f"steps between checkpoints; {_by_default('save_freq')}", free=True, at_least=1
+    )
+    log_freq: int = option(200, "steps between metrics", free=True, at_least=1)
     tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard", free=True)
     wandb: Mapping[str, Any] = option(dict, "an option of Weights & Biases: enable, project, mode, ...", free=True)
     trust: bool = False
@@ -94,18 +96,7 @@ class FitConfig:
     init_from: Path | None = None
 
     def __post_init__(self) -> None:
-        for name in _AT_LEAST_1:
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise UsageError(f"{name} is {value}; expected at least 1")
-        if not 0.0 <= self.eval_split < 1.0:
-            raise UsageError(f"dataset.eval_split is {self.eval_split}; expected at least 0 and less than 1")
-        if self.lr is not None and not 0.0 < self.lr < math.inf:
-            raise UsageError(f"lr is {self.lr}; expected more than 0")
-        if self.observation is not None and self.observation not in OBSERVATIONS:
-            raise UnknownName("observation", self.observation, OBSERVATIONS)
-        if self.action_space is not None and self.action_space not in ACTION_SPACES:
-            raise UnknownName("action space", self.action_space, ACTION_SPACES)
+        check_bounds(self)
         if "path" in self.policy and "type" in self.policy:
             raise UsageError("give one of --policy.path=DIR and --policy.type=...: the type is in the checkpoint")
         check_convertible(self.kind, self.action_space or JOINT_TARGET)

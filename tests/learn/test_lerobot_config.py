@@ -113,10 +113,9 @@ def test_no_more_actions_are_taken_of_a_plan_than_it_has(kind) -> None:
     ("changes", "says"),
     [
         ({"steps": 0}, "steps is 0; expected at least 1"),
-        ({"eval_split": 1.0}, "dataset.eval_split is 1.0; expected at least 0 and less than 1"),
-        ({"lr": 0.0}, "lr is 0.0; expected more than 0"),
+        ({"eval_split": 1.0}, "eval_split is 1.0; expected 0 to 0.99"),
+        ({"lr": 0.0}, "lr is 0.0"),
         ({"observation": "images"}, "mlp does not take images"),
-        ({"observation": "image"}, "did you mean 'images'"),
     ],
 )
 def test_options_of_a_fit_out_of_range_are_refused(changes, says):
