@@ -130,9 +130,9 @@ class ImitationRun(Run):
         """Measure a round's policy on the validation's seeds, which ends the round."""
         round_, config = policy.round, self.config
         self._watch.on_stage("validate", round_, config.validation_episodes)
-        options = {"conditions": config.conditions, "trust": config.fit.trust}
-        path, name = self._folder(round_) / FILE_NAME, f"DAgger round {round_}"
-        validation = self._validate(policy.path, path, name, config.hold, **options)
+        driver = PolicyDriver((policy.path,), trust=config.fit.trust)
+        job = RolloutJob(config.env, driver, config.hold, label="last", conditions=config.conditions)
+        validation = self._validate(job, self._folder(round_) / FILE_NAME, f"DAgger round {round_}")
         here, so_far = self._made[round_], [one for one in self._made.values() if one.round <= round_]
         return Result(
             unit="round",

@@ -22,7 +22,9 @@ import numpy as np
 from manip_il.algorithms.learning_config import LONGER, LearningConfig
 from manip_il.algorithms.run import Result, Run, Watch
 from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
+from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
@@ -198,7 +200,8 @@ class LearningRun(Run):
         if not here.is_dir():
             with new_folder(here) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
-        found = self._validate(policy, here / FILE_NAME, f"iteration {number}", HOLD)
+        job = RolloutJob(self.config.env, PolicyDriver((policy,)), HOLD, label="last")
+        found = self._validate(job, here / FILE_NAME, f"iteration {number}")
         if number == best_validation(validations(self.folder)):
             self._keep_best(policy)
         return found

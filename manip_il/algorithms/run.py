@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
@@ -121,16 +120,11 @@ class Run:
         taken, self._seconds = dict.fromkeys(STAGES, 0.0) | self._seconds, {}
         return {stage: round(seconds, 3) for stage, seconds in taken.items()}
 
-    def _validate(self, policy: Path, path: Path, name: str, hold: int, **options: Any) -> EvalResult:
-        """Evaluate a policy on the validation's seeds and write `path`, unless that has been done.
-
-        name: of the policy, in the file. options: of the job.
-        """
+    def _validate(self, job: RolloutJob, path: Path, name: str) -> EvalResult:
+        """Evaluate a job on the validation's seeds and write `path`, unless that has been done. name: in the file."""
         with self._timed("validate"):
             if path.is_file():
                 return EvalResult.read(path)
-            driver = PolicyDriver((policy,), trust=options.pop("trust", False))
-            job = RolloutJob(self.config.env, driver, hold, label="last", **options)
             suite = job.conditions[0].name if job.conditions else NOMINAL.name
             seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
             found = evaluate(self._engine, job, seeds, name, self._watch.on_episode, suite=suite)
