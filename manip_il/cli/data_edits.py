@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import exists, require_dataset
-from manip_il.cli.options import Given
+from manip_il.cli.options import Given, group
 from manip_il.cli.outputs import check_output, prepare_output
 from manip_il.cli.progress import Progress, say, warn
 from manip_il.cli.record import left_out, require_repo_id
@@ -18,6 +20,7 @@ from manip_il.option import option
 from manip_il.sim.config import CAMERAS, Look
 
 if TYPE_CHECKING:
+    from manip_il.collect.edits import Source, Target
     from manip_il.sim.config import CameraConfig
 
 _RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
@@ -95,6 +98,30 @@ class MergeOptions:
 
 
 @dataclass
+class EditGroup:
+    """Options of every edit of a dataset's states."""
+
+    robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
+    workers: int | None = common.processes_option()
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    @contextmanager
+    def open(self, root: Path, folder: Path, what: str, pieces: int | None = None) -> Generator[tuple[Source, Target]]:
+        """Yield a dataset to read and the new one's folder to write, held, with the progress of its pieces.
+
+        pieces: how many, by default one an episode. Raises `UsageError` for a folder that may not be written to.
+        """
+        from manip_il.collect.edits import Target, open_source
+        from manip_il.collect.workers import default_workers
+
+        _require_target(root, folder, overwrite=self.overwrite)
+        source = open_source(root, self.robot)
+        warn(*source.warnings)
+        with exclusive(folder), Progress(pieces or source.dataset.info.episodes, what) as bar:
+            yield source, Target(folder, self.workers or default_workers(), self.overwrite, bar.advance)
+
+
+@dataclass
 class RenderOptions:
     """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. Nothing is simulated."""
 
@@ -103,27 +130,18 @@ class RenderOptions:
         MISSING, "a dataset of this program, with or without pictures", positional=True, check=require_dataset
     )
     target: Path = option(MISSING, "folder of the new dataset", positional=True)
-    robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
     cameras: list[str] = option(lambda: list(CAMERAS), common.CAMERAS_HELP)
     image: Given = common.image_given()
     look: Look = field(default_factory=Look)
-    workers: int | None = common.processes_option()
-    overwrite: bool = option(False, "replace an existing dataset")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        _require_target(self.source, self.target, overwrite=self.overwrite)
+    edit: EditGroup = group(EditGroup(), prefix="")
 
     def run(self) -> None:
         """Render every episode; TARGET appears when all are there."""
-        from manip_il.collect.edits import Target, open_source, render_dataset
-        from manip_il.collect.workers import default_workers
+        from manip_il.collect.edits import render_dataset
 
         cameras = _cameras(self.cameras, self.image, self.look)
-        source, workers = open_source(self.source, self.robot), self.workers or default_workers()
-        warn(*source.warnings)
-        with exclusive(self.target), Progress(source.dataset.info.episodes, f"render {self.source}") as bar:
-            info = render_dataset(source, cameras, Target(self.target, workers, self.overwrite, bar.advance))
+        with self.edit.open(self.source, self.target, f"render {self.source}") as (source, target):
+            info = render_dataset(source, cameras, target)
         say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames: {_pictures_text(cameras)}")
         say(f"dataset: {self.target}")
 
@@ -141,33 +159,20 @@ class RelabelOptions:
         MISSING, "a dataset of this program, with or without pictures", positional=True, check=require_dataset
     )
     target: Path | None = option(None, "folder of the new dataset; by default DATASET_relabelled", positional=True)
-    robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
-    workers: int | None = common.processes_option()
-    overwrite: bool = option(False, "replace an existing dataset")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        _require_target(self.dataset, self._target(), overwrite=self.overwrite)
+    edit: EditGroup = group(EditGroup(), prefix="")
 
     def run(self) -> None:
         """Label every state; TARGET appears when all are labelled."""
-        from manip_il.collect.edits import Target, open_source, relabel_dataset
-        from manip_il.collect.workers import default_workers
+        from manip_il.collect.edits import relabel_dataset
 
-        target, workers = self._target(), self.workers or default_workers()
-        source = open_source(self.dataset, self.robot)
-        warn(*source.warnings)
-        with exclusive(target), Progress(source.dataset.info.episodes, f"relabel {self.dataset}") as bar:
-            changed = relabel_dataset(source, Target(target, workers, self.overwrite, bar.advance))
+        root = self.target or self.dataset.with_name(f"{self.dataset.absolute().name}_relabelled")
+        with self.edit.open(self.dataset, root, f"relabel {self.dataset}") as (source, target):
+            changed = relabel_dataset(source, target)
         info, what = source.dataset.info, "all labels are as they were"
         if changed:
             what = f"{changed:,} labels differ: by more than 1 % of a joint's longest step, in phase, or in being sound"
         say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {what}")
-        say(f"dataset: {target}")
-
-    def _target(self) -> Path:
-        folder = self.dataset.absolute()
-        return self.target or self.dataset.with_name(f"{folder.name}_relabelled")
+        say(f"dataset: {root}")
 
 
 @dataclass
@@ -186,32 +191,24 @@ class RedrawOptions:
     branch_steps: int = option(
         1, "control steps that the expert drives on from every scene, for act and diffusion", at_least=1
     )
-    robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
     cameras: list[str] = option(lambda: list(CAMERAS), common.CAMERAS_HELP)
     image: Given = common.image_given(small=True)
     vary: list[str] = option(list, "how every frame looks: view, clutter, object (its colour), or YAMLs of ranges")
     seed: int = common.seed_option()
-    workers: int | None = common.processes_option()
-    overwrite: bool = option(False, "replace an existing dataset")
-
-    def check(self) -> None:
-        """Refuse what paths and values show to be wrong."""
-        _require_target(self._dataset(), self.target, overwrite=self.overwrite)
+    edit: EditGroup = group(EditGroup(), prefix="")
 
     def run(self) -> None:
         """Draw all frames; TARGET appears when they are there."""
-        from manip_il.collect.edits import Target, open_source, redraw_dataset
+        from manip_il.collect.edits import redraw_dataset
         from manip_il.collect.scenes import CHUNK, Scenes
-        from manip_il.collect.workers import default_workers
         from manip_il.evaluation.suites import varied
 
         cameras = _cameras(self.cameras, self.image, small=True)
-        source = open_source(self._dataset(), self.robot)
-        warn(*source.warnings)
-        conditions, workers = varied(self.vary, source.env, sees=True), self.workers or default_workers()
-        scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
-        with exclusive(self.target), Progress(self.frames, f"redraw {self._dataset()}") as bar:
-            target = Target(self.target, workers, self.overwrite, lambda: bar.advance(CHUNK))
+        root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
+        require_dataset(root)
+        with self.edit.open(root, self.target, f"redraw {root}", -(-self.frames // CHUNK)) as (source, target):
+            conditions = varied(self.vary, source.env, sees=True)
+            scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)
         left, drawn = self.frames - info.episodes, f"{info.episodes:,} scenes, {info.frames:,} frames"
         say(f"redrew {drawn}: {_pictures_text(cameras)}; {left:,} left out, without a sound label")
@@ -219,11 +216,6 @@ class RedrawOptions:
         policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
         train = f"manip-il train --dataset.root={self.target} --policy.type={policy}"
         say(f"next: {train} --output_dir=runs/{self.target.name}")
-
-    def _dataset(self) -> Path:
-        root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
-        require_dataset(root)
-        return root
 
 
 def _cameras(names: list[str], sizes: Given, look: Look | None = None, *, small: bool = False) -> CameraConfig:

@@ -63,8 +63,7 @@ def warn(*lines: str) -> None:
 class Progress:
     """Progress of `total` steps, None if the number is unknown; use as a context manager.
 
-    A bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing of no steps, or if progress is
-    switched off.
+    A bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing if progress is switched off.
     """
 
     def __init__(self, total: int | None, description: str):
@@ -81,7 +80,7 @@ class Progress:
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
-        else:
+        elif self._done:
             self._print()
 
     def advance(self, n: int = 1, **fields: object) -> None:
@@ -97,7 +96,7 @@ class Progress:
         self._printed = time.monotonic()
         count = self._done if self._total is None else f"{self._done}/{self._total}"
         rate = f"{self._done / max(self._printed - self._start, 1e-9):.3g}/s"
-        if self._total != 0 and not _quiet:
+        if not _quiet:
             details = ", ".join(filter(None, [rate, self._details()]))
             print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
 
