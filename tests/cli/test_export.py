@@ -89,23 +89,6 @@ def test_a_policy_of_another_tool_is_exported_with_a_warning(here, capsys):
     assert "theirs was written by another tool: the file does not say robot, task" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("mistake", ["no_run", "act", "there"])
-def test_mistakes_are_found_before_anything_heavy_is_imported(here, mistake):
-    write_run(here / "run", "act" if mistake == "act" else "mlp")
-    if mistake == "there":
-        (here / "policy.onnx").write_bytes(b"")
-    script = (
-        "import sys; from manip_il.cli.main import main; code = main(sys.argv[1:])\n"
-        "assert not {'torch', 'lerobot', 'mujoco', 'onnx', 'onnxruntime'} & sys.modules.keys(), sys.modules.keys()\n"
-        "sys.exit(code)"
-    )
-    words = ["export", "nothing" if mistake == "no_run" else "run"]
-    done = subprocess.run([sys.executable, "-c", script, *words], cwd=here, capture_output=True, text=True, timeout=300)
-    assert done.returncode in (1, 2), done.stderr
-    assert done.stderr.startswith("manip-il: error: ")
-    assert done.stderr.count("\n") == 1
-
-
 @pytest.mark.parametrize(("kind", "observation"), [("mlp", "state"), ("cnn", "images"), ("cnn", "both")])
 @pytest.mark.slow
 def test_the_docs_snippet_runs_it_without_this_package(here, kind, observation):

@@ -69,20 +69,6 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
     assert not (target / "thesis.txt").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["push", "empty", "URL"], "is neither a LeRobot dataset (meta/info.json) nor a run or policy"),
-        (["push", "RUN", "hf://datasets/me/x"], "hf://datasets/me/x is for a dataset; datasets go to"),
-    ],
-)
-def test_wrong_words(words, says, run, url, here, error):
-    (here / "empty").mkdir()
-    names = {"RUN": str(run), "URL": url}
-    assert main([names.get(word, word) for word in words]) == 2
-    assert says in error()
-
-
 def test_no_password_and_no_token_is_said_again(url, run, capsys):
     for words in (
         ["pull", url, "got", "hf_HunterTwoHunterTwo"],

@@ -130,18 +130,3 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
     fit = options.config().fit if command == "dagger" else options._fit_config()  # pyright: ignore[reportAttributeAccessIssue]
     assert Path(LeRobotFit(fit).policy.pretrained_path).resolve() == find_policy(run).resolve()
-
-
-@pytest.mark.parametrize("value", ["missing", "null", "5"])
-@pytest.mark.parametrize("command", ["train", "dagger"])
-@pytest.mark.usefixtures("here")
-def test_a_path_without_a_policy_is_one_line(command, value, error):
-    given = [f"--dataset.root={SAMPLE}"] if command == "train" else []
-    assert main([command, *given, f"--policy.path={value}"]) == 2
-    assert "policy" in error()
-
-
-def test_eval_on_another_task_than_the_policys_says_which(tmp_path, policy, error):
-    words = [f"--policy.path={policy}", "--task.type=lift", "--eval.n_episodes=1", f"--output_dir={tmp_path / 'e'}"]
-    assert main(["eval", *words]) == 1
-    assert "task differs: the policy has reach, the environment has lift" in error()
