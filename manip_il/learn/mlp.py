@@ -153,7 +153,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """Return the mean loss."""
+        """Return the mean loss over the rows of a batch, whose columns are (B, n), and no metrics."""
         losses = self._row_losses(self.network_inputs(batch), batch)
         return losses.sum() / len(losses), {}
 
