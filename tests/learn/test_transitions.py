@@ -102,5 +102,5 @@ def test_no_demonstration_is_one_line(read):
 def test_a_number_that_is_not_finite_is_named(read):
     action = make_table()["action"]
     action[7, 1] = np.nan
-    with pytest.raises(NotFiniteError, match="column action, row 7, episode 0"):
+    with pytest.raises(NotFiniteError, match="column action, row 7"):
         read(action=action)
