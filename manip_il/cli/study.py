@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -142,24 +143,21 @@ def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
 
     Without those that change nothing there, such as another object if there is none. Raises `ManipError` for names.
     """
-    return {
-        name: {test: trial for test, one in plan.experts.items() if (trial := expert_trial(env, one)) is not None}
-        for name, env in plan.envs.items()
-    }
+    found: dict[str, dict[str, Trial]] = {name: {} for name in plan.envs}
+    for name, env in plan.envs.items():
+        for test, one in plan.experts.items():
+            with contextlib.suppress(NoEffect):
+                found[name][test] = _expert_trial(replace(env, robot=one.robot or env.robot), one)
+    return found
 
 
-def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
-    """Return a test in an arm's environment; None if it would change nothing."""
+def _expert_trial(env: EnvConfig, test: ExpertTest) -> Trial:
     from manip_il.evaluation.runner import Trial
     from manip_il.evaluation.suites import varied
     from manip_il.robots.table import get_robot  # here, as help needs no simulator
 
-    env = replace(env, robot=test.robot or env.robot)
     get_robot(env.robot)
     seeds = stream_seeds("test", test.n_episodes, 0)
-    try:
-        if test.vary:
-            return Trial(env, seeds, "+".join(test.vary), varied(test.vary, env, sees=False))
-        return Trial.of(env, seeds, test.suite)
-    except NoEffect:
-        return None
+    if test.vary:
+        return Trial(env, seeds, "+".join(test.vary), varied(test.vary, env, sees=False))
+    return Trial.of(env, seeds, test.suite)
