@@ -77,7 +77,7 @@ MISTAKES = {
     f"{TRAIN} --policy.type=act --observation=eyes": "one of state, images, both",
     f"{TRAIN} --action_space=ee_detla": "did you mean 'ee_delta'?",
     f"{TRAIN} --steps=0": "steps is 0; expected at least 1",
-    f"{TRAIN} --lr=-1": "lr is -1.0; expected more than 0",
+    f"{TRAIN} --lr=-1": "lr is -1.0; expected at least",
     f"{TRAIN} --wandb.projekt=a --policy.type=act": "did you mean 'project'",
     f"{TRAIN} --policy.loss=mes": "did you mean 'mse'?",
     "eval": "--policy.path=DIR",
