@@ -39,7 +39,8 @@ demo: setup  ## the whole story, small: runs/demo/report.html
 
 demo-eyes: setup  ## a policy from pictures, from nothing, in half an hour: runs/eyes/test/report.html
 	$(BIN)/manip-il dagger --config_path=configs/panda_dagger.yaml --output_dir=runs/eyes_state
-	$(BIN)/manip-il train --dataset.root=runs/eyes_state/dataset --policy.type=cnn --redraw=30000 --output_dir=runs/eyes
+	$(BIN)/manip-il data redraw runs/eyes_state runs/eyes_scenes --frames=30000
+	$(BIN)/manip-il train --dataset.root=runs/eyes_scenes --policy.type=cnn --output_dir=runs/eyes
 	$(BIN)/manip-il eval --policy.path=runs/eyes --eval.n_episodes=200 --eval.films=6 --output_dir=runs/eyes/test
 
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.

@@ -21,6 +21,7 @@ from manip_il.collect.expert import Expert
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
+from manip_il.tasks.envs import make_env
 
 STEPS = 30  # of an episode: the expert's way from the start to the goal
 
@@ -33,7 +34,7 @@ def main() -> int:
     print(describe_machine())
     print("robot  labelled control steps/s  raw physics, control steps/s  share of raw (median, all repeats)")
     for robot in ROBOTS:
-        env = ManipEnv(robot, "pick_place")
+        env = make_env(robot, "pick_place")
         expert = Expert(env.scene)
         measured = np.array([repeat(env, expert, episodes) for _ in range(repeats)])
         ours, raw = np.median(measured, axis=0)

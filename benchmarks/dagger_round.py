@@ -26,7 +26,7 @@ from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.envs import scene_of
 
 LIMIT, SHARE = 30.0, 0.15  # [s], of it
 
@@ -68,7 +68,7 @@ def report(result: Result, folder: Path, config: RunConfig, workers: int) -> Non
 
 def seconds_to_label(root: Path, config: RunConfig) -> float:
     """What one core takes to ask the expert in every state of a dataset."""
-    expert = Expert(build_scene(config.env.robot, config.env.task))
+    expert = Expert(scene_of(config.env.robot, config.env.task))
     states = [State.from_vector(vector) for vector in Dataset.open(root).columns(("sim_state",))["sim_state"]]
     expert.label(states[0])
     started = time.perf_counter()

@@ -36,7 +36,8 @@ from manip_il.learn.train import fit
 from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.envs import make_env
 
 BIN = Path(sys.executable).parent
 TASK = "pick_place"
@@ -68,7 +69,7 @@ def main() -> int:
 def fitted(robot: str, folder: Path, quick: bool) -> Path:
     """A policy cloned from 200 demonstrations: it solves nearly all, as what one evaluates in earnest does."""
     count, steps = (10, 50) if quick else (200, 4_000)
-    config = EnvConfig(robot, TASK)
+    config = make_config(robot, TASK)
     demos = RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count))
     write_dataset(demos, folder / "dataset", env_spec(config), repo_id="local/demos", fingerprint={})
     return fit(Sources((Dataset.open(folder / "dataset"),)), FitConfig(steps=steps), folder)
@@ -76,7 +77,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:
     """Control steps a second on one core, ours and raw, over the same episodes."""
-    job = RolloutJob(EnvConfig(robot, TASK), PolicyDriver((policy,)), label="last")
+    job = RolloutJob(make_config(robot, TASK), PolicyDriver((policy,)), label="last")
     started = time.perf_counter()
     found = list(job.run(stream_seeds("test", episodes)))
     ours = time.perf_counter() - started
@@ -85,7 +86,7 @@ def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, flo
 
 
 def replay_seconds(config: EnvConfig, episode: Episode) -> float:
-    env = ManipEnv(config=config)
+    env = make_env(config=config)
     env.start(episode.seed)
     scene, data = env.scene, env.data
     controls = np.zeros((len(episode), scene.model.nu))

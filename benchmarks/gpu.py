@@ -22,6 +22,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from manip_il.tasks.envs import make_env
+
 os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
 
 import numpy as np
@@ -40,7 +42,6 @@ from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import ManipEnv
 
 BATCH, EPISODES_AT_ONCE = 32, 25
 SECONDS, REPEATS = 5.0, 3  # of a measurement
@@ -141,9 +142,9 @@ def milliseconds_an_action(path: Path, device: str, size: int) -> float:
 
 
 def pictures_per_s(size: int) -> float:
-    env, config = ManipEnv(), CameraConfig(("front", "wrist"), size, size)
+    env, config = make_env(), CameraConfig(("front", "wrist"), size, size)
     env.start(0)
-    draw = partial(render.pictures, env.config.robot, env.config.task, env.data, config)
+    draw = partial(render.pictures, env.scene, env.data, config)
     return len(config.names) * per_s(draw)
 
 

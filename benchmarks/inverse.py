@@ -28,8 +28,8 @@ from manip_il.cli.main import main as manip_il
 from manip_il.rewards.methods import METHODS, learn
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.env import ManipEnv
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import env_of
 from manip_il.tasks.furnishing import layout_of, space_of
 from manip_il.tasks.grid import Grid
 from manip_il.tasks.pick_place import OBJECT
@@ -67,7 +67,7 @@ def main() -> int:
 
 def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int]]:
     """Yield the grids of layouts that no demonstration has, and the nodes at which their objects are."""
-    env = ManipEnv.of(EnvConfig(robot, CARRY))
+    env = env_of(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
         grid = Grid(layout_of(env.world, OBJECT), space_of(env.world.scene.robot))

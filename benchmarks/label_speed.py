@@ -25,8 +25,8 @@ from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
 from manip_il.robots import ROBOTS, ik
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import EnvConfig
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import TASKS
 
 
@@ -45,7 +45,7 @@ def compare_with_solver(episodes: int, repeats: int) -> None:
     """Print the median label of pick_place beside the median of its bare quadratic program."""
     print("robot  states  label [us]  bare QP [us]  label / QP")
     for robot in ROBOTS:
-        expert = Expert(build_scene(robot, "pick_place"))
+        expert = Expert(scene_of(robot, "pick_place"))
         states = visited(robot, episodes)
         problems = [problem_of(expert, state) for state in states]
         pairs = [(s, p) for s, p in zip(states, problems, strict=True) if p is not None]
@@ -62,7 +62,7 @@ def compare_tasks(episodes: int, repeats: int) -> None:
     """Print the median label of every task beside pick_place's."""
     print("robot  task          states  label [us]  of pick_place's")
     robot = next(iter(ROBOTS))  # not every task fits within every arm's reach
-    experts = {task: Expert(build_scene(robot, task)) for task in TASKS}
+    experts = {task: Expert(scene_of(robot, task)) for task in TASKS}
     states = {task: visited(robot, episodes, task)[:: episodes // 2] for task in TASKS}
     times = {task: np.empty((repeats, len(states[task]))) for task in TASKS}
     for repeat in range(repeats):
@@ -79,7 +79,7 @@ def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
     states: list[State] = []
     horizon = {"expert": TASKS[task].limits.horizon, "random": 50}
     for driver in ("expert", "random"):
-        job = RolloutJob(EnvConfig(robot, task, horizon=horizon[driver]), driver_of(driver), hold=5)
+        job = RolloutJob(make_config(robot, task, horizon=horizon[driver]), driver_of(driver), hold=5)
         for episode in job.run(stream_seeds("certificate", episodes)):
             states += [State.from_vector(row) for row in episode.columns["sim_state"]]
     return states

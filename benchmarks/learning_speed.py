@@ -26,8 +26,8 @@ from manip_il.algorithms.vector_env import RobotEpisode
 from manip_il.cli.main import main as command
 from manip_il.collect.workers import Engine
 from manip_il.learn.discriminators import GailDiscriminator
-from manip_il.sim.config import EnvConfig
 from manip_il.sim.env import ManipEnv
+from manip_il.tasks.config import make_config
 
 SCENES = (("panda", "reach"), ("panda", "pick_place"), ("fetch", "pick_place"))
 NEVER = 10**9
@@ -73,7 +73,7 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
     words = [f"--robot.type={robot}", f"--task.type={task}", "--dataset.num_episodes=5", f"--dataset.root={demos}"]
     if command(["record", *words, "--workers=1", "--quiet"]):
         raise SystemExit("recording failed")
-    env = EnvConfig(robot, task)
+    env = make_config(robot, task)
     config = LearningConfig(method="gail", env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
     run = LearningRun(config, folder, Engine())
     recorded = [Recorded(env, None) for _ in range(config.episodes)]

@@ -29,6 +29,7 @@ from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import camera_id
+from manip_il.tasks.envs import make_env
 
 SIZES = ((128, 128), (240, 320), (480, 640))
 STATES = 6  # of one expert episode, evenly apart
@@ -47,7 +48,7 @@ def main() -> int:
     print("medians and ranges of all repeats")
     print("robot  camera  height x width  look     ours [ms]  as it is / ours       ours / no robot")
     for robot in ROBOTS:
-        env = ManipEnv(robot)
+        env = make_env(robot)
         states = visited(env)
         for height, width in sizes:
             for camera in CAMERAS:
@@ -82,8 +83,7 @@ def repeat(env: ManipEnv, states: list[State], config: CameraConfig) -> tuple[fl
     """Seconds a picture: ours, the physics model as it is, the scene without its robot."""
     import mujoco  # after ours, which chooses its OpenGL
 
-    robot, task = env.config.robot, env.config.task
-    ours = seconds(env, states, lambda: render.pictures(robot, task, env.data, config))
+    ours = seconds(env, states, lambda: render.pictures(env.scene, env.data, config))
     render.close()
     no_robot = copy.copy(env.scene.model)
     no_robot.geom_group[no_robot.geom_type == mujoco.mjtGeom.mjGEOM_MESH] = HIDDEN

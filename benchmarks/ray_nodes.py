@@ -29,7 +29,7 @@ from manip_il.collect.ray_pool import run_there
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 NODES = 4
 TURNS = 5
@@ -40,7 +40,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
     quick = parser.parse_args().quick
     episodes, turns = (4, 1) if quick else (60, TURNS)
-    job = RolloutJob(EnvConfig("panda"))
+    job = RolloutJob(make_config("panda"))
     print(describe_machine())
     print(f"over the wire: {wire(job):,.0f} bytes an episode of panda pick_place")
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})

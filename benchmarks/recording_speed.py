@@ -25,6 +25,9 @@ from pathlib import Path
 import numpy as np
 from _machine import describe_machine
 
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env
+
 os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks, here and in the limit
 
 from manip_il.collect.job import RolloutJob
@@ -36,7 +39,6 @@ from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.render import pictures
 
 HOLD = 10  # as `manip-il record`
@@ -51,15 +53,15 @@ def main() -> int:
     print(describe_machine())
     print("recording                       control steps/s  limit, control steps/s  share (median, all repeats)")
     for robot in ROBOTS:
-        job = RolloutJob(EnvConfig(robot), hold=HOLD)
+        job = RolloutJob(make_config(robot), hold=HOLD)
         report(f"{robot}, one core", *one_core(job, 2 if quick else 40, 2 if quick else 5))
     for robot in ROBOTS:
-        job = RolloutJob(EnvConfig(robot), hold=HOLD, cameras=CAMERAS)
+        job = RolloutJob(make_config(robot), hold=HOLD, cameras=CAMERAS)
         report(f"{robot}, two cameras, one core", *one_core(job, 1 if quick else 8, 2 if quick else 3))
         report(f"{robot}, encoding beside it", *beside(job, 1 if quick else 8, 2 if quick else 3))
     print("two workers against one       recording              bare physics: the machine's limit")
     for robot in ROBOTS:
-        job = RolloutJob(EnvConfig(robot), hold=HOLD)
+        job = RolloutJob(make_config(robot), hold=HOLD)
         two_workers(robot, job, 8 if quick else 80, 2 if quick else 3)
     return 0
 
@@ -139,18 +141,18 @@ def replay_seconds(job: RolloutJob, seed: int, actions: np.ndarray) -> float:
     """Seconds of the bare physics of an episode, and of its pictures where the job makes some."""
     import mujoco  # after ours, which chooses its OpenGL
 
-    env = ManipEnv(config=job.env)
+    env = make_env(config=job.env)
     env.start(seed)
     model, data, physics_steps = env.scene.model, env.data, job.env.physics_steps
     space, gripper = env.scene.actions, env.scene.gripper
     commands = [np.append(action[space.arm], gripper.command(action[space.gripper])) for action in actions]
     controls, order = np.array(commands), [*env.scene.arm_ctrl, *gripper.ctrl]
     if job.cameras is not None:
-        pictures(job.env.robot, job.env.task, data, job.cameras)  # the first makes the context
+        pictures(env.scene, data, job.cameras)  # the first makes the context
     started = time.perf_counter()
     for control in controls:
         if job.cameras is not None:
-            pictures(job.env.robot, job.env.task, data, job.cameras)
+            pictures(env.scene, data, job.cameras)
         data.ctrl[order] = control
         mujoco.mj_step(model, data, physics_steps)
     return time.perf_counter() - started
@@ -183,7 +185,7 @@ def bare_seconds(job: RolloutJob) -> float:
     """Seconds of some bare physics."""
     import mujoco
 
-    env = ManipEnv(config=job.env)
+    env = make_env(config=job.env)
     env.start(0)
     started = time.perf_counter()
     mujoco.mj_step(env.scene.model, env.data, BARE_STEPS)

@@ -36,9 +36,8 @@ from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.mdp import Episode
 from manip_il.rewards.methods import METHODS, learn
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.furnishing import EDGE, observed_layout
 from manip_il.tasks.layout import THINGS, path_features
 from manip_il.tasks.pick_place import OBJECT
@@ -134,7 +133,7 @@ def drive(job: RolloutJob, truth: Reward, layouts: int, *, many: bool) -> list[D
 
 def _seeds(env: EnvConfig, layouts: int, *, many: bool) -> Iterator[int]:
     """Seeds of layouts that no demonstration has, told apart by what the first observation shows."""
-    simulated, left = ManipEnv.of(env), layouts
+    simulated, left = env_of(env), layouts
     names = env_spec(env).environment_state_names
     here = [names.index(f"{name}.here") for name in (*THINGS, EDGE)]
     for seed in stream_seeds("held_out", _SPARE * layouts, 0):
@@ -151,14 +150,14 @@ def _cost(env: EnvConfig, episode: Episode, names: Sequence[str], truth: Reward)
     if not episode.success:
         return np.inf
     seen = episode.columns[ENVIRONMENT_STATE].astype(np.float64)
-    scene = build_scene(env.robot, CARRY, env.object)
+    scene = scene_of(env.robot, CARRY, env.object)
     layout = observed_layout(scene, OBJECT, dict(zip(names, seen[0].tolist(), strict=True)))
     at = seen[:, [names.index(f"{OBJECT}.{axis}") for axis in "xyz"]]
     return float(path_features(layout, carried_stretch(at, np.array(layout.goal))) @ np.array(truth.weights))
 
 
 def _env(robot: str, reward: Reward) -> EnvConfig:
-    return EnvConfig(robot, CARRY, reward=reward.numbers)
+    return make_config(robot, CARRY, reward=reward.numbers)
 
 
 def _print(arm: str, name: str, found: list[Driven], own: list[Driven]) -> bool:

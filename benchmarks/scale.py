@@ -32,7 +32,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import episode_path, list_seeds
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 FIRST = 100
 TURNS = 3
@@ -137,7 +137,7 @@ def others(root: Path) -> dict[str, Run]:
 def against_empty(folder: Path, episodes: int) -> list[float]:
     """Time of new episodes beside all journals that are there, over that of the same ones in an empty folder."""
     journals, empty = folder / "demos.journals", folder / "empty"
-    job, after = RolloutJob(EnvConfig("fetch", "reach"), hold=10), max(list_seeds(journals)) + 1
+    job, after = RolloutJob(make_config("fetch", "reach"), hold=10), max(list_seeds(journals)) + 1
     ratios: list[float] = []
     empty.mkdir()
     collect_seconds(job, range(after, after + 5), empty)  # the first loads and compiles

@@ -14,8 +14,8 @@ from PIL import Image
 from manip_il.collect.expert import Expert
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import FILM
-from manip_il.sim.env import ManipEnv
 from manip_il.sim.render import Picture
+from manip_il.tasks.envs import make_env
 from manip_il.tasks.table import TASKS
 
 FRAMES = 6  # of a strip
@@ -27,7 +27,7 @@ DOCS = Path(__file__).parent.parent / "docs" / "tasks"
 
 def film(task: str) -> list[Picture]:
     """Return a picture of every other control step of one solved episode, and of its end."""
-    env = ManipEnv("panda", task, look=FILM, render_mode="rgb_array")
+    env = make_env("panda", task, look=FILM, render_mode="rgb_array")
     expert, pictures = Expert(env.scene), []
     env.start(stream_seeds("training", 4)[EPISODES.get(task, 3)])
     for step in range(env.config.horizon):

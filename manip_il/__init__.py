@@ -11,13 +11,13 @@ from importlib import import_module
 from typing import Any
 
 from manip_il.sim.gl import choose_backend
-from manip_il.sim.register import register_envs
+from manip_il.tasks.register import register_envs
 
 choose_backend()
 register_envs()
 
 __version__ = "0.1.0"
-_HOMES = {"Expert": "collect.expert", "make_env": "sim.env", "record": "collect.record"}
+_HOMES = {"Expert": "collect.expert", "make_env": "tasks.envs", "record": "collect.record"}
 
 
 def __getattr__(name: str) -> Any:

@@ -9,10 +9,10 @@ import numpy as np
 from manip_il.collect.expert import Expert
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import build_scene
+from manip_il.sim.task import phases
 from manip_il.sim.world import World
+from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.table import TASKS
-from manip_il.tasks.task import phases
 
 SEED = 5_000_000
 SIZES = Condition("sizes", size=(0.03, 0.07), mass=(0.05, 0.3))
@@ -25,14 +25,14 @@ def sizes_of(task: str) -> list[Condition]:
 
 
 def started(robot: str = "panda", task: str = "pick_place", seed: int = SEED, **settings: Any) -> ManipEnv:
-    env = ManipEnv(robot, task, **settings)
+    env = make_env(robot, task, **settings)
     env.start(seed)
     return env
 
 
 def world_at_home(robot: str, task: str = "pick_place") -> World:
     """The arm as its YAML says it starts; call `update` after a change."""
-    world = World(build_scene(robot, task))
+    world = World(scene_of(robot, task))
     world.data.qpos[world.scene.arm_q] = world.scene.robot.home
     world.update()
     return world

@@ -26,15 +26,17 @@ from manip_il.evaluation.suites import varied
 from manip_il.mdp import Episode, State
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.env import ManipEnv
 from manip_il.sim.shape import KINDS as SHAPES
 from manip_il.sim.variation import WORLD_SIZE, drawn_in
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.envs import env_of, make_env
 
 from .damage import digests
 from .tables import SCENES, every_scene
 
 KINDS = ("object", "view", "dynamics")
-REACH = EnvConfig("panda", "reach", horizon=6, success_steps=1)
+REACH = make_config("panda", "reach", horizon=6, success_steps=1)
 NOT_IN_THE_WORLDS_NUMBERS = {"mass", "friction"}  # but in the objects'
 
 
@@ -56,13 +58,13 @@ def path_of(env: ManipEnv, state: State, steps: int) -> list[bytes]:
 
 @pytest.mark.parametrize(("robot", "task", "shape"), [*((*scene, "") for scene in SCENES), ("panda", "lift", "any")])
 def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, task: str, shape: str):
-    config = EnvConfig(robot, task, object=shape)
-    env = ManipEnv.of(config, None, [condition(config, *KINDS)])
+    config = make_config(robot, task, object=shape)
+    env = env_of(config, None, [condition(config, *KINDS)])
     env.start(7)
     for _ in range(3):
         env.advance(Expert(env.scene).label(env.get_state()).action)
     vector = env.get_state().to_vector()
-    plain = ManipEnv.of(config)
+    plain = env_of(config)
     plain.start(8)
     restored = State.from_vector(vector)
     assert path_of(plain, restored, 4) == path_of(env, State.from_vector(vector), 4)
@@ -75,15 +77,15 @@ def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, tas
 @pytest.mark.gl
 @pytest.mark.parametrize("shape", ["", "any"])
 def test_pictures_of_restored_states_are_those_of_their_own_world(shape: str):
-    config, cameras = EnvConfig("panda", "pick_place", object=shape), CameraConfig(("front", "wrist"), 32, 32)
-    env = ManipEnv.of(config, cameras, [condition(config, *KINDS)])
+    config, cameras = make_config("panda", "pick_place", object=shape), CameraConfig(("front", "wrist"), 32, 32)
+    env = env_of(config, cameras, [condition(config, *KINDS)])
     for seed in (1, 2):
         env.start(seed)
         seen, state = env.observe().images, env.get_state().to_vector()
         made = render_states(config, cameras, state[None])
         for name, picture in seen.items():
             np.testing.assert_array_equal(made[schema.IMAGES + name][0], picture)
-    plain = ManipEnv.of(config, cameras)
+    plain = env_of(config, cameras)
     plain.set_state(State.from_vector(state))
     np.testing.assert_array_equal(plain.observe().images["front"], seen["front"])
     plain.start(2)
@@ -92,7 +94,7 @@ def test_pictures_of_restored_states_are_those_of_their_own_world(shape: str):
 
 @every_scene
 def test_a_state_from_before_worlds_had_numbers_of_their_own_is_read_as_it_was(robot: str, task: str):
-    env = ManipEnv(robot, task)
+    env = make_env(robot, task)
     env.start(3)
     state = env.get_state()
     older = State(state.physics, state.variation[:-WORLD_SIZE], state.step)
@@ -108,7 +110,7 @@ WORLDS = [("", KINDS), ("", ("object",)), ("", ("dynamics",)), ("", ("view", "dy
 @pytest.fixture(scope="module", params=[*WORLDS, ("any", ())], ids=str)
 def world(request) -> tuple[EnvConfig, list[Episode]]:
     shape, kinds = request.param
-    config = EnvConfig("panda", "pick_place", horizon=12, object=shape)
+    config = make_config("panda", "pick_place", horizon=12, object=shape)
     job = RolloutJob(config, conditions=(condition(config, *kinds),) if kinds else ())
     return config, list(job.run([3, 4]))
 
@@ -122,7 +124,7 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
         path = Journal(tmp_path / "varied.journals", spec, fingerprint).write(episode)
         assert read_journal(path)[1].drawn == episode.drawn != {}
         state = State.from_vector(episode.columns[schema.SIM_STATE][0])
-        found = drawn_in(state.variation, ManipEnv.of(config).scene.nominal)
+        found = drawn_in(state.variation, env_of(config).scene.nominal)
         assert found.keys() == episode.drawn.keys() - NOT_IN_THE_WORLDS_NUMBERS
     build(tmp_path / "varied.journals", tmp_path / "varied")
     assert Dataset.open(tmp_path / "varied").episodes.drawn == {

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig, MLPOptions
 from manip_il.option import check_bounds, option
-from manip_il.sim.config import CameraConfig, EnvConfig
-from manip_il.stock.table import ROBOT as STOCK
+from manip_il.sim.config import CameraConfig
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
     from manip_il.collect.query import Query
@@ -126,7 +127,7 @@ class RunConfig:
     with redraw, no pictures are recorded. conditions: what the worlds of all episodes differ in, validation's too.
     """
 
-    env: EnvConfig = field(default_factory=EnvConfig)
+    env: EnvConfig = field(default_factory=make_config)
     method: str = "dagger"
     demonstrations: int = option(50, "successful expert episodes to begin with (round 0)", at_least=1)
     rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more", grows=True)

@@ -25,7 +25,7 @@ from manip_il.evaluation.tables import Table
 from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
 from manip_il.rewards.paths import Demonstration, cheapest_path, plan
 from manip_il.robots.table import get_robot
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.furnishing import EDGE, observed_layout, space_of
 from manip_il.tasks.grid import Grid
 from manip_il.tasks.ladder import AT_GOAL
@@ -66,7 +66,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     spec = dataset.spec
     places = _places(root, spec)
     table = dataset.columns([schema.ENVIRONMENT_STATE, schema.SUCCESS, EPISODE_INDEX])
-    scene = build_scene(get_robot(spec.robot).name, CARRY, spec.object)
+    scene = scene_of(get_robot(spec.robot).name, CARRY, spec.object)
     index = table[EPISODE_INDEX].ravel()
     found = list[Carried]()
     for episode in np.unique(index).tolist():

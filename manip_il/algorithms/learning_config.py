@@ -8,7 +8,7 @@ from pathlib import Path
 from manip_il.errors import UsageError
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import check_bounds, option
-from manip_il.sim.config import EnvConfig
+from manip_il.tasks.config import EnvConfig
 
 LONGER = 1.5  # times the longest demonstration, by default
 

@@ -20,7 +20,7 @@ from manip_il.errors import MismatchError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.network import MLPNetwork
 from manip_il.mdp import Observation
-from manip_il.sim.config import EnvConfig
+from manip_il.tasks.config import EnvConfig
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, given
@@ -11,8 +12,10 @@ from manip_il.errors import UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 from manip_il.robots import ROBOTS
-from manip_il.sim.config import CameraConfig, EnvConfig, Look
-from manip_il.stock import table as stock
+from manip_il.sim.config import CameraConfig, Look
+from manip_il.tasks import NAMES
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.stock import table as stock
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
@@ -28,6 +31,7 @@ _TRUST = (
 _CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras view, clutter, late"
 CAMERAS_HELP = "any of front, side, wrist"
 OWN_ROBOT_HELP = "its YAML, if the dataset's robot does not ship"
+OWN_TASK_HELP = "its Python file, if the dataset's task does not ship"
 
 
 def env_given(*, of_policy: bool = False) -> Any:
@@ -52,7 +56,7 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
     robot, task = values.get("robot", EnvConfig.robot), values.get("task")
     if robot != stock.ROBOT and task in stock.STOCK:
         raise UsageError(f"--task.type={task} is with --robot.type={robot}; expected {stock.ROBOT}")
-    return EnvConfig(**values)
+    return make_config(**values)
 
 
 def camera_config(
@@ -130,6 +134,12 @@ def _require_suite(suite: str) -> None:
     require_suite(suite)
 
 
-def own_robot(robot: str, suffix: str = "") -> str:
-    """Return the option, after a space, that a next command needs for a robot that does not ship; else nothing."""
-    return "" if robot in (*ROBOTS, stock.ROBOT) else f" --robot.type={robot}{suffix}"
+def own_names(robot: str, task: str) -> str:
+    """Return the options, after a space, that a next command needs for a robot and a task that do not ship."""
+    given = [] if robot in (*ROBOTS, stock.ROBOT) else [f"--robot.type={_file(robot, '.yaml')}"]
+    given += [] if task in (*NAMES, *stock.STOCK, "unknown") else [f"--task.type={_file(task, '.py')}"]
+    return "".join(f" {one}" for one in given)
+
+
+def _file(name: str, suffix: str) -> str:
+    return name if Path(name).suffix else name + suffix

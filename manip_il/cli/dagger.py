@@ -94,7 +94,8 @@ class DaggerOptions:
         if (folder / "dataset").is_dir():
             say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}")
-        test = f"manip-il eval --policy.path={best}{common.own_robot(config.env.robot)} --output_dir={folder}/test"
+        own = common.own_names(config.env.robot, config.env.task)
+        test = f"manip-il eval --policy.path={best}{own} --output_dir={folder}/test"
         remedies = f"more --steps ({config.fit.total_steps:,} a round now), or more --demonstrations"
         say_policy(best, best_result(results).validation, test, remedies)
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from manip_il.cli.inputs import open_driver
 from manip_il.cli.progress import say, warn
-from manip_il.collect.environments import env_fingerprint
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.data.atomic import write_file
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.film import Shot, run_states
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import EpisodeResult, EvalResult, merge_results
@@ -22,17 +22,20 @@ from manip_il.learn.policy_files import policy_sha256
 NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing is loaded
 
 
-def replay(file: Path, seed: int, policy: Path | None, video: Path | None, *, trust: bool) -> None:
+def replay(
+    file: Path, seed: int, policy: Path | None, video: Path | None, *, task: str | None = None, trust: bool = False
+) -> None:
     """Run one episode of an evaluation again: the same policy, seed and conditions. Prints what was drawn.
 
-    policy: its current path, by default the one in the evaluation. video: an MP4 to write. Raises `ManipError` if the
-    outcome is not that of the evaluation, `UsageError` for a seed or a policy that is not there.
+    policy: its current path, by default the one in the evaluation. video: an MP4 to write. task: its file, if it does
+    not ship. Raises `ManipError` if the outcome is not that of the evaluation, `UsageError` for a seed or a policy that
+    is not there.
     """
     result = EvalResult.read(file)
     by_seed = {episode.seed: episode for episode in result.episodes}
     if seed not in by_seed:
         raise UsageError(f"--replay is {seed}; {file} has the seeds {min(by_seed)} to {max(by_seed)}")
-    before, job = by_seed[seed], _job(result, file, policy, trust)
+    before, job = by_seed[seed], _job(result, file, policy, task, trust)
     episode = run_states(job, seed)
     say(*_lines(before))
     if video is not None:
@@ -56,10 +59,12 @@ def merge(files: Sequence[Path]) -> EvalResult:
     return merged
 
 
-def _job(result: EvalResult, file: Path, policy: Path | None, trust: bool) -> RolloutJob:
+def _job(result: EvalResult, file: Path, policy: Path | None, task: str | None, trust: bool) -> RolloutJob:
     """Return the rollouts of the evaluation; warn if policy or program have changed since."""
     settings = result.settings
-    env = settings.env(result.robot, result.task)
+    env = settings.env(result.robot, task or result.task)
+    if (given := env_spec(env).task) != result.task:
+        raise MismatchError("task", str(file), result.task, "--task.type", given)
     is_policy = result.policy not in NO_FILES or bool(result.policy_sha256) or policy is not None
     path = find_policy(policy or Path(result.policy)) if is_policy else None
     _, driver, cameras = open_driver(path, result.policy, env, trust=trust)

@@ -16,7 +16,7 @@ from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
 from manip_il.errors import UsageError
 from manip_il.option import option
-from manip_il.stock.table import ROBOT
+from manip_il.tasks.stock.table import ROBOT
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
@@ -115,7 +115,8 @@ class EvalOptions:
         if self.health:
             say(f"healthy: {health.healthy()}")
         elif self.replay is not None:
-            eval_files.replay(self.evaluation[0], self.replay, self.policy.path, self.video, trust=self.trust)
+            policy, task = self.policy.path, self.env.get("task")
+            eval_files.replay(self.evaluation[0], self.replay, policy, self.video, task=task, trust=self.trust)
         elif self.evaluation:
             merged = eval_files.merge(self.evaluation)
             with self.output.open(self) as folder:
@@ -149,7 +150,8 @@ class EvalOptions:
             self._report(result, folder, *films)
         failed = [episode.seed for episode in result.episodes if not episode.success]
         seed = (failed or [result.episodes[0].seed])[0]
-        say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed} --video=replay.mp4")
+        own = common.own_names("panda", job.env.task)  # a robot's file is in eval.json; a task's is given each time
+        say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed}{own} --video=replay.mp4")
 
     def _job(self) -> RolloutJob:
         from manip_il.collect.job import RolloutJob

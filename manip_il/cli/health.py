@@ -7,6 +7,7 @@ import tempfile
 from importlib import metadata
 
 from manip_il.errors import ManipError, RenderError
+from manip_il.tasks.envs import make_env
 
 _FEWEST_COLOURS = 16  # in a picture of a scene; the emptiest ones hold hundreds
 
@@ -28,12 +29,11 @@ def healthy() -> str:
 def _draw() -> str:
     """Draw the default scene; return vendor and renderer. Raises `RenderError` for a blank picture, too."""
     from manip_il.sim.config import CAMERAS, CameraConfig
-    from manip_il.sim.env import ManipEnv
     from manip_il.sim.render import pictures
 
-    world, cameras = ManipEnv(), CameraConfig(CAMERAS)
+    world, cameras = make_env(), CameraConfig(CAMERAS)
     world.start(0)
-    drawn = pictures(world.config.robot, world.config.task, world.data, cameras, shape=world.config.object)
+    drawn = pictures(world.scene, world.data, cameras)
     from OpenGL import GL  # mujoco has chosen its platform
 
     words = (GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER))

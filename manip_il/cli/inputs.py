@@ -11,6 +11,7 @@ from manip_il.cli.options import Given, Open
 from manip_il.cli.progress import warn
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.policy_folder import find_policy, hub_hint
+from manip_il.tasks.config import make_config
 
 if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.algorithms.config import RunConfig
@@ -19,7 +20,8 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.evaluation.runner import Trial
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.learn.reward import LearnedReward
-    from manip_il.sim.config import CameraConfig, EnvConfig
+    from manip_il.sim.config import CameraConfig
+    from manip_il.tasks.config import EnvConfig
 
 REWARD = "a reward of manip-il reward fit"
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
@@ -111,11 +113,10 @@ def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str
     from manip_il.collect.environments import env_fingerprint, env_spec, is_known
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.schema import check_same_spec
-    from manip_il.sim.env import EnvConfig
 
     if not is_known(spec.robot, spec.task):
         return []
-    env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
+    env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
     check_same_spec(name, spec, "this program", env_spec(env))
     # Tolerance and horizon change nothing that is learnt, and a dataset does not hold them; nor are pictures compared.
     here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}

@@ -17,12 +17,13 @@ from manip_il.errors import UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import option
+from manip_il.tasks.config import make_config
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.checkpoint import Origin
-    from manip_il.sim.config import EnvConfig
+    from manip_il.tasks.config import EnvConfig
 
 METRICS_FILE = "metrics.jsonl"
 _INIT = "a cloned mlp, or its run, to begin with"
@@ -63,7 +64,7 @@ class Learning:
                 self._learn(config, folder, engine, stages)
             self._report(config, folder)
         say(f"report: {folder / REPORT_FILE}")
-        robot = common.own_robot(config.env.robot)
+        robot = common.own_names(config.env.robot, config.env.task)
         test = f"manip-il eval --policy.path={folder}{robot} --output_dir={folder}/test"
         remedies = f"more --steps ({config.steps:,} now){'' if config.start else ', a clone to begin with (--init)'}"
         found = validations(folder)
@@ -187,8 +188,7 @@ class PpoOptions(Learning):
 def _known_env(name: str, spec: RobotTaskSpec | Origin) -> EnvConfig:
     """Return the environment that a dataset or reward is for; `UsageError` if it cannot be simulated here."""
     from manip_il.collect.environments import is_known
-    from manip_il.sim.config import EnvConfig
 
     if not is_known(spec.robot, spec.task):
         raise UsageError(f"{name} is for {spec.robot} {spec.task}, which cannot be simulated here")
-    return EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
+    return make_config(spec.robot, spec.task, spec.fps, object=spec.object)

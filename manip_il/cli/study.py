@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.arm import Member
     from manip_il.evaluation.runner import Trial
     from manip_il.evaluation.study import Study as Tested
-    from manip_il.sim.config import EnvConfig
+    from manip_il.tasks.config import EnvConfig
 
 
 class Study:

@@ -25,7 +25,7 @@ from manip_il.seeding import MAX_SEED
 
 if TYPE_CHECKING:
     from manip_il.evaluation.rounds import History, Rule
-    from manip_il.sim.config import EnvConfig
+    from manip_il.tasks.config import EnvConfig
 
 STUDY_FILE = "study.yaml"
 ROUND_0 = "round_000"
@@ -212,7 +212,9 @@ def learning_env(arm: str, env: EnvConfig) -> EnvConfig:
 
     A dataset and a checkpoint tell robot, task and rate, nothing else.
     """
-    known = type(env)(env.robot, env.task, env.control_hz, object=env.object)
+    from manip_il.tasks.config import make_config  # here, as help needs no simulator
+
+    known = make_config(env.robot, env.task, env.control_hz, object=env.object)
     if env != known:
         raise MismatchError("environment", f"arm {arm!r}", env, "a run that begins with it", known)
     return env

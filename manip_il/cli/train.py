@@ -98,8 +98,8 @@ class TrainOptions:
         with self.output.open(self) if _is_first_process() else contextlib.nullcontext():
             path = self._fit(config, sources, weights)
         if _is_first_process():
-            robot = common.own_robot(sources.spec.robot, suffix=".yaml")
-            say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path}{robot} --output_dir={folder}/eval")
+            own = common.own_names(sources.spec.robot, sources.spec.task)
+            say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path}{own} --output_dir={folder}/eval")
 
     def _fit_config(self) -> FitConfig:
         from manip_il.seeding import stream_base

@@ -14,13 +14,15 @@ from manip_il.cli.options import Given
 from manip_il.cli.progress import say, warn
 from manip_il.errors import RenderError, UsageError
 from manip_il.option import option
-from manip_il.stock.table import ROBOT as STOCK
+from manip_il.tasks.envs import env_of
+from manip_il.tasks.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
     from manip_il.evaluation.watch import RerunLog, WindowScreen
-    from manip_il.sim.config import CameraConfig, EnvConfig
+    from manip_il.sim.config import CameraConfig
     from manip_il.sim.env import ManipEnv
+    from manip_il.tasks.config import EnvConfig
 
 HOLD = 10  # control steps that an episode goes on for after success
 IN_A_FILE = 3  # episodes, if nobody says how many
@@ -75,12 +77,11 @@ class ViewOptions:
         from manip_il.collect.job import observed_cameras, run_steps
         from manip_il.evaluation.watch import outcome
         from manip_il.seeding import BLOCK, stream_seeds
-        from manip_il.sim.env import ManipEnv
 
         job = self._job()
         seeds = stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)
-        env = ManipEnv.of(job.env, observed_cameras(job), job.conditions)
-        with contextlib.closing(self._screen(env)) as screen:
+        env = env_of(job.env, observed_cameras(job), job.conditions)
+        with contextlib.closing(self._screen(env, job.env)) as screen:
             for step in run_steps(job, [env], seeds, screen.act):
                 if not screen.add(step):
                     break
@@ -112,22 +113,21 @@ class ViewOptions:
     def _cameras(self, env: EnvConfig) -> CameraConfig | None:
         """Return cameras for people, with shadows if nobody waits; None, with a warning, without OpenGL."""
         from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
-        from manip_il.sim.env import ManipEnv
 
         cameras = CameraConfig(CAMERAS, *SIZE, FILM if self.output else Look())
         try:
-            ManipEnv.of(env, cameras).reset(seed=0)
+            env_of(env, cameras).reset(seed=0)
         except RenderError as error:
             warn(f"shown without pictures: {error}")
             return None
         return cameras
 
-    def _screen(self, env: ManipEnv) -> WindowScreen | RerunLog:
+    def _screen(self, env: ManipEnv, config: EnvConfig) -> WindowScreen | RerunLog:
         from manip_il.evaluation.watch import RerunLog, WindowScreen
 
         if self._in_a_window:
             return WindowScreen(env, sliders=self.policy.type == "sliders")
-        log = RerunLog(env.config, self.output)
+        log = RerunLog(config, self.output)
         if log.address:
             ports = " ".join(f"-L {port}:localhost:{port}" for port in log.ports)
             say(f"open: {log.address}")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, is_known, make_expert
+from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, make_expert
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
@@ -29,12 +29,13 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
-from manip_il.robots.table import get_robot
-from manip_il.sim.config import CameraConfig, EnvConfig
-from manip_il.sim.env import ManipEnv
+from manip_il.robots.table import get_robot, is_robot
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.variation import OLDER
-from manip_il.stock.table import ROBOT as STOCK
-from manip_il.tasks.table import TASKS
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.envs import env_of
+from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.tasks.table import get_task, is_task
 
 Columns = dict[str, NDArray[Any]]
 _DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that what is made of a state depends on
@@ -53,8 +54,8 @@ class Source:
     warnings: tuple[str, ...] = ()
 
 
-def open_source(root: Path, robot: str | None = None) -> Source:
-    """Read what is needed to restore a dataset's states; robot: the YAML of its robot, if that does not ship.
+def open_source(root: Path, robot: str | None = None, task: str | None = None) -> Source:
+    """Read what is needed to restore a dataset's states; robot, task: their files, if they do not ship.
 
     Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
     a robot and task that are known here, `MismatchError` if its states do not fit them.
@@ -65,14 +66,18 @@ def open_source(root: Path, robot: str | None = None) -> Source:
         raise ManipError(
             f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
-    if not (spec.task in TASKS if robot else is_known(spec.robot, spec.task)):
+    lacking = [] if robot or is_robot(spec.robot) or spec.robot == STOCK else [f"--robot.type=PATH/{spec.robot}.yaml"]
+    lacking += [] if task or is_task(spec.task) or spec.robot == STOCK else [f"--task.type=PATH/{spec.task}.py"]
+    if lacking:
         raise ManipError(
             f"{root} is for the robot {spec.robot!r} and the task {spec.task!r}, which are not both known here, so its "
-            f"states cannot be restored; a robot of your own is given by --robot.type=PATH/{spec.robot}.yaml"
+            f"states cannot be restored; give {' and '.join(lacking)}"
         )
-    if robot and (given := get_robot(robot).name) != spec.robot:
-        raise MismatchError("robot", str(root), spec.robot, "--robot.type", given)
-    env = EnvConfig(robot or spec.robot, spec.task, object=spec.object)
+    given = get_robot(robot).name if robot else spec.robot, get_task(task).name if task else spec.task
+    for what, ours, theirs in zip(("robot", "task"), given, (spec.robot, spec.task), strict=True):
+        if ours != theirs:
+            raise MismatchError(what, str(root), theirs, f"--{what}.type", ours)
+    env = make_config(robot or spec.robot, task or spec.task, object=spec.object)
     size = env_spec(env).sim_state_size
     lacks = size - spec.sim_state_size  # of states from before they held all draws
     if lacks not in (0, *OLDER):
@@ -204,7 +209,7 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
     """
     if env.robot == STOCK:
         raise RenderError(f"{env.robot} has no cameras here")
-    view, spec, rows = ManipEnv.of(env, cameras), env_spec(env, cameras), len(states)
+    view, spec, rows = env_of(env, cameras), env_spec(env, cameras), len(states)
     found: Columns = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
     found |= {key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys}
     for row, state in enumerate(states):

@@ -16,27 +16,30 @@ from manip_il.collect.rollout import Environment, Labeller
 from manip_il.data.fingerprint import canonical_json, environment_fingerprint
 from manip_il.data.schema import OPENINGS, SERVOS, RobotTaskSpec
 from manip_il.mdp import STATE_EXTRAS
-from manip_il.robots import ROBOTS
 from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.table import is_robot
 from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CameraConfig, EnvConfig
-from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.sim.config import CameraConfig
+from manip_il.sim.env import environment_state_names
+from manip_il.sim.points import point_names
 from manip_il.sim.props import VERSION as DRAWN
-from manip_il.sim.scene import SCENES_KEPT, Scene, build_scene
-from manip_il.stock.simulation import StockSimulation, require_no_cameras
-from manip_il.stock.table import ACTION_MEANING, PHASES, STATE_NAMES, get_stock
-from manip_il.stock.table import ROBOT as STOCK
-from manip_il.stock.table import STOCK as STOCK_TASKS
-from manip_il.tasks.points import point_names
-from manip_il.tasks.table import TASKS, get_task
-from manip_il.tasks.task import phases
+from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.task import phases
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.envs import config_scene, env_of
+from manip_il.tasks.own import source_hash
+from manip_il.tasks.stock.simulation import StockSimulation, require_no_cameras
+from manip_il.tasks.stock.table import ACTION_MEANING, PHASES, STATE_NAMES, get_stock
+from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.tasks.stock.table import STOCK as STOCK_TASKS
+from manip_il.tasks.table import TASKS, get_task, is_task
 
 _STOCK = StockSimulation()
 
 
 def is_known(robot: str, task: str) -> bool:
     """Return whether there is an environment of this robot and task here."""
-    return task in STOCK_TASKS if robot == STOCK else robot in ROBOTS and task in TASKS
+    return task in STOCK_TASKS if robot == STOCK else is_robot(robot) and is_task(task)
 
 
 def make_env(
@@ -45,13 +48,13 @@ def make_env(
     """Make an environment. Raises `UsageError` for cameras or conditions that it does not have."""
     if config.robot == STOCK:
         return _STOCK.make(config, cameras, conditions)
-    return ManipEnv.of(config, cameras, conditions)
+    return env_of(config, cameras, conditions)
 
 
 @lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
     """Make the expert of an environment, or return the one that was made."""
-    return _STOCK.expert(config) if config.robot == STOCK else Expert(_scene(config))
+    return _STOCK.expert(config) if config.robot == STOCK else Expert(config_scene(config))
 
 
 @cache
@@ -71,11 +74,11 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
             action_meaning=ACTION_MEANING,
             phases=PHASES,
         )
-    scene, task = _scene(config), get_task(config.task, config.object)
+    scene, task = config_scene(config), get_task(config.task, config.object)
     servos = scene.robot.lerobot
     return RobotTaskSpec(
         robot=scene.robot.name,
-        task=config.task,
+        task=task.name,
         fps=config.control_hz,
         joint_names=scene.robot.joint_names,
         environment_state_names=environment_state_names(scene),
@@ -93,7 +96,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
 
 def env_actions(config: EnvConfig) -> ActionSpace:
     """Return names, bounds and scale of an environment's actions, (n,)."""
-    return _STOCK.actions(config) if config.robot == STOCK else _scene(config).actions
+    return _STOCK.actions(config) if config.robot == STOCK else config_scene(config).actions
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
@@ -106,13 +109,12 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
 
 @cache
 def _fingerprint(config: EnvConfig) -> dict[str, str]:
-    settings = asdict(config)
+    settings, own = asdict(config), dict[str, str]()
+    if config.robot != STOCK and config.task not in TASKS:
+        task = get_task(config.task, config.object, config.reward)
+        settings["task"], own = task.name, {"task_sha256": source_hash(task)}
     for name in ("object", "reward"):  # as before there were any
         if not settings[name]:
             del settings[name]
-    model = _STOCK.model_bytes(config) if config.robot == STOCK else _scene(config).model_bytes()
-    return environment_fingerprint(model, settings)
-
-
-def _scene(config: EnvConfig) -> Scene:
-    return build_scene(config.robot, config.task, config.object, config.physics_step)
+    model = _STOCK.model_bytes(config) if config.robot == STOCK else config_scene(config).model_bytes()
+    return environment_fingerprint(model, settings) | own

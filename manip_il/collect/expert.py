@@ -7,12 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.errors import ManipError
 from manip_il.mdp import Label, State
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.rotations import angle_between, rotation_matrix
+from manip_il.sim.task import Refusing, Target, objects_in
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Refusing, Target, objects_in
 
 F64 = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ class Expert:
     def __init__(self, scene: Scene):
         self._scene, self._world = scene, World(scene)
         self._ik = ArmIK(scene.robot)
-        self._task, rungs = get_task(scene.task), get_task(scene.task).rungs
+        self._task, rungs = scene.task, scene.task.rungs
         self._refusing = self._task if isinstance(self._task, Refusing) else None
         self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
@@ -53,8 +53,12 @@ class Expert:
             return self._hold(q, world.opening, reason)
         for phase, rung in self._rungs:
             if rung.holds(world):
-                return self._towards(q, world.opening, rung.target(world), phase)
-        raise AssertionError(f"{self._scene.name}: the last rung of a ladder always holds")
+                target = rung.target(world)
+                if not isinstance(target, Target):
+                    kind = type(target).__name__
+                    raise ManipError(f"{self._scene.name}: rung {rung.name!r} returned a {kind}; expected a Target")
+                return self._towards(q, world.opening, target, phase)
+        raise ManipError(f"{self._scene.name}: no rung holds; expected the last to hold everywhere")
 
     def _unsound(self, world: World) -> str:
         hand = world.ee.position.tolist()

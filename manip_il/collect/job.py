@@ -18,9 +18,10 @@ from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.policy_files import policy_cameras
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
-from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.shape import draws_shape
-from manip_il.stock.table import ROBOT as STOCK
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:  # torch only where a learner drives
     from manip_il.learn.policy import LearnedPolicy

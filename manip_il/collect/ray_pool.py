@@ -1,7 +1,7 @@
 """Workers of a Ray cluster: of `RAY_ADDRESS` or one that runs on this machine, else a local one that is started.
 
-They send what is to be stored to this process, and get the policies' files from it, once a node: nodes need no shared
-disk.
+They send what is to be stored to this process, and get files from it, once a node: the policies', and that of a task of
+one's own. Nodes need no shared disk.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
+from manip_il.tasks.own import SUFFIX
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
 try:
@@ -65,7 +66,8 @@ class RayPool:
     def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
         """Send some seeds of a job to the cluster."""
         files = [self._ship(folder) for folder in job.driver.policies]
-        reference = _run_remote.remote(__version__, job, seeds, journal, *files)
+        task = self._ship(Path(job.env.task)) if job.env.task.endswith(SUFFIX) else None
+        reference = _run_remote.remote(__version__, job, seeds, journal, task, *files)
         future: Future[list[Episode]] = Future()
         self._running[future] = reference
         reference.future().add_done_callback(lambda answer: self._settle(future, answer, journal))
@@ -98,19 +100,27 @@ class RayPool:
 
     def _ship(self, folder: Path) -> Any:
         if folder not in self._folders:
-            files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*.*"))}
-            self._folders[folder] = ray.put(files)
+            root, paths = (folder.parent, [folder]) if folder.is_file() else (folder, sorted(folder.rglob("*.*")))
+            self._folders[folder] = ray.put({path.relative_to(root).as_posix(): path.read_bytes() for path in paths})
         return self._folders[folder]
 
 
 def run_there(
-    version: str, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None, *policies: Files
+    version: str,
+    job: RolloutJob,
+    seeds: tuple[int, ...],
+    journal: Journal | None,
+    task: Files | None,
+    *policies: Files,
 ) -> bytes:
     """Return the packed answer of a task on a node. Raises `ManipError` if it has another version of the program."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
     with tempfile.TemporaryDirectory(prefix="manip_il-") as folder:
+        if task is not None:
+            file = _unpack(task, Path(folder) / "task") / Path(job.env.task).name
+            job = replace(job, env=replace(job.env, task=str(file)))
         if isinstance(job.driver, PolicyDriver):
             here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
             job = replace(job, driver=replace(job.driver, policies=here))

@@ -18,8 +18,8 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State, Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import World
-from manip_il.stock.environment import StockEnv
-from manip_il.stock.expert import StockExpert
+from manip_il.tasks.stock.environment import StockEnv
+from manip_il.tasks.stock.expert import StockExpert
 
 F64 = NDArray[np.float64]
 Environment = ManipEnv | StockEnv

@@ -19,12 +19,12 @@ from manip_il.collect.query import branch
 from manip_il.mdp import Actor, Label, State, Transition
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import PICTURED, Condition, draw
-from manip_il.sim.config import CameraConfig, EnvConfig
-from manip_il.sim.env import ManipEnv
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.variation import completed, with_drawn
 from manip_il.sim.world import World
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import TakesReward
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.envs import env_of
+from manip_il.tasks.reward import TakesReward
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time
@@ -72,8 +72,8 @@ class SceneDrawer:
     """Draws, labels and pictures scenes of one environment."""
 
     def __init__(self, config: EnvConfig, scenes: Scenes):
-        self._env = ManipEnv.of(config, scenes.cameras)
-        self._task = get_task(config.task, config.object, config.reward)
+        self._env = env_of(config, scenes.cameras)
+        self._task, self._shape = self._env.scene.task, config.object
         self._expert = make_expert(config)
         self._scenes = scenes
 
@@ -99,7 +99,7 @@ class SceneDrawer:
 
     def _with_look(self, state: State, number: int) -> State:
         """The state with the looks of a frame; as it was where nothing is drawn."""
-        conditions, shape = self._scenes.conditions, self._env.config.object
+        conditions, shape = self._scenes.conditions, self._shape
         drawn = draw(conditions, number, shape).values if conditions else {}
         variation = completed(state.variation, self._env.scene.nominal)
         return replace(state, variation=with_drawn(variation, {key: drawn[key] for key in PICTURED if key in drawn}))

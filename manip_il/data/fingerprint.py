@@ -22,6 +22,7 @@ _LONGEST = 80  # characters of a value in a warning
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 _MEANING = {
     "model_sha256": "compiled MuJoCo model",
+    "task_sha256": "the task's file",
     "config_sha256": "config",
     "cameras_sha256": "pictures' size and look",
 }

@@ -18,7 +18,7 @@ from manip_il.evaluation.policy_folder import EXPECTED, find_policy, require_sou
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.runner import Progress, Trial
-from manip_il.sim.config import EnvConfig
+from manip_il.tasks.config import EnvConfig, make_config
 
 CONFIG_FILE = "config.yaml"
 _SEED_FOLDER = re.compile(r"seed_(\d+)")
@@ -198,7 +198,7 @@ def _run_options(folder: Path) -> tuple[int, EnvConfig] | None:
     own = {"robot": groups["robot"].get("type"), "task": groups["task"].get("type"), **groups["env"]}
     own |= {name: groups["task"].get(name) for name in ("object", "reward")}
     known = {field.name for field in fields(EnvConfig)}
-    env = EnvConfig(**{name: value for name, value in own.items() if name in known and value is not None})
+    env = make_config(**{name: value for name, value in own.items() if name in known and value is not None})
     return checks.whole(f"{path}: seed", tree.get("seed", 0), 0, checks.LARGEST_SEED), env
 
 

@@ -25,8 +25,8 @@ from manip_il.evaluation.certificate import Case, Certificate, Group, Row
 from manip_il.mdp import F32, F64, Actor, Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
-from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import Perturbation, kinds_for
+from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.table import get_task
 
 _LOG = logging.getLogger(__name__)

@@ -22,8 +22,8 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.rounds import format_seconds
 from manip_il.evaluation.tables import BASELINE, DAGGER, NO_CONDITION, PolicyRow, Table, evaluation_table, policy_table
 from manip_il.sim.conditions import words
+from manip_il.sim.task import NO_PHASE
 from manip_il.tasks.table import TASKS
-from manip_il.tasks.task import NO_PHASE
 
 NOT_RECORDED = "not recorded"
 _NO_PHASE = "not even the expert can continue: an object is off the table, or something is out of reach"

@@ -14,10 +14,11 @@ from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import CONFIDENCE, PairedComparison, Proportion, compare_paired
 from manip_il.sim.conditions import NOMINAL, Condition
+from manip_il.tasks.config import make_config
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.sim.config import EnvConfig
+    from manip_il.tasks.config import EnvConfig
 
 FILE_NAME = "eval.json"
 Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
@@ -102,10 +103,8 @@ class EvalSettings:
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """Return the environment that was evaluated in."""
-        from manip_il.sim.config import EnvConfig
-
-        limits = self.tolerance, self.success_steps, self.horizon
-        return EnvConfig(robot, task, self.control_hz, *limits, self.object, self.reward)
+        limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.horizon}
+        return make_config(robot, task, self.control_hz, **limits, object=self.object, reward=self.reward)
 
     @property
     def disturbance(self) -> str:

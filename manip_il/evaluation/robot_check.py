@@ -20,13 +20,14 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.sim.config import EnvConfig
 from manip_il.sim.home import Pair, meeting_at
-from manip_il.sim.scene import PREFIX, build_scene
+from manip_il.sim.scene import PREFIX
+from manip_il.sim.task import Task
 from manip_il.sim.variation import widest_grasp
 from manip_il.sim.world import World
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Task
 
 FILE_NAME = "check.json"
 SOLVES = 0.9  # share of clean episodes that the expert solves, of a task that can be done
@@ -114,14 +115,14 @@ def check_robot(
 
     on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
     """
-    robot, scene = get_robot(name), build_scene(name, "reach")
+    robot, scene = get_robot(name), scene_of(name, "reach")
     overlaps = tuple(meeting_at(robot, scene.model, PREFIX, np.asarray(robot.home)))
     checked = [check_starts(name, task) for task in tasks]
     for place, task in enumerate(checked):
         if episodes and task.has_starts:
             found: list[EvalResult] = []
             for condition in (NOMINAL, read_condition("random_actions")):
-                job = RolloutJob(EnvConfig(name, task.name), hold=HOLD, label="last", conditions=(condition,))
+                job = RolloutJob(make_config(name, task.name), hold=HOLD, label="last", conditions=(condition,))
                 seeds = stream_seeds("validation", episodes)
                 found.append(evaluate(engine, job, seeds, "expert", on_result, suite=condition.name))
             checked[place] = replace(task, clean=found[0], noisy=found[1])
@@ -133,7 +134,7 @@ def check_starts(name: str, task: str) -> TaskCheck:
     the_task = get_task(task)
     checked = TaskCheck(task, widths(the_task))
     try:
-        scene = build_scene(name, task)
+        scene = scene_of(name, task)
     except UsageError as error:
         return replace(checked, refused=str(error))
     world = World(scene)

@@ -18,9 +18,9 @@ from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, Table
 from manip_il.robots.reach import reach_of
 from manip_il.sim.config import FILM
 from manip_il.sim.render import Line, Overview, marked_picture
-from manip_il.sim.scene import build_scene
+from manip_il.sim.task import TakesShape
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import TakesShape
 
 _ROOM = 0.13  # of a map around the workspace [m]
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
@@ -159,7 +159,7 @@ def looks(name: str) -> tuple[Still, ...]:
 
     Raises `RenderError` without off-screen OpenGL.
     """
-    scene = build_scene(name, "reach")
+    scene = scene_of(name, "reach")
     data, gripper = mujoco.MjData(scene.model), scene.gripper
     data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
     data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
@@ -180,6 +180,5 @@ def looks(name: str) -> tuple[Still, ...]:
     )
     data.mocap_pos[:, 2] = -9.0  # goals: out of sight
     return tuple(
-        Still(words, encode_jpeg(marked_picture(name, "reach", data, view, (480, 640), FILM, lines)))
-        for view, words in views
+        Still(words, encode_jpeg(marked_picture(scene, data, view, (480, 640), FILM, lines))) for view, words in views
     )

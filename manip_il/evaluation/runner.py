@@ -27,13 +27,14 @@ from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.policy_files import policy_cameras, policy_sha256
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.scene import SCENES_KEPT, build_scene
+from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.task import objects_in
 from manip_il.sim.world import World
-from manip_il.stock.simulation import StockSimulation
-from manip_il.stock.table import ROBOT as STOCK
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.envs import scene_of
+from manip_il.tasks.stock.simulation import StockSimulation
+from manip_il.tasks.stock.table import ROBOT as STOCK
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import objects_in
 
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
@@ -98,7 +99,7 @@ def evaluate(
     return EvalResult(
         policy=name,
         robot=job.env.robot,
-        task=job.env.task,
+        task=env_spec(job.env).task,
         fingerprint=env_fingerprint(job.env, observed_cameras(job)),
         episodes=tuple(results[seed] for seed in seeds if seed in results),
         settings=EvalSettings.of(job, suite),
@@ -151,7 +152,7 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
 
 
 def _positions(env: EnvConfig, state: State) -> dict[str, F64]:
-    world, task = _world(build_scene(env.robot, env.task, env.object)), get_task(env.task, env.object)
+    world, task = _world(scene_of(env.robot, env.task, env.object)), get_task(env.task, env.object)
     world.restore(state.physics, state.variation)
     found = {"hand": world.ee.position, "goal": task.destination(world)}
     for name in world.scene.objects:

@@ -10,9 +10,9 @@ import manip_il
 from manip_il import checks
 from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
 from manip_il.sim.conditions import Condition, merged
-from manip_il.sim.config import EnvConfig
 from manip_il.sim.shape import draws_shape
-from manip_il.stock.table import STOCK
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.stock.table import STOCK
 
 SUITES = {
     "nominal": ("nominal",),
@@ -75,8 +75,8 @@ def read_condition(name: str) -> Condition:
 
 def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
     """What of a condition has an effect in an environment, see `Condition.for_world`."""
+    from manip_il.sim.task import TakesShape
     from manip_il.tasks.table import get_task  # here, as a wrong name needs no simulator
-    from manip_il.tasks.task import TakesShape
 
     if env.task in STOCK:  # which takes none
         return None if condition.ranges else condition

@@ -15,11 +15,13 @@ from manip_il.collect.rollout import Act, Turn
 from manip_il.data import schema
 from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Transition
-from manip_il.sim.config import CAMERAS, EnvConfig
+from manip_il.sim.config import CAMERAS
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import build_scene
+from manip_il.sim.task import phases
 from manip_il.sim.window import Clock, Window
 from manip_il.sim.world import World
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
 
 F64 = NDArray[np.float64]
@@ -36,8 +38,8 @@ class WindowScreen:
     """
 
     def __init__(self, env: ManipEnv, *, sliders: bool = False):
-        self._env, self._phases = env, env_spec(env.config).phases
-        self._window = Window(env.config, sliders=sliders)
+        self._env, self._phases = env, phases(env.scene.task)
+        self._window = Window(env.scene, env.config.control_hz, sliders=sliders)
         self.act = slider_actions(self._window, env) if sliders else None
 
     def add(self, step: Transition) -> bool:
@@ -93,7 +95,7 @@ class RerunLog:
             output.open("wb").close()  # first: rerun adds lines of its own if it cannot write
         self._rerun: Any = rerun
         self._env, self._task, self._spec = env, get_task(env.task, env.object), env_spec(env)
-        self._world = World(build_scene(env.robot, env.task, env.object, env.physics_step))
+        self._world = World(scene_of(env.robot, env.task, env.object, env.physics_step))
         self._clock = None if output else Clock(env.control_hz)
         self._frames, self._phase = 0, ""
         self._stream: Any = rerun.RecordingStream("manip_il")

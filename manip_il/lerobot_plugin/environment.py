@@ -19,10 +19,12 @@ from manip_il.learn.names import OBSERVATIONS
 from manip_il.option import option_of
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig
-from manip_il.sim.config import EnvConfig as SimConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
-from manip_il.sim.register import ENV_IDS, TASK_IDS
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.config import EnvConfig as SimConfig
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import scene_of
+from manip_il.tasks.register import ENV_IDS, TASK_IDS
+from manip_il.tasks.table import SUFFIX, get_task
 
 TASKS = {env_id.removeprefix("manip_il/"): names for env_id, names in ENV_IDS.items()}
 ANY_ROBOTS = {env_id.removeprefix("manip_il/"): task for env_id, task in TASK_IDS.items()}
@@ -37,7 +39,8 @@ _RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE}
 class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
-    robot: for a task of any robot (`PickPlace-v0`), by name or a YAML; panda if none is named.
+    task: one of gymnasium's names (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with a task of your own.
+    robot: for a task of any robot (`PickPlace-v0`, a file), by name or a YAML; panda if none is named.
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
     with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
     tolerance, success_steps, object, reward: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
@@ -64,7 +67,6 @@ class ManipILEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         for kind, name, known in (
-            ("--env.task", self.task or "", {**TASKS, **ANY_ROBOTS}),
             ("--env.observation", self.observation, OBSERVATIONS),
             ("--env.render_mode", self.render_mode, RENDER_MODES),
         ):
@@ -84,9 +86,7 @@ class ManipILEnv(EnvConfig):
     @override
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `gymnasium.make` beside the id."""
-        cameras = self._cameras()
-        pictures = {"cameras": cameras.names, "image_size": cameras.size} if cameras else {}
-        return {"config": self._simulation(), "film": self.render_mode != "none", **pictures}
+        return {"config": self._simulation(), "film": self.render_mode != "none", "cameras": self._cameras()}
 
     @override
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
@@ -99,14 +99,16 @@ class ManipILEnv(EnvConfig):
         return super().create_envs(n_envs, use_async_envs)
 
     def _simulation(self) -> SimConfig:
-        name = self.task or ""
-        robot, task = TASKS.get(name) or (self.robot or SimConfig.robot, ANY_ROBOTS[name])
+        name, robot = self.task or "", self.robot or SimConfig.robot
+        if name not in TASKS and name not in ANY_ROBOTS and not name.endswith(SUFFIX):
+            raise UnknownName("--env.task", name, {**TASKS, **ANY_ROBOTS})
+        robot, task = TASKS.get(name) or (robot, ANY_ROBOTS.get(name, name))
         if self.robot and self.robot != robot:
             raise UsageError(
                 f"--env.robot is {self.robot!r}, and --env.task={name} is {robot}'s; leave one of them out"
             )
-        limits = self.tolerance, self.success_steps, self.episode_length
-        return SimConfig(robot, task, self.fps, *limits, self.object, self.reward)
+        limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.episode_length}
+        return make_config(robot, task, self.fps, **limits, object=self.object, reward=self.reward)
 
     def _cameras(self) -> CameraConfig | None:
         if self.observation == "state":
@@ -123,7 +125,7 @@ class ManipILEnv(EnvConfig):
             "agent_pos": PolicyFeature(FeatureType.STATE, joints),
         }
         if self.observation != "images":
-            size = len(environment_state_names(build_scene(simulation.robot, simulation.task, simulation.object)))
+            size = len(environment_state_names(scene_of(simulation.robot, simulation.task, simulation.object)))
             features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
         if cameras is not None:
             picture = PolicyFeature(FeatureType.VISUAL, (*cameras.size, 3))
@@ -134,8 +136,9 @@ class ManipILEnv(EnvConfig):
 class FilmedEnv(ManipEnv):
     """The environment; without `film` small black pictures where lerobot-eval films, which it cannot be told not to."""
 
-    def __init__(self, *, film: bool, **kwargs: Any):
-        super().__init__(render_mode="rgb_array", **kwargs)
+    def __init__(self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any):
+        task = get_task(config.task, config.object, config.reward)
+        super().__init__(get_robot(config.robot), task, config, cameras=cameras, render_mode="rgb_array", **gymnasiums)
         self._film = film
 
     @override

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,23 @@ from manip_il.robots.robot import FOUND, JOINT_STEP, UPRIGHT, YAWS, Robot, costs
 from manip_il.robots.servos import LeRobotConfig
 
 SUFFIXES = (".yaml", ".yml")
+GROUP = "manip_il.robots"  # of entry points: a name, and the path of a YAML
 
 
 def get_robot(name: str) -> Robot:
-    """Return a robot by its name in `ROBOTS`, or of a YAML file. Raises `UnknownName`, `UsageError`."""
+    """Return a robot by its name, of a YAML file, or that a package brings. Raises `UnknownName`, `UsageError`."""
     if name in ROBOTS:
         return _read(ROBOTS[name])
     if name.endswith(SUFFIXES):
         return _read(Path(name).absolute())
+    for found in entry_points(group=GROUP, name=name):
+        return _read(Path(found.load()).absolute())
     raise UnknownName("robot", name, ROBOTS, f"known: {', '.join(sorted(ROBOTS))}, or the path of a YAML")
+
+
+def is_robot(name: str) -> bool:
+    """Return whether a robot ships, or an installed package brings it."""
+    return name in ROBOTS or bool(entry_points(group=GROUP, name=name))
 
 
 def read_robot(path: Path) -> Robot:

@@ -5,34 +5,36 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import Any, Self
+from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.errors import ManipError
 from manip_il.mdp import Observation, State
+from manip_il.robots.robot import Robot
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
-from manip_il.sim.config import CameraConfig, EnvConfig, Look
+from manip_il.sim.config import CameraConfig, Episodes, Look
 from manip_il.sim.events import Events
+from manip_il.sim.points import points_in
 from manip_il.sim.posture import draw_posture
 from manip_il.sim.render import Picture, pictures, projections
 from manip_il.sim.scene import SCENES_KEPT, build_scene
+from manip_il.sim.shape import ANY
+from manip_il.sim.task import Task, ask, instruction_in
 from manip_il.sim.variation import drawn_in, with_drawn
 from manip_il.sim.window import Window, check_render_mode
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.points import points_in
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import ask, instruction_in
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 _JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
 
 
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
-    """Joint-position control of one arm on one task.
+    """Joint-position control of one arm on one task. By their names: `manip_il.tasks.envs.make_env`.
 
     Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32. Observation: a dict
     of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
@@ -40,7 +42,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     "solved once" and "solved at the end" can both be read. conditions: what episodes differ in from the nominal world,
     in turn by their seeds; `drawn` has the present one's values. The state is the true one, whatever is observed.
     render_mode: `rgb_array`, or `human`: MuJoCo's viewer in real time, from `reset` and `step`.
-    Raises `UnknownName` for a robot, task, camera or render_mode, `UsageError` for a size of pictures that
+    Raises `UnknownName` for a camera or render_mode, `UsageError` for a size of pictures that
     `CameraConfig` refuses, `RenderError` for `human` without a display.
     """
 
@@ -48,44 +50,31 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def __init__(
         self,
-        robot: str = "panda",
-        task: str = "pick_place",
+        robot: Robot,
+        task: Task,
+        config: Episodes,
         *,
-        config: EnvConfig | None = None,
-        cameras: tuple[str, ...] = (),
-        image_size: tuple[int, int] = (128, 128),
+        cameras: CameraConfig | None = None,
         look: Look | None = None,
         render_mode: str | None = None,
         conditions: Sequence[Condition] = (),
-        **settings: Any,
     ):
-        self.look = look or Look()
-        self._view = CameraConfig(tuple(cameras), *image_size, self.look) if cameras else None
-        self.config = config or EnvConfig(robot, task, **settings)
-        self.world = World(
-            build_scene(self.config.robot, self.config.task, self.config.object, self.config.physics_step)
-        )
-        self._task = get_task(self.config.task, self.config.object, self.config.reward)
+        self.look, self._view = look or (cameras.look if cameras else Look()), cameras
+        self.config = config
+        self.world = World(build_scene(robot, task, config.physics_step))
+        self._task = task
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)
         check_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode, self._window = render_mode, None
-        self.cameras, self.image_size = tuple(cameras), image_size
+        self.cameras = cameras.names if cameras else ()
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
-        self.task = self.config.task
+        self.task = task.name
         limits = np.vstack([self.scene.actions.low, self.scene.actions.high])
         limits = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi)  # a joint that turns freely
         self.action_space = gymnasium.spaces.Box(*limits.astype(np.float32), dtype=np.float32)
         self.observation_space = self._observation_space()
-
-    @classmethod
-    def of(cls, config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> Self:
-        """Make an environment of configurations."""
-        if cameras is None:
-            return cls(config=config, conditions=conditions)
-        size, look = cameras.size, cameras.look
-        return cls(config=config, cameras=cameras.names, image_size=size, look=look, conditions=conditions)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -121,7 +110,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def start(self, seed: int) -> None:
         """Start the episode of a seed: `reset` without making an observation."""
         world, scene, rng = self.world, self.scene, rng_for(seed, "reset")
-        self._begin(seed, draw(self._conditions, seed, self.config.object))
+        self._begin(seed, draw(self._conditions, seed, ANY if self.scene.draws_shape else ""))
         world.vary(with_drawn(scene.nominal, self.drawn.values))
         data, robot = world.data, scene.robot
         mujoco.mj_resetData(world.model, data)
@@ -242,7 +231,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """Return a picture from the front camera, uint8 (480, 640, 3); None where a window shows the world."""
         if self.render_mode == "human":
             if self._window is None:
-                self._window = Window(self.config)
+                self._window = Window(self.scene, self.config.control_hz)
             self._window.show(self.data, self.looks)
         if self.render_mode != "rgb_array":
             return None
@@ -260,11 +249,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return Drawn(self.drawn.condition, drawn_in(self.world.variation, self.scene.nominal))
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        return pictures(self.config.robot, self.config.task, self.data, cameras, self.looks, self.config.object)
+        return pictures(self.scene, self.data, cameras, self.looks)
 
     def _keypoints(self, cameras: CameraConfig) -> dict[str, F32]:
         points = np.stack([*points_in(self.world).values()])
-        return projections(self.config.robot, self.config.task, cameras, points, self.config.object)
+        return projections(self.scene, cameras, points)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}
@@ -282,15 +271,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             "agent_pos": gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32),
             "environment_state": gymnasium.spaces.Box(-np.inf, np.inf, (k,), np.float32),
         }
-        if self.cameras:
-            picture = gymnasium.spaces.Box(0, 255, (*self.image_size, 3), np.uint8)
+        if self._view:
+            picture = gymnasium.spaces.Box(0, 255, (*self._view.size, 3), np.uint8)
             spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
         return gymnasium.spaces.Dict(spaces)
-
-
-def make_env(robot: str = "panda", task: str = "pick_place", **settings: Any) -> ManipEnv:
-    """Return the environment of a robot, by its name or its YAML's path, and a task. settings: see `ManipEnv`."""
-    return ManipEnv(robot, task, **settings)
 
 
 def joint_state(world: World) -> F32:
@@ -300,11 +284,22 @@ def joint_state(world: World) -> F32:
 
 
 def environment_state(world: World) -> F32:
-    """Return the numbers that the task observes, float32 (k,)."""
+    """Return the numbers that the task observes, float32 (k,). Raises `ManipError` if their names have changed."""
     numbers: list[float] = []  # of few entries a list is faster than numpy
-    for value in get_task(world.scene.task).observe(world).values():
+    observed = world.scene.task.observe(world)
+    if tuple(observed) != _observed_names(world.scene):
+        names = ", ".join(_observed_names(world.scene))
+        raise ManipError(f"{world.scene.name}: observed {', '.join(observed)}, and before {names}; expected the same")
+    for value in observed.values():
         numbers += value.tolist() if isinstance(value, np.ndarray) and value.ndim else [float(value)]
     return np.array(numbers, np.float32)
+
+
+@lru_cache(SCENES_KEPT)
+def _observed_names(scene: Scene) -> tuple[str, ...]:
+    world = World(scene)
+    world.update()
+    return tuple(scene.task.observe(world))
 
 
 @lru_cache(SCENES_KEPT)
@@ -313,6 +308,6 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
     world = World(scene)
     world.update()
     names: list[str] = []
-    for name, value in get_task(scene.task).observe(world).items():
+    for name, value in scene.task.observe(world).items():
         names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
     return tuple(names)

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from manip_il.errors import UnknownName, UsageError
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, Drawn
+from manip_il.sim.task import Task
 from manip_il.sim.world import World
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Task
 
 F64 = NDArray[np.float64]
 Change = Callable[[World, np.random.Generator], object]
@@ -74,7 +73,7 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
     height: how far up it is moved [m]; above 0 it is turned at random, too, and falls. Draws in which it would stand
     inside something else are drawn again; returns whether there was an object and such a place.
     """
-    objects = get_task(world.scene.task).objects
+    objects = world.scene.task.objects
     if not objects:
         return False
     name = objects[0]
@@ -196,8 +195,8 @@ class Events:
         self._knock_step = int(self._knock_rng.integers(low, high, endpoint=True)) if self._knock else -1
         name = next((name for name in drawn.values if name in KINDS), "")
         self._kind, self._kind_step = KINDS.get(name), int(drawn.number(name, -1))
-        if self._kind is not None and name not in kinds_for(get_task(world.scene.task)):
-            raise UsageError(f"perturbation {name!r} needs an object; {world.scene.task} has none")
+        if self._kind is not None and name not in kinds_for(world.scene.task):
+            raise UsageError(f"perturbation {name!r} needs an object; {world.scene.task.name} has none")
         self._kind_rng = rng_for(seed, f"perturbation {name}")
 
     @staticmethod

@@ -17,8 +17,9 @@ from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.gl import context_class, remedy
 from manip_il.sim.props import Prop, props
-from manip_il.sim.scene import build_scene, camera_id
+from manip_il.sim.scene import camera_id
 from manip_il.sim.view import ViewModel
+from manip_il.sim.world import Scene
 
 Picture = NDArray[np.uint8]
 _FINER = 2  # drawn so much finer each way, then averaged: cheaper than OpenGL's antialiasing, which repeats the meshes
@@ -44,39 +45,30 @@ class Overview(NamedTuple):
 
 
 def pictures(
-    robot: str,
-    task: str,
-    data: mujoco.MjData,
-    cameras: CameraConfig,
-    drawn: Drawn = NOMINAL_VALUES,
-    shape: str = "",
+    scene: Scene, data: mujoco.MjData, cameras: CameraConfig, drawn: Drawn = NOMINAL_VALUES
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    shape: of the task's object, as `EnvConfig.object`. A picture depends on `qpos`, the goal and what the episode draws
-    alone: it has the same bytes in any order.
+    A picture depends on `qpos`, the goal and what the episode draws alone: it has the same bytes in any order.
     Raises `RenderError`, which says what to unset or install, where there is no off-screen OpenGL.
     """
-    renderer = _process.renderer(robot, task, cameras.look, shape)
+    renderer = _process.renderer(scene, cameras.look)
     renderer.pose(data, drawn)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
 
-def projections(
-    robot: str, task: str, cameras: CameraConfig, points: NDArray[np.float64], shape: str = ""
-) -> dict[str, NDArray[np.float32]]:
+def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
     """Return where points (K, 3) of the world [m] are in what `pictures` drew last in this process: name -> (K, 3).
 
     Across and down from 0 to 1, and 1 for a point within the picture; zeros for any other. A point may be hidden by
     something before it. Raises what `pictures` raises.
     """
-    renderer = _process.renderer(robot, task, cameras.look, shape)
+    renderer = _process.renderer(scene, cameras.look)
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
 
 
 def marked_picture(
-    robot: str,
-    task: str,
+    scene: Scene,
     data: mujoco.MjData,
     camera: str | Overview,
     size: tuple[int, int],
@@ -87,7 +79,7 @@ def marked_picture(
 
     size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures` raises.
     """
-    renderer = _process.renderer(robot, task, look, "")
+    renderer = _process.renderer(scene, look)
     renderer.pose(data, NOMINAL_VALUES)
     return renderer.picture(camera, size, lines)
 
@@ -100,11 +92,11 @@ def close() -> None:
 class _Renderer:
     """Draws one scene in one look, in pictures of any size. Needs a current OpenGL context."""
 
-    def __init__(self, robot: str, task: str, look: Look, shape: str):
-        self._view = ViewModel(robot, task, look, shape)
+    def __init__(self, scene: Scene, look: Look):
+        self._view = ViewModel(scene, look)
         self._model = self._view.model
         self._data, self._props = mujoco.MjData(self._model), list[Prop]()
-        self._of = build_scene(robot, task, shape)
+        self._of = scene
         self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -181,12 +173,11 @@ class _Process:
     def __init__(self) -> None:
         self._gl: Any = None
         self._pid = 0  # of the process that made the context
-        self._key: tuple[str, str, Look, str] | None = None
+        self._key: tuple[Scene, Look] | None = None
         self._renderer: _Renderer | None = None
 
-    def renderer(self, robot: str, task: str, look: Look, shape: str) -> _Renderer:
-        key = (robot, task, look, shape)
-        build_scene(robot, task, shape)  # first: an unknown name is no fault of OpenGL's
+    def renderer(self, scene: Scene, look: Look) -> _Renderer:
+        key = (scene, look)
         if self._gl is not None and self._pid != os.getpid():
             raise RenderError("OpenGL does not survive a fork; start processes that make pictures by 'spawn'")
         try:

@@ -18,15 +18,13 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.servos import ServoUnits
 from manip_il.robots.spec import arm_spec, copy_options
-from manip_il.robots.table import get_robot
 from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.home import require_free_home
+from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Fitting, Task
 
 PREFIX = "robot/"  # of everything of the robot's in a scene
 TABLE = "table"  # the name of its geom
@@ -44,27 +42,22 @@ _PEDESTAL = 0.13  # half its width [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
 
 
-def build_scene(robot: str, task: str, shape: str = "", step: float = DT_SIM) -> Scene:
-    """Return the scene of a robot and a task, compiled once and kept for a while. Raises `UnknownName`, `UsageError`.
-
-    shape: of its object, as `EnvConfig.object`; empty for the task's own. step: of physics [s].
-    """
-    return _build(get_robot(robot), task, shape, step)
-
-
 @lru_cache(SCENES_KEPT)
-def _build(robot: Robot, task: str, shape: str, step: float) -> Scene:
-    the_task = get_task(task, shape)
+def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
+    """Return the scene of a robot and a task, compiled once and kept for a while. Raises `UsageError`.
+
+    step: of physics [s].
+    """
     try:
-        spec = scene_spec(robot, the_task)
+        spec = scene_spec(robot, task)
         spec.option.timestep = step
         model = spec.compile()
     except ValueError as error:
         why = " ".join(str(error).split())
         raise UsageError(
-            f"robot {robot.name} and task {the_task.name} make no scene of {robot.files.model}: {why}"
+            f"robot {robot.name} and task {task.name} make no scene of {robot.files.model}: {why}"
         ) from None
-    return _index(robot, the_task, model, shape)
+    return _index(robot, task, model)
 
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
@@ -98,7 +91,7 @@ def camera_id(model: mujoco.MjModel, name: str) -> int:
     raise UnknownName("camera", name, known)
 
 
-def _index(robot: Robot, task: Task, model: mujoco.MjModel, shape: str) -> Scene:
+def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
     joints = [model.joint(PREFIX + name) for name in robot.joints]
     objects = _objects(model)
     gripper = Gripper(robot, model, PREFIX)
@@ -106,7 +99,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel, shape: str) -> Scene
     require_free_home(robot, model, PREFIX)
     return Scene(
         robot=robot,
-        task=task.name,
+        task=task,
         model=model,
         gripper=gripper,
         actions=_action_space(robot, joints, gripper),
@@ -117,7 +110,6 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel, shape: str) -> Scene
         shoulder=joints[0].id,
         yaws=_yaws(robot, model, joints[-1]),
         nominal=variation.nominal(model, objects),
-        shape=shape,
     )
 
 

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from manip_il.sim.conditions import PICTURED, Drawn
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import SCENES_KEPT, SEEN, TABLE, build_scene, camera_id
+from manip_il.sim.scene import SCENES_KEPT, SEEN, TABLE, camera_id
 from manip_il.sim.variation import GEOMS, resized
+from manip_il.sim.world import Scene
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -48,13 +49,12 @@ class ViewModel:
     fine: keep every face of the meshes.
     """
 
-    def __init__(self, robot: str, task: str, look: Look, shape: str = "", *, fine: bool = False):
-        whole = build_scene(robot, task, shape).model
-        self.model: Any = copy.copy(whole if fine else _with_few_faces(robot, task, shape))
+    def __init__(self, scene: Scene, look: Look, *, fine: bool = False):
+        self.model: Any = copy.copy(scene.model if fine else _with_few_faces(scene))
         self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
             self.model.vis.quality.shadowsize = 0
-        self._objects = [one.geom for one in build_scene(robot, task, shape).objects.values()]
+        self._objects = [one.geom for one in scene.objects.values()]
         self._table = [self.model.geom(TABLE).id]
         self._light(look.brightness, look.light_turn)
         self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
@@ -119,8 +119,7 @@ class ViewModel:
 
 
 @lru_cache(SCENES_KEPT)
-def _with_few_faces(robot: str, task: str, shape: str) -> mujoco.MjModel:
-    scene = build_scene(robot, task, shape)
+def _with_few_faces(scene: Scene) -> mujoco.MjModel:
     model, finest = copy.copy(scene.model), min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:

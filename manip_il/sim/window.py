@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import RenderError, UnknownName
-from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
-from manip_il.sim.config import FILM, EnvConfig
+from manip_il.sim.config import FILM
 from manip_il.sim.view import ViewModel
-from manip_il.sim.world import STATE_KIND
+from manip_il.sim.world import STATE_KIND, Scene
 
 F64 = NDArray[np.float64]
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
@@ -74,7 +73,7 @@ class Clock:
 
 
 class Window:
-    """A window that shows one environment. sliders: open the panel on the right, which has them.
+    """A window that shows a scene, `control_hz` times a second. sliders: open the panel on the right, which has them.
 
     Raises `RenderError` where there is no display.
     """
@@ -82,14 +81,14 @@ class Window:
     def __deepcopy__(self, memo: dict[int, Any]) -> None:
         """Return nothing, as a copied environment opens a window of its own."""
 
-    def __init__(self, config: EnvConfig, *, sliders: bool = False):
+    def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):
         require_display()
         import mujoco.viewer
 
-        self._view = ViewModel(config.robot, config.task, FILM, config.object, fine=True)
+        self._view = ViewModel(scene, FILM, fine=True)
         self._model, self._data = self._view.model, mujoco.MjData(self._view.model)
         self._state = np.empty(mujoco.mj_stateSize(self._model, STATE_KIND))
-        self._clock = Clock(config.control_hz)
+        self._clock = Clock(control_hz)
         others = threading.enumerate()
         self._handle: Any = mujoco.viewer.launch_passive(
             self._model, self._data, show_left_ui=False, show_right_ui=sliders
@@ -98,7 +97,7 @@ class Window:
         atexit.register(self.close)  # before MuJoCo's own, which do not wait for its threads and may crash
         with self._handle.lock():
             camera = self._handle.cam
-            camera.lookat[:] = [*get_robot(config.robot).workspace.centre, _LOOK_AT]
+            camera.lookat[:] = [*scene.robot.workspace.centre, _LOOK_AT]
             camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
 
     @property

@@ -23,7 +23,7 @@ from manip_il.robots.reach import Reach, reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_across, angle_ahead, angle_from_down, off_yaw, yaw_ahead
 from manip_il.sim import variation as variations
-from manip_il.sim.shape import draws_shape
+from manip_il.sim.shape import ANY
 from manip_il.sim.variation import Object
 
 F64 = NDArray[np.float64]
@@ -46,14 +46,13 @@ class Pose(NamedTuple):
 class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of what is named in it.
 
-    task: its name. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies
-    by name. ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest of the hand,
-    off the one that counts as none [rad]. nominal: the variation that the model has as compiled, (v,). shape: of its
-    object, as `EnvConfig.object`.
+    task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies by name.
+    ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest of the hand,
+    off the one that counts as none [rad]. nominal: the variation that the model has as compiled, (v,).
     """
 
     robot: Robot
-    task: str
+    task: Any
     model: mujoco.MjModel
     gripper: Gripper
     actions: ActionSpace
@@ -64,7 +63,6 @@ class Scene:
     shoulder: int
     yaws: tuple[float, float]
     nominal: F64
-    shape: str = ""
 
     @cached_property
     def state_size(self) -> int:
@@ -74,12 +72,13 @@ class Scene:
     @cached_property
     def draws_shape(self) -> bool:
         """Whether each episode draws the shape of the object; the model as compiled has a cube."""
-        return draws_shape(self.shape)
+        shape = getattr(self.task, "shape", None)
+        return shape is not None and shape.kind == ANY
 
     @property
     def name(self) -> str:
         """Robot and task, for messages."""
-        return f"{self.robot.name} {self.task}"
+        return f"{self.robot.name} {self.task.name}"
 
     def model_bytes(self) -> bytes:
         """Return the compiled model, byte for byte: what a fingerprint hashes."""

@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.sim.task import Rung
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import Lift, Place, Which, carry, carry_progress, held, let_go
 from manip_il.tasks.objects import WOOD, add_furniture, add_part
-from manip_il.tasks.task import Rung
 
 F64 = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ from manip_il.errors import UsageError
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, Shape
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.carry_starts import draw_names, draw_things
 from manip_il.tasks.furnishing import (
@@ -45,7 +46,6 @@ from manip_il.tasks.layout import ABOVE, ASIDE, FULL, THINGS
 from manip_il.tasks.pick_place import OBJECT, PickPlace, observe_cube
 from manip_il.tasks.reward import DEFAULT, TASTES, Reward
 from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import hand_down
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, add_bin, drop_place, drop_progress, drop_rungs, is_in
 from manip_il.tasks.ladder import grasp_progress, grasp_rungs, held
@@ -18,7 +19,6 @@ from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_together, draw_yaw
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
 from manip_il.tasks.cabinet import (
     BAR,
@@ -30,7 +31,6 @@ from manip_il.tasks.objects import add_cube
 from manip_il.tasks.pick_place import OBJECT, observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

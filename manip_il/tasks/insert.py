@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import angle_between
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import CLOSED, nearness
@@ -19,7 +20,6 @@ from manip_il.tasks.peg import HOLE, PEG, azimuth, held, lower_end, upper_axis
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.set_up import LIFT, LIFT_SLOPE, PEG_RUNGS, Way, hangs, move, peg_progress, way_to
 from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

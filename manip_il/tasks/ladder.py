@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import hand_down
+from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside
-from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
 Which = Callable[[World], str]  # the object that it is about now

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.sim.task import Limits, Start
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.pick_place import OBJECT, PickPlace
 from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_lying, draw_until
-from manip_il.tasks.task import Limits, Start
 
 F64 = NDArray[np.float64]
 UNDER = np.array([0.0, 0.0, -1.0])  # no hand gets there [m]

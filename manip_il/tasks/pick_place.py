@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.shape import CUBE, Shape
+from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import Lie, is_cube, lie_of
 from manip_il.tasks.ladder import pick_progress, pick_rungs
 from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_lying
-from manip_il.tasks.task import CUBE_SIZES, Limits, Observed, Rung, Start
 
 F64 = NDArray[np.float64]
 

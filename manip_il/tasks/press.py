@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import hand_down
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import draw_resting_place, draw_yaw
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

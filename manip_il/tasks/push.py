@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import hand_down
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.ladder import AT_GOAL, nearness
 from manip_il.tasks.objects import RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, resting_height
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

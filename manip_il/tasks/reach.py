@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import hand_down
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.ladder import AT_GOAL, CLOSED, nearness
 from manip_il.tasks.objects import CUBE_HALF, add_goal
 from manip_il.tasks.starts import UPRIGHT, draw_goal
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import rotation_matrix, rotation_vector
+from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import CLOSED, nearness
@@ -29,7 +30,6 @@ from manip_il.tasks.peg import (
     stands,
     upper_axis,
 )
-from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import angle_from_down, hand_down
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in
 from manip_il.tasks.grasp import grasp_of, lie_of
@@ -18,7 +19,6 @@ from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, resting_height
-from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 

@@ -123,7 +123,7 @@ def draw_together(
 
 def _no_place(world: World, what: str) -> UsageError:
     return UsageError(
-        f"task {world.scene.task}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
+        f"task {world.scene.task.name}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
         f" {world.scene.robot.name}; choose another task or robot"
     )
 

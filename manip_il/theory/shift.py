@@ -27,7 +27,7 @@ from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
-from manip_il.sim.config import EnvConfig
+from manip_il.tasks.config import EnvConfig
 
 F64 = NDArray[np.float64]
 EPISODES = 50  # of the expert and of every round's policy

@@ -19,14 +19,14 @@ from manip_il.collect.workers import Engine
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from ..collect.clones import clone
 from .trees import files
 
 pytestmark = pytest.mark.slow  # every test here waits for whole runs
 
-ENV = EnvConfig("fetch", "reach")
+ENV = make_config("fetch", "reach")
 
 
 @pytest.fixture(scope="module")

@@ -16,14 +16,14 @@ from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from .trees import check_same_data
 
 pytestmark = pytest.mark.slow
 
 CONFIG = RunConfig(
-    env=EnvConfig("fetch", "reach", horizon=40),
+    env=make_config("fetch", "reach", horizon=40),
     demonstrations=2,
     rounds=2,
     episodes_per_round=2,

@@ -22,7 +22,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from ..learn.tiny_policies import ACT
 from .trees import check_same_data, files
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow  # every test here waits for a whole run
 
 ALONE = BetaSchedule("constant", 0)
 CONFIG = RunConfig(
-    env=EnvConfig("fetch", "reach", horizon=40),
+    env=make_config("fetch", "reach", horizon=40),
     demonstrations=4,
     rounds=1,
     episodes_per_round=2,
@@ -266,7 +266,7 @@ def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(labe
 @pytest.mark.gl
 def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
     fit = FitConfig({"type": "cnn", "device": "cpu", "width": 16}, steps=2, batch_size=4, image_augment=False)
-    cameras, env = CameraConfig(("front",), 64, 64), EnvConfig("panda", "reach", horizon=20)
+    cameras, env = CameraConfig(("front",), 64, 64), make_config("panda", "reach", horizon=20)
     config = replace(CONFIG, beta=ALONE, demonstrations=2, env=env, fit=fit, cameras=cameras, validation_episodes=1)
     results = list(ImitationRun(config, tmp_path, Engine()).results())
     assert results[1].labels > results[0].labels

@@ -10,10 +10,10 @@ from manip_il.collect.environments import make_expert
 from manip_il.collect.rollout import Turn
 from manip_il.errors import MismatchError
 from manip_il.learn.action_spaces import Conversion
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.env import ManipEnv
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import env_of
 
-ENV = EnvConfig("fetch", "reach")
+ENV = make_config("fetch", "reach")
 HAND = Conversion("ee_delta", "fetch")
 
 
@@ -37,7 +37,7 @@ def expert_action(episode: RobotEpisode) -> np.ndarray:
 
 
 def test_a_target_reaches_the_robot_as_the_joints_it_means():
-    ours, env = lockstep(2, hold=None), ManipEnv.of(ENV)
+    ours, env = lockstep(2, hold=None), env_of(ENV)
     ours.seeds = [4, 5]
     observed = ours.reset()
     env.start(5)

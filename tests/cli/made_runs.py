@@ -18,12 +18,12 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.mdp import Episode
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import EnvConfig, make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
 
-ENV = EnvConfig("panda", "reach", horizon=8)
+ENV = make_config("panda", "reach", horizon=8)
 OPTIONS = DaggerOptions(env={"task": "reach", "horizon": 8})
 SUCCESSES = (0.2, 0.6, 0.4)
 

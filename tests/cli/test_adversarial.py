@@ -11,7 +11,7 @@ from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
 from manip_il.data.dataset import Dataset
 from manip_il.learn.checkpoint import Origin
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from ..learn.tiny_policies import write_checkpoint
 
@@ -52,7 +52,7 @@ def test_bad_input_is_one_line(name, words, says, code, here, error):
 def test_a_policy_that_cannot_be_gone_on_from_is_refused(kind, robot, says, here, error):
 
     own = Dataset.open(SAMPLE).spec
-    env = EnvConfig("fetch" if (robot == "same") == (own.robot == "fetch") else "panda", own.task)
+    env = make_config("fetch" if (robot == "same") == (own.robot == "fetch") else "panda", own.task)
     spec = env_spec(env)
     write_checkpoint(here / "policy", kind, spec, origin=Origin.of(spec, {}))
     assert main(["rl", "gail", f"--dataset.root={SAMPLE}", "--init=policy", "--quiet"]) != 0

@@ -9,11 +9,12 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_fingerprint
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.env import ManipEnv
+from manip_il.tasks.config import make_config
 
 from .made_runs import make_policy
 
-ENV = EnvConfig("fetch", "reach", horizon=60)
+ENV = make_config("fetch", "reach", horizon=60)
 WORDS = ["robot", "certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--cases=2", "--workers=1"]
 
 

@@ -13,12 +13,12 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from ..damage import edit_json
 from .made_runs import make_episode
 
-ENV = EnvConfig("panda", "reach", 20)
+ENV = make_config("panda", "reach", 20)
 
 
 @pytest.fixture

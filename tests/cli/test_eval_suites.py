@@ -16,14 +16,14 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import EPISODES_FILE as KEPT
 from manip_il.evaluation.suites import CONDITIONS, SUITES, suite_conditions
 from manip_il.sim.conditions import NOMINAL, draw
-from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import STANDARD
+from manip_il.tasks.config import make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
 from .made_runs import make_policy
 
-ENV = EnvConfig("fetch", "pick_place", horizon=10)
+ENV = make_config("fetch", "pick_place", horizon=10)
 SMALL = ["--robot.type=fetch", "--env.horizon=10", "--workers=1", "--eval.films=0"]
 REACH = ["--policy.type=expert", "--task.type=reach", *SMALL]
 
@@ -39,38 +39,38 @@ def evaluate(folder: str, *words: str) -> int:
 
 def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
     for suite in SUITES:
-        assert suite_conditions(suite, EnvConfig(task="pick_place"), sees=True)
+        assert suite_conditions(suite, make_config(task="pick_place"), sees=True)
     assert {name for names in SUITES.values() for name in names} == {*CONDITIONS} - {"random_actions"}
-    assert suite_conditions("nominal", EnvConfig(task="reach"), sees=False) == (NOMINAL,)
-    [knocked] = suite_conditions("knocked", EnvConfig(task="pick_place"), sees=False)
+    assert suite_conditions("nominal", make_config(task="reach"), sees=False) == (NOMINAL,)
+    [knocked] = suite_conditions("knocked", make_config(task="pick_place"), sees=False)
     assert knocked.ranges == STANDARD.ranges  # the disturbance that DAgger collects under
-    names = [one.name for one in suite_conditions("all", EnvConfig(task="pick_place"), sees=True)]
+    names = [one.name for one in suite_conditions("all", make_config(task="pick_place"), sees=True)]
     assert names == ["nominal", "knocked", "sensing", "late", "object", "view", "clutter", "dynamics"]
     blind = ["nominal", "knocked", "sensing", "object", "dynamics"]
-    assert [one.name for one in suite_conditions("all", EnvConfig(task="pick_place"), sees=False)] == blind
-    assert [one.name for one in suite_conditions("all", EnvConfig(task="reach"), sees=False)] == [
+    assert [one.name for one in suite_conditions("all", make_config(task="pick_place"), sees=False)] == blind
+    assert [one.name for one in suite_conditions("all", make_config(task="reach"), sees=False)] == [
         *blind[:3],
         "dynamics",
     ]
     with pytest.raises(UsageError, match="changes nothing for reach"):
-        suite_conditions("object", EnvConfig(task="reach"), sees=True)
+        suite_conditions("object", make_config(task="reach"), sees=True)
 
 
 def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
-    expected = suite_conditions("all", EnvConfig(task="pick_place"), sees=True)
+    expected = suite_conditions("all", make_config(task="pick_place"), sees=True)
     folder = tmp_path / "share" / "manip_il" / "suites"
     folder.mkdir(parents=True)
     for name in CONDITIONS:
         (folder / f"{name}.yaml").write_bytes((Path("configs/suites") / f"{name}.yaml").read_bytes())
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     monkeypatch.setattr(manip_il, "__file__", str(tmp_path / "lib" / "manip_il" / "__init__.py"))
-    assert suite_conditions("all", EnvConfig(task="pick_place"), sees=True) == expected
+    assert suite_conditions("all", make_config(task="pick_place"), sees=True) == expected
 
 
 def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, capsys):
     assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=10", *SMALL) == 0
     data = json.loads(Path("e/eval.json").read_text())
-    conditions = suite_conditions("all", EnvConfig(task="pick_place"), sees=False)
+    conditions = suite_conditions("all", make_config(task="pick_place"), sees=False)
     counts = {name: one["n_episodes"] for name, one in data["by_condition"].items()}
     assert counts == {one.name: 2 for one in conditions}
     for episode in data["episodes"]:

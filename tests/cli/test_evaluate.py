@@ -13,13 +13,14 @@ from manip_il.data.schema import STATE
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.sim.config import CameraConfig, Look
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.env import ManipEnv
+from manip_il.tasks.config import make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import edit_config, write_checkpoint
 from .made_runs import make_policy
 
-ENV = EnvConfig("panda", "reach", horizon=8)
+ENV = make_config("panda", "reach", horizon=8)
 DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
 
 

@@ -17,13 +17,13 @@ from manip_il.collect.environments import env_spec
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.policy_files import policy_sha256
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from ..learn.tiny_policies import write_checkpoint
 
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"
 (SNIPPET,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
-SPEC = env_spec(EnvConfig("panda", "pick_place"))
+SPEC = env_spec(make_config("panda", "pick_place"))
 # Before the snippet: these packages cannot be imported, as if they were not installed.
 WITHOUT = "import sys; sys.modules |= dict.fromkeys(('manip_il', 'lerobot', 'torch', 'onnx'))\n"
 

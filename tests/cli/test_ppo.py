@@ -12,11 +12,11 @@ import torch
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
 from manip_il.learn.reward import RewardNetwork, RewardShape, ways_of, write_reward
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import EnvConfig, make_config
 
 from ..collect.clones import clone
 
-ENV = EnvConfig("fetch", "reach")
+ENV = make_config("fetch", "reach")
 
 
 def reward(folder: Path, env: EnvConfig = ENV) -> Path:

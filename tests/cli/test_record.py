@@ -18,7 +18,7 @@ from manip_il.data.journal import list_episodes
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig, Look
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from .made_runs import files
 
@@ -102,7 +102,7 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
     assert files(tmp_path / "again") == files(tmp_path / "one")
 
 
-ENV = EnvConfig("panda", "reach", horizon=6, success_steps=1)
+ENV = make_config("panda", "reach", horizon=6, success_steps=1)
 
 
 @pytest.fixture

@@ -16,7 +16,8 @@ from manip_il.collect.job import RolloutJob, run_steps
 from manip_il.data import schema
 from manip_il.evaluation.watch import FRAME, slider_actions
 from manip_il.mdp import Episode
-from manip_il.sim.config import CAMERAS, EnvConfig
+from manip_il.sim.config import CAMERAS
+from manip_il.tasks.config import make_config
 
 from ..scenes import started
 
@@ -46,7 +47,7 @@ def column(path: Path, entity: str, component: str) -> list[Any]:
 
 def simulated(task: str) -> Iterator[Episode]:
     """The same episodes, without anybody watching."""
-    return RolloutJob(EnvConfig("panda", task), hold=10).run([3_000_000, 3_000_001])
+    return RolloutJob(make_config("panda", task), hold=10).run([3_000_000, 3_000_001])
 
 
 def test_a_file_holds_every_step_as_it_was_simulated(tmp_path, no_opengl, capsys):
@@ -106,7 +107,7 @@ def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
 
     env, window = started(task="reach"), Window()
     scene, start = env.scene, env.data.ctrl.copy()
-    job = RolloutJob(EnvConfig("panda", "reach", horizon=30))
+    job = RolloutJob(make_config("panda", "reach", horizon=30))
     window.commands = start + 0.1
     window.commands[scene.gripper.ctrl] = start[scene.gripper.ctrl]
     window.commands[scene.gripper.ctrl[0]] = 0.03  # one finger: the other one follows

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.collect.workers import Engine
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from .clones import clone
 
@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # where workers find `kept`
 @pytest.fixture(scope="session")
 def checkpoint(tmp_path_factory) -> Path:
     """A policy for the default environment, hardly trained."""
-    return clone(EnvConfig(), 4, tmp_path_factory.mktemp("policy"), steps=20)
+    return clone(make_config(), 4, tmp_path_factory.mktemp("policy"), steps=20)
 
 
 @pytest.fixture(scope="module")

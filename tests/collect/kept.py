@@ -14,7 +14,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import journal_of
 from manip_il.data.journal import Journal, list_episodes
 from manip_il.mdp import Episode
-from manip_il.sim.config import EnvConfig
+from manip_il.tasks.config import EnvConfig
 
 
 def contents(folder: Path) -> dict[str, bytes]:

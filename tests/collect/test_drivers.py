@@ -14,7 +14,7 @@ from manip_il.collect.query import Query, drawn_step, parse_query
 from manip_il.collect.rollout import Turn
 from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.envs import scene_of
 
 STATE = State(np.zeros(4), np.zeros(3))
 SCALE = np.array([0.1, 0.1, 0.08])
@@ -82,7 +82,7 @@ def test_a_mixture_executes_the_label_with_probability_beta_else_the_learners_ac
 
 
 def test_a_random_driver_stays_within_its_reach():
-    actions = build_scene("panda", "reach").actions
+    actions = scene_of("panda", "reach").actions
     drive = RandomDriver().start(Setting(actions, 15))
     state = np.asarray([*np.linspace(-1, 1, 7), 0.04], np.float32)
     turns = [Turn(seed, 0, Observation(state, np.zeros(0, np.float32)), STATE) for seed in range(99)]

@@ -36,16 +36,16 @@ from manip_il.mdp import Episode, State
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, Look
-from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import drawn_in
 from manip_il.sim.world import World
-from manip_il.stock.table import ROBOT as STOCK
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.envs import env_of, scene_of
+from manip_il.tasks.stock.table import ROBOT as STOCK
 
 from ..damage import digests, edit_json
 from ..tables import SCENES, one_arm_per_task
 
-ENV, REACH = EnvConfig("panda", "pick_place"), EnvConfig("fetch", "reach")
+ENV, REACH = make_config("panda", "pick_place"), make_config("fetch", "reach")
 CAMERAS, SMALL = CameraConfig(("front", "wrist"), 64, 96), CameraConfig(("front", "wrist"), 32, 32)
 NOISE = Condition("noise", random_actions=(0.3, 0.3))
 
@@ -79,7 +79,7 @@ def visited(tmp_path_factory) -> Source:
 
 @pytest.mark.slow
 def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_while_recording():
-    envs = [EnvConfig(*scene) for scene in SCENES]
+    envs = [make_config(*scene) for scene in SCENES]
     pieces = [(env, episode) for env in envs for episode in recorded(env, 1, conditions=(NOISE,))]
     with closing(map_in_order(label_all, pieces, 2)) as labelled:
         for (_, episode), found in labelled:
@@ -87,7 +87,7 @@ def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_whil
                 np.testing.assert_array_equal(labels.reshape(episode.columns[key].shape), episode.columns[key])
 
 
-@pytest.mark.parametrize("env", [REACH, EnvConfig(STOCK, "FetchReach-v4")], ids=lambda env: env.robot)
+@pytest.mark.parametrize("env", [REACH, make_config(STOCK, "FetchReach-v4")], ids=lambda env: env.robot)
 def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvConfig, tmp_path):
     [first, second] = recorded(env)
     older = {key: first.columns[key].copy() for key in (schema.ACTION, schema.EXPERT_PHASE)}
@@ -107,7 +107,7 @@ def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvC
 @pytest.mark.gl
 @pytest.mark.parametrize("robot", ["panda", "fetch"])
 def test_pictures_made_afterwards_are_those_made_while_recording(robot: str):
-    env = EnvConfig(robot)
+    env = make_config(robot)
     for episode in recorded(env, 1, cameras=CAMERAS):
         pictures, spec = render_states(env, CAMERAS, episode.columns[schema.SIM_STATE]), env_spec(env, CAMERAS)
         assert set(pictures) == {*spec.image_keys, *spec.keypoint_keys}
@@ -179,7 +179,7 @@ def world_in(world: World, state: State) -> World:
 @pytest.mark.gl
 @pytest.mark.parametrize(("robot", "task"), one_arm_per_task())
 def test_redrawn_scenes_are_other_scenes_around_the_same_hand_with_the_experts_label(robot: str, task: str, tmp_path):
-    env, scene = EnvConfig(robot, task), build_scene(robot, task)
+    env, scene = make_config(robot, task), scene_of(robot, task)
     source = open_source(write(recorded(env, 1, conditions=(NOISE,)), tmp_path / "visited", env))
     frames, expert, world = 2 * CHUNK, Expert(scene), World(scene)
     episodes = redrawn(source, tmp_path / "new", frames)
@@ -222,7 +222,7 @@ def test_a_branch_is_the_experts_next_steps_and_looks_are_those_of_the_state(vis
     looks = (Condition("looks", colour=(0, 1), clutter=(2, 4)),)
     single = redrawn(visited, tmp_path / "1", 4, conditions=looks)
     branches = redrawn(visited, tmp_path / "3", 4, branch_steps=3, conditions=looks)
-    env, colours = ManipEnv.of(ENV, SMALL), set()
+    env, colours = env_of(ENV, SMALL), set()
     for one, three in zip(single, branches, strict=True):
         assert (len(one), len(three)) == (1, 3)
         np.testing.assert_array_equal(one.columns[schema.ACTION][0], three.columns[schema.ACTION][0])

@@ -14,9 +14,10 @@ from manip_il.collect.job import RolloutJob, run_steps
 from manip_il.mdp import Label, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
-from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.scene import SCENES_KEPT, build_scene
+from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import GOAL, Scene, World
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
 
@@ -29,13 +30,13 @@ STEEPEST = 50.0  # change of a joint target per change of the object's position 
 
 @lru_cache(SCENES_KEPT)
 def expert_of(robot: str, task: str) -> Expert:
-    return Expert(build_scene(robot, task))
+    return Expert(scene_of(robot, task))
 
 
 @cache
 def visited_states(robot: str, task: str, driver: str) -> tuple[State, ...]:
     """States of two episodes that a driver visited."""
-    config = EnvConfig(robot, task, horizon=40)
+    config = make_config(robot, task, horizon=40)
     conditions = tuple(sizes_of(task)) if driver == "varied" else ()
     episodes = RolloutJob(config, driver_of(driver), hold=3, conditions=conditions).run(stream_seeds("certificate", 2))
     return tuple(State.from_vector(row) for episode in episodes for row in episode.columns["sim_state"])
@@ -60,7 +61,7 @@ def joints(scene: Scene, state: State) -> np.ndarray:
 
 def with_object(scene: Scene, state: State, move: np.ndarray) -> State:
     """The state with its object moved by `move` [m]."""
-    world, one = world_in(scene, state), scene.objects[get_task(scene.task).grasped[0]]
+    world, one = world_in(scene, state), scene.objects[scene.task.grasped[0]]
     world.data.qpos[one.q : one.q + 3] += move
     return replace(state, physics=world.physics())
 
@@ -74,9 +75,9 @@ def test_a_label_read_off_a_running_world_is_that_of_its_state(robot: str, task:
     """Also where it was knocked, has other sizes, and is observed with noise."""
     knocked = KNOCKED.for_world(has_object=bool(get_task(task).objects), sees=False, sizes=None)
     conditions = (*(sizes_of(task) if driver == "varied" else ()), *([knocked] if knocked else ()))
-    config, expert = EnvConfig(robot, task, horizon=30), expert_of(robot, task)
+    config, expert = make_config(robot, task, horizon=30), expert_of(robot, task)
     job = RolloutJob(config, driver_of(driver), hold=3, conditions=conditions)
-    for step in run_steps(job, [ManipEnv.of(config, None, conditions)], stream_seeds("certificate", 2)):
+    for step in run_steps(job, [env_of(config, None, conditions)], stream_seeds("certificate", 2)):
         assert step.label is not None
         assert written(step.label) == written(expert.label(step.state))
 
@@ -84,7 +85,7 @@ def test_a_label_read_off_a_running_world_is_that_of_its_state(robot: str, task:
 @pytest.mark.parametrize("driver", DRIVERS)
 @every_scene
 def test_a_label_is_a_step_that_the_arm_can_make(robot: str, task: str, driver: str):
-    expert, scene = expert_of(robot, task), build_scene(robot, task)
+    expert, scene = expert_of(robot, task), scene_of(robot, task)
     actions = scene.actions
     for state in visited_states(robot, task, driver):
         label = expert.label(state)
@@ -101,7 +102,7 @@ def test_a_label_is_a_step_that_the_arm_can_make(robot: str, task: str, driver: 
 @pytest.mark.parametrize("driver", DRIVERS)
 @every_scene_with_a_cube
 def test_within_a_rung_the_label_follows_the_object_continuously(robot: str, task: str, driver: str, size: float):
-    expert, scene, rng = expert_of(robot, task), build_scene(robot, task), np.random.default_rng(0)
+    expert, scene, rng = expert_of(robot, task), scene_of(robot, task), np.random.default_rng(0)
     compared = 0
     states = visited_states(robot, task, driver)
     for state in states:
@@ -119,7 +120,7 @@ def test_within_a_rung_the_label_follows_the_object_continuously(robot: str, tas
 )
 @every_scene_with_a_cube
 def test_where_there_is_no_sound_label_the_arm_holds_still(robot: str, task: str, move, reason: str):
-    expert, scene = expert_of(robot, task), build_scene(robot, task)
+    expert, scene = expert_of(robot, task), scene_of(robot, task)
     state = with_object(scene, visited_states(robot, task, "expert")[3], np.array(move, float))
     label = expert.label(state)
     assert (label.valid, label.phase, label.reason) == (False, 0, reason)

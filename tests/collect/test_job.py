@@ -20,15 +20,15 @@ from manip_il.errors import UsageError
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import STANDARD
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import scene_of
 
 from ..learn.tiny_policies import write_checkpoint
 
 SEEDS = stream_seeds("round/1", 4)
-ENV = EnvConfig(horizon=30)
-EXPERT = RolloutJob(EnvConfig("fetch"), hold=3)
+ENV = make_config(horizon=30)
+EXPERT = RolloutJob(make_config("fetch"), hold=3)
 NOISE = tuple(map(tuple, np.diag([1e-4] * 7 + [1e-6]).tolist()))
 ONE, SELDOM, SAFETY = Query("one"), Query("probability", 0.2), Query("safety", 0.5)
 JOBS = {
@@ -36,7 +36,7 @@ JOBS = {
     "noisy expert": {"driver": NoisyExpertDriver(NOISE)},
     "random": {"driver": RandomDriver()},
     "mixture": {"beta": 0.5},
-    "policy of chunks": {"conditions": suite_conditions("all", EnvConfig(), sees=False), "batch": 3},
+    "policy of chunks": {"conditions": suite_conditions("all", make_config(), sees=False), "batch": 3},
     "probability": {"query": Query("probability", 0.3)},
     "takeover": {"label": "takeover", "query": ONE},
     "branch": {"label": "branch", "query": ONE, "branch_steps": 4},
@@ -59,7 +59,7 @@ def labelled(episode: Episode) -> np.ndarray:
 
 def is_the_experts(episode: Episode) -> None:
     """Every sound label is what the expert says of the frame's state, whoever drove."""
-    expert = Expert(build_scene(ENV.robot, ENV.task))
+    expert = Expert(scene_of(ENV.robot, ENV.task))
     for i in np.flatnonzero(labelled(episode)):
         label = expert.label(State.from_vector(episode.columns["sim_state"][i]))
         np.testing.assert_array_equal(episode.columns["action"][i], label.action.astype(np.float32))

@@ -19,12 +19,13 @@ from manip_il.collect.job import RolloutJob
 from manip_il.learn.checkpoint import Origin
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, Look
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import env_of
 
 from ..learn.tiny_policies import write_checkpoint
 
 SEEDS = stream_seeds("certificate", 4)
-ENV = EnvConfig("panda", "reach", horizon=8)
+ENV = make_config("panda", "reach", horizon=8)
 DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
 
 
@@ -45,7 +46,7 @@ def lerobots_rollout(checkpoint: Path, seed: int, cameras: CameraConfig | None =
     """Actions of LeRobot's own evaluation loop over one environment, (T, n)."""
     policy = ACTPolicy.from_pretrained(checkpoint)
     before, after = make_pre_post_processors(policy.config, str(checkpoint))
-    env = ManipEnv.of(ENV, cameras)
+    env = env_of(ENV, cameras)
     policy.reset()
     observation, _ = env.reset(seed=seed)
     actions, over = [], False

@@ -18,11 +18,11 @@ from manip_il.data.journal import Journal, list_episodes, list_seeds
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from ..damage import digests
 
-JOB = RolloutJob(EnvConfig("fetch", "reach", horizon=30), hold=1)
+JOB = RolloutJob(make_config("fetch", "reach", horizon=30), hold=1)
 SEEDS = range(1_000_000, 1_000_012)
 
 
@@ -83,10 +83,10 @@ def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
     assert journal_of(tmp_path, JOB).prepare() == []
     list(collect(Recorded(), JOB, SEEDS[:1], tmp_path))
     assert journal_of(tmp_path, JOB).prepare() == []
-    for other in (replace(JOB, env=EnvConfig("panda", "reach")), replace(JOB, cameras=CameraConfig(("front",)))):
+    for other in (replace(JOB, env=make_config("panda", "reach")), replace(JOB, cameras=CameraConfig(("front",)))):
         with pytest.raises(MismatchError):
             journal_of(tmp_path, other).prepare()
-    assert len(journal_of(tmp_path, replace(JOB, env=EnvConfig("fetch", "reach", tolerance=0.05))).prepare()) == 1
+    assert len(journal_of(tmp_path, replace(JOB, env=make_config("fetch", "reach", tolerance=0.05))).prepare()) == 1
 
 
 def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog):

@@ -11,8 +11,8 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import LABEL_VALID
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
-from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import KINDS, Perturbation, kinds_for
+from manip_il.tasks.config import make_config
 from manip_il.tasks.table import TASKS
 
 from ..tables import SCENES, WITH_A_CUBE
@@ -39,7 +39,7 @@ CHANGED = [
 
 
 def failures(condition: Condition, robot: str, task: str, count: int) -> list[int]:
-    job = RolloutJob(EnvConfig(robot, task), hold=0, conditions=(condition,))
+    job = RolloutJob(make_config(robot, task), hold=0, conditions=(condition,))
     return [episode.seed for episode in job.run(stream_seeds("certificate", count)) if not episode.success]
 
 
@@ -55,7 +55,10 @@ UNSOUND = {("panda", "carry", "moved", 6)}
 @pytest.mark.parametrize(("robot", "task", "kind", "at"), CHANGED)
 def test_the_expert_recovers_or_says_that_it_cannot(robot: str, task: str, kind: str, at: int):
     seed = stream_seeds("certificate", 20)[at]
-    config, condition = EnvConfig(robot, task, horizon=at + TASKS[task].limits.horizon), Perturbation(kind, {seed: at})
+    config, condition = (
+        make_config(robot, task, horizon=at + TASKS[task].limits.horizon),
+        Perturbation(kind, {seed: at}),
+    )
     [episode] = RolloutJob(config, hold=0, conditions=(condition,)).run([seed])
     assert len(episode) > at
     if (robot, task, kind, at) in UNSOUND:

@@ -26,12 +26,12 @@ from manip_il.collect.workers import Engine, map_in_order
 from manip_il.data.journal import list_seeds
 from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from ..faults.child import living
 
 SEEDS = stream_seeds("certificate", 8)
-JOB = RolloutJob(EnvConfig("fetch", "reach"), hold=3)
+JOB = RolloutJob(make_config("fetch", "reach"), hold=3)
 PROGRAM = """
 import os, time
 from manip_il.collect.workers import open_pool
@@ -86,7 +86,7 @@ def test_an_episode_is_on_disk_before_it_arrives_with_the_bytes_of_one_process(e
 @pytest.mark.slow
 @both_backends
 def test_a_policy_acts_the_same_everywhere(engine: Engine, checkpoint):
-    job = RolloutJob(EnvConfig(horizon=10), PolicyDriver((checkpoint,), 0.5))
+    job = RolloutJob(make_config(horizon=10), PolicyDriver((checkpoint,), 0.5))
     assert written(engine.run(job, SEEDS[:4])) == written(job.run(SEEDS[:4]))
 
 

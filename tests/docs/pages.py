@@ -17,7 +17,7 @@ PAGES = (
     "benchmarks/README.md",
     "datasets/README.md",
 )
-LANGUAGES = ("sh", "python", "yaml", "text")
+LANGUAGES = ("sh", "python", "yaml", "toml", "text")
 _FENCE = re.compile(r"^ *```(\w*)$")
 
 

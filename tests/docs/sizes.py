@@ -10,7 +10,7 @@ import yaml
 
 from manip_il.cli.main import load
 from manip_il.cli.options import options_of
-from manip_il.stock.table import ROBOT as STOCK
+from manip_il.tasks.stock.table import ROBOT as STOCK
 
 from .pages import command_of
 

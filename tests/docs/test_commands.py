@@ -12,7 +12,6 @@ import pytest
 from manip_il.cli.main import load
 from manip_il.cli.parsing import parse
 from manip_il.evaluation import film
-from manip_il.tasks.table import TASKS
 
 from ..store.servers import TOKEN, Hub, hub_server, s3_server, talk_to
 from ..warm import Warm
@@ -61,15 +60,6 @@ def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 
 @pytest.fixture
-def tasks() -> Iterator[None]:
-    """The table of tasks as it was, whatever a page adds to it."""
-    before = dict(TASKS)
-    yield
-    TASKS.clear()
-    TASKS.update(before)
-
-
-@pytest.fixture
 def workplace(
     tmp_path: Path,
     stock: Stock,
@@ -77,7 +67,6 @@ def workplace(
     running_hub: Hub,
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
-    tasks: None,
 ) -> Workplace:
     """A folder with the repository's configs, studies made small, and servers that answer for the Hub and S3."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")

@@ -19,9 +19,9 @@ from manip_il.evaluation.certify import certify, count_episodes, draw_moment
 from manip_il.evaluation.intervals import wilson_interval
 from manip_il.learn.checkpoint import Origin
 from manip_il.mdp import Episode
-from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.events import NOTICEABLE, Perturbation
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env, scene_of
 
 from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint
@@ -43,7 +43,7 @@ def certificate(*rows: Row) -> Certificate:
 
 @pytest.fixture(scope="module")
 def measured() -> Certificate:
-    return certify(Engine(), EnvConfig("fetch", "pick_place"), 3)
+    return certify(Engine(), make_config("fetch", "pick_place"), 3)
 
 
 def test_a_gap_is_the_cost_to_go_after_the_action_less_that_without_it():
@@ -91,11 +91,11 @@ def test_the_tables_and_the_page_show_the_numbers_and_who_was_not_solved():
 
 @pytest.mark.parametrize("kind", ["random", "opposite", "gripper"])
 def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate, kind: str):
-    expert = Expert(build_scene("fetch", "pick_place"))
+    expert = Expert(scene_of("fetch", "pick_place"))
 
     def steps_to_go(seed: int, moment: int, perturbed: bool) -> int | None:
         perturbation = Perturbation(kind, {seed: moment if perturbed else 10_000})
-        env = ManipEnv("fetch", "pick_place", conditions=[perturbation])
+        env = make_env("fetch", "pick_place", conditions=[perturbation])
         env.start(seed)
         for step in range(moment + env.config.horizon):
             env.begin_step()
@@ -121,14 +121,14 @@ def test_every_kind_has_its_row_and_every_case_its_moment_on_the_experts_way(mea
         for case in one.cases:
             assert case.moment == draw_moment(case.seed, one.name, whole[case.seed])
             assert case.undisturbed == whole[case.seed] - case.moment
-    assert measured.fingerprint == env_fingerprint(EnvConfig("fetch", "pick_place"))
-    assert count_episodes(EnvConfig(), 3) == 3 * len(measured.rows)
+    assert measured.fingerprint == env_fingerprint(make_config("fetch", "pick_place"))
+    assert count_episodes(make_config(), 3) == 3 * len(measured.rows)
 
 
 def test_fingers_that_stand_as_they_would_be_put_are_no_case(measured: Certificate):
     rows = {row.name: row for row in measured.rows}
     whole = {case.seed: case.steps or 0 for case in rows["start"].cases}
-    env = ManipEnv("fetch", "pick_place")
+    env = make_env("fetch", "pick_place")
     expert = Expert(env.scene)
 
     def is_open(seed: int) -> bool:
@@ -145,19 +145,19 @@ def test_fingers_that_stand_as_they_would_be_put_are_no_case(measured: Certifica
 
 def test_an_expert_that_is_given_no_time_is_told_so():
     with pytest.raises(ManipError, match="solved none of 2 undisturbed episodes within 6 steps"):
-        certify(Engine(), EnvConfig(horizon=6), 2)
+        certify(Engine(), make_config(horizon=6), 2)
 
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory) -> Path:
     """An untrained one, which solves nothing."""
-    env = EnvConfig("fetch", "reach", horizon=60)
+    env = make_config("fetch", "reach", horizon=60)
     meta = Origin.of(env_spec(env), env_fingerprint(env))
     return write_checkpoint(tmp_path_factory.mktemp("policy"), "act", env_spec(env), origin=meta)
 
 
 def test_the_expert_goes_on_from_where_a_learner_left_it(policy: Path):
-    env, episodes = EnvConfig("fetch", "reach", horizon=60), list[Episode]()
+    env, episodes = make_config("fetch", "reach", horizon=60), list[Episode]()
     made = certify(Engine(), env, 4, policy=policy, on_episode=episodes.append)
     [learner] = made.of("learner")
     assert (len(learner.cases), learner.left_out) == (4, 0)
@@ -173,9 +173,9 @@ def test_the_expert_goes_on_from_where_a_learner_left_it(policy: Path):
 @pytest.mark.slow
 def test_two_processes_give_the_same_certificate(measured: Certificate):
     with Engine(2) as engine:
-        again = certify(engine, EnvConfig("fetch", "pick_place"), 3)
+        again = certify(engine, make_config("fetch", "pick_place"), 3)
     assert again == measured
-    assert certify(Engine(), EnvConfig("fetch", "pick_place"), 3, seed=1).rows != again.rows
+    assert certify(Engine(), make_config("fetch", "pick_place"), 3, seed=1).rows != again.rows
 
 
 # What 500 cases a kind gave, panda and fetch: start 100 and 100 %, changed states 99.7 and 99.8 %, wrong actions 100
@@ -189,7 +189,7 @@ MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: measured 4.5 
 @pytest.fixture(scope="module", params=["panda", "fetch"])
 def certified(request, tmp_path_factory) -> Certificate:
     """Beside perturbed states, those that a poor clone of the expert visits."""
-    env = EnvConfig(request.param)
+    env = make_config(request.param)
     return certify(Engine(), env, CASES, policy=clone(env, 10, tmp_path_factory.mktemp("clone"), steps=300, width=64))
 
 

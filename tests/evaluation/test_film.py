@@ -12,9 +12,9 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data import schema
 from manip_il.evaluation.film import Shot, encode_mp4, filmed_steps, run_states
 from manip_il.sim.conditions import Condition
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
-JOB = RolloutJob(EnvConfig(), label="last")
+JOB = RolloutJob(make_config(), label="last")
 SEED = 4_000_000
 
 

@@ -18,8 +18,8 @@ from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.rounds import format_seconds, history
 from manip_il.evaluation.tables import BASELINE, CLONING, PolicyRow
 from manip_il.sim.conditions import Condition
+from manip_il.sim.task import phases
 from manip_il.tasks.table import TASKS
-from manip_il.tasks.task import phases
 
 from .made_evals import far_corner, made_comparison, made_eval, without_detail
 from .page import EVIL, Page, page_of

@@ -18,14 +18,15 @@ from manip_il.evaluation.runner import episode_result, evaluate
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, Condition, draw
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env
 
 from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint
 
 SEEDS = stream_seeds("certificate", 12)
-ENV = EnvConfig("fetch", horizon=12)
-ALL = suite_conditions("all", EnvConfig(), sees=False)
+ENV = make_config("fetch", horizon=12)
+ALL = suite_conditions("all", make_config(), sees=False)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def act(tmp_path_factory):
 @pytest.fixture(scope="module")
 def mlp(tmp_path_factory):
     """A policy of one call for all episodes, fitted a little so that its actions differ from state to state."""
-    return clone(EnvConfig("fetch"), 3, tmp_path_factory.mktemp("policy"), steps=60, width=64, batch_size=64)
+    return clone(make_config("fetch"), 3, tmp_path_factory.mktemp("policy"), steps=60, width=64, batch_size=64)
 
 
 def job_of(policy, **changes) -> RolloutJob:
@@ -70,7 +71,7 @@ def test_an_episode_of_a_suite_is_that_of_its_condition_alone(act):
 
 def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
     result = evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it", suite="all")
-    env = ManipEnv(conditions=ALL, config=ENV)
+    env = make_env(conditions=ALL, config=ENV)
     for episode in result.episodes:
         env.start(episode.seed)
         assert episode.detail["drawn"] == dict(env.drawn.values)
@@ -81,10 +82,10 @@ def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
 
 
 def test_places_are_the_true_ones_of_first_and_last_state():
-    job = RolloutJob(EnvConfig("fetch"), label="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),))
+    job = RolloutJob(make_config("fetch"), label="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),))
     [episode] = job.run(SEEDS[:1])
     result = episode_result(job, episode)
-    env = ManipEnv(config=EnvConfig("fetch"))
+    env = make_env(config=make_config("fetch"))
     env.start(SEEDS[0])
     assert result.detail["start"]["object"] == pytest.approx(env.world.pose("object").position, abs=1e-4)
     assert result.detail["start"]["hand"] == pytest.approx(env.data.site_xpos[env.scene.ee_site], abs=1e-4)
@@ -95,7 +96,7 @@ def test_places_are_the_true_ones_of_first_and_last_state():
 
 
 def test_a_task_without_an_object_has_no_place_of_one(act):
-    job = RolloutJob(EnvConfig("fetch", "reach", horizon=8), label="last")
+    job = RolloutJob(make_config("fetch", "reach", horizon=8), label="last")
     [one] = evaluate(Engine(1), job, SEEDS[:1], "expert").episodes
     assert set(one.detail["start"]) == {"hand"}
 

@@ -20,7 +20,7 @@ from manip_il.learn.lerobot_config import policy_class, policy_config, policy_ty
 from manip_il.learn.names import PLAIN
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import fit
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 from .tiny_policies import edit_config, refused, write_checkpoint
 
@@ -218,7 +218,7 @@ def test_a_worker_trusts_only_what_its_job_does(act, ran):
     edit_config(act, input_features={"observation.state": {"type": "STATE", "shape": [8]}})
     edit_config(act, output_features={"action": {"type": "ACTION", "shape": [8]}})
     (act / "manip_il.json").unlink()
-    job = RolloutJob(EnvConfig("panda", "reach", horizon=8), PolicyDriver((act,)), label="last")
+    job = RolloutJob(make_config("panda", "reach", horizon=8), PolicyDriver((act,)), label="last")
     with pytest.raises(ManipError, match="--trust=true"):
         list(pickle.loads(pickle.dumps(job)).run([0]))
     assert ran == []

@@ -8,11 +8,12 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy_files import policy_cameras
-from manip_il.sim.config import CameraConfig, EnvConfig, Look
+from manip_il.sim.config import CameraConfig, Look
+from manip_il.tasks.config import make_config
 
 from .tiny_policies import edit_config, write_checkpoint
 
-ENV = EnvConfig("panda", "reach", horizon=8)
+ENV = make_config("panda", "reach", horizon=8)
 DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from manip_il.data.schema import EXECUTED_ACTION
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl]
 SIDE, STEPS, COUNT = 32, 10, 4
@@ -29,7 +29,7 @@ def test_act_on_pictures_trains_and_acts_alike_in_lerobot_eval_and_in_ours(
 ):
     demos = record("seen", 3, "--cameras=front", f"--image.height={SIDE}", f"--image.width={SIDE}")
     reach = trial(
-        EnvConfig("panda", "reach", horizon=STEPS, tolerance=0.3), COUNT, CameraConfig(("front",), SIDE, SIDE)
+        make_config("panda", "reach", horizon=STEPS, tolerance=0.3), COUNT, CameraConfig(("front",), SIDE, SIDE)
     )
     inputs = {  # LeRobot would take environment_state too: it is a column of every dataset of ours
         "observation.state": {"type": "STATE", "shape": [8]},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.sim.env import EnvConfig
+from manip_il.tasks.config import make_config
 
 pytestmark = pytest.mark.slow
 UNFILMED = "--env.render_mode=none"  # these tests need no OpenGL
@@ -28,7 +28,7 @@ def test_lerobot_eval_finds_our_success_for_every_seed_and_needs_no_word_of_the_
     words += [f"--action_space={space}", "--batch_size=64", "--steps=300", f"--output_dir={tmp_path / 'run'}"]
     assert main(["train", f"--dataset.root={demos}", *words]) == 0
     path = tmp_path / "run/checkpoints/last/pretrained_model"
-    evaluation = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.1), 6)
+    evaluation = trial(make_config("panda", "reach", horizon=40, tolerance=0.1), 6)
     few = evaluation.words(batch_size, asynchronous=batch_size == 2)
     command("lerobot-eval", f"--policy.path={path}", *few, UNFILMED, f"--output_dir={tmp_path / 'eval'}")
     theirs, ours = lerobots(tmp_path / "eval"), evaluation.ours(path)
@@ -44,6 +44,6 @@ def test_lerobot_trains_our_mlp_on_our_dataset(command, trial, demos, tmp_path):
         "--dataset.repo_id=someone/reach", f"--dataset.root={demos}", f"--output_dir={tmp_path / 'run'}",
         "--steps=400", "--batch_size=32", "--num_workers=0",
     )  # fmt: skip
-    reach = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.1), 8)
+    reach = trial(make_config("panda", "reach", horizon=40, tolerance=0.1), 8)
     episodes = reach.ours(tmp_path / "run/checkpoints/last/pretrained_model")
     assert sum(episode.success for episode in episodes) >= 6

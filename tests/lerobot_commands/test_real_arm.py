@@ -22,7 +22,7 @@ from manip_il.data.schema import ACTION, STATE
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.robots.table import get_robot
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.envs import scene_of
 
 from ..so_follower import Camera, arm, record, recorders_features
 
@@ -34,7 +34,7 @@ KEPT = {ACTION, STATE, "observation.images.front"}
 
 @pytest.fixture
 def real(monkeypatch: pytest.MonkeyPatch) -> Any:
-    robot, model = get_robot("so101"), build_scene("so101", "reach").model
+    robot, model = get_robot("so101"), scene_of("so101", "reach").model
     limits = {name: tuple(model.joint(f"robot/{name}").range) for name in (*robot.joints, "gripper")}
     found = arm(monkeypatch, limits, {"front": Camera(HEIGHT, WIDTH)})
     found.bus.stand({**dict(zip(robot.joints, robot.home, strict=True)), "gripper": 0.5})

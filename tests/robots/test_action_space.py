@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
 from manip_il.robots.action_space import ActionSpace
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.envs import scene_of
 
 from ..tables import every_robot
 
@@ -78,7 +78,7 @@ def test_parts_of_different_lengths_are_refused_with_all_of_them():
 
 @every_robot
 def test_a_scenes_actions_are_its_robots_joints_in_their_ranges(robot: str):
-    scene = build_scene(robot, "reach")
+    scene = scene_of(robot, "reach")
     actions, gripper = scene.actions, scene.gripper
     assert actions.names == scene.robot.joint_names
     assert (actions.low < actions.high).all()

@@ -26,7 +26,8 @@ from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.sim.home import meeting_at
-from manip_il.sim.scene import PREFIX, build_scene
+from manip_il.sim.scene import PREFIX
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import TASKS
 
 from ..tables import every_robot
@@ -39,7 +40,7 @@ EVERYWHERE = Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21)))
 def test_a_hand_opens_with_its_command(robot: str):
     openings = sweep(get_robot(robot)).openings
     assert (np.diff(openings) > 0).all()
-    assert openings.max() == build_scene(robot, "reach").gripper.most
+    assert openings.max() == scene_of(robot, "reach").gripper.most
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -51,12 +52,12 @@ def test_what_a_task_grasps_has_a_width(task: str):
 
 @every_robot
 def test_at_home_nothing_overlaps(robot: str):
-    scene = build_scene(robot, "reach")
+    scene = scene_of(robot, "reach")
     assert meeting_at(scene.robot, scene.model, PREFIX, np.asarray(scene.robot.home)) == {}
 
 
 def test_parts_that_overlap_are_named_and_how_deep(tmp_path: Path):
-    scene = build_scene(str(write(tmp_path)), "reach")
+    scene = scene_of(str(write(tmp_path)), "reach")
     found = meeting_at(scene.robot, scene.model, PREFIX, np.array([0, 1.6, 1.0, 1.0, 0]))
     assert ("fore", "table") in found
     assert 0.01 < found["fore", "table"] < 0.1
@@ -64,7 +65,7 @@ def test_parts_that_overlap_are_named_and_how_deep(tmp_path: Path):
 
 def test_neighbours_that_overlap_in_any_posture_are_no_fault_of_home(tmp_path: Path):
     long = model_of().replace('size="0.03" fromto="0 0 0.05', 'size="0.03" fromto="0 0 -0.15')  # into the base
-    scene = build_scene(str(write(tmp_path, model=long)), "reach")
+    scene = scene_of(str(write(tmp_path, model=long)), "reach")
     found = meeting_at(scene.robot, scene.model, PREFIX, np.asarray(scene.robot.home))
     assert set(found) == {("base", "upper")}
 

@@ -16,7 +16,7 @@ from manip_il.robots.robot import FOUND, Robot
 from manip_il.robots.rotations import angle_across, angle_off_vertical
 from manip_il.robots.table import get_robot, read_robot
 from manip_il.seeding import stream_seeds
-from manip_il.sim.config import EnvConfig
+from manip_il.tasks.config import make_config
 
 from .own import ARM, EXAMPLES, JAWS, tree_of, write
 
@@ -114,7 +114,7 @@ def test_a_mistake_is_one_line(mistake: str, tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["reach", "pick_place"])
 def test_the_expert_drives_an_arm_of_a_short_yaml(path: Path, task: str):
-    episodes = list(RolloutJob(EnvConfig(str(path), task)).run(SEEDS))
+    episodes = list(RolloutJob(make_config(str(path), task)).run(SEEDS))
     assert all(episode.success for episode in episodes)
 
 
@@ -136,5 +136,5 @@ def test_an_example_says_little_and_is_found_whole(example: Path):
 @pytest.mark.parametrize("name", ["ur5e", "xarm7"])
 def test_the_expert_stacks_with_fingers_on_a_linkage(name: str):
     example = next(path for path in EXAMPLES if path.stem == name)
-    episodes = list(RolloutJob(EnvConfig(str(example), "stack")).run(SEEDS))
+    episodes = list(RolloutJob(make_config(str(example), "stack")).run(SEEDS))
     assert all(episode.success for episode in episodes)

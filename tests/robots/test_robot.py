@@ -17,7 +17,8 @@ from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.table import get_robot
-from manip_il.sim.scene import PREFIX, build_scene
+from manip_il.sim.scene import PREFIX
+from manip_il.tasks.envs import scene_of
 
 from ..scenes import drive, started, world_at_home
 from ..tables import every_robot
@@ -29,14 +30,14 @@ MODEL = ARM.replace("FINGERS", JAWS["slides"][0])
 def refusal(path: Path, task: str = "reach") -> str:
     """The one line that a robot's YAML is refused with."""
     with pytest.raises(UsageError) as caught:
-        build_scene(str(path), task)
+        scene_of(str(path), task)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
 def test_an_arm_from_a_yaml_is_a_scene_and_has_the_files_name(tmp_path: Path):
     path = write(tmp_path, "six_axes")
-    scene = build_scene(str(path), "reach")
+    scene = scene_of(str(path), "reach")
     assert scene.robot.name == "six_axes"
     assert scene.robot.joint_names == ("turn", "shoulder", "elbow", "wrist", "roll", "gripper")
     assert scene.name == "six_axes reach"
@@ -234,7 +235,7 @@ def test_a_gripper_too_small_for_the_tasks_cube_is_one_line(tmp_path: Path):
     path = write(tmp_path, tree=inside("gripper", open=[0.02, 0.02]))
     line = refusal(path, "pick_place")
     assert "task pick_place: 'object' is 0.050 m wide, and the gripper of own opens to 0.042 m" in line
-    assert build_scene(str(path), "reach").gripper.most < 0.05
+    assert scene_of(str(path), "reach").gripper.most < 0.05
 
 
 def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
@@ -251,7 +252,7 @@ def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
 
 @every_robot
 def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
-    scene = build_scene(robot, "reach")
+    scene = scene_of(robot, "reach")
     model = scene.model
     assert sorted(model.camera(i).name for i in range(model.ncam)) == ["front", f"{PREFIX}wrist", "side"]
     assert all(model.light_bodyid == 0)
@@ -267,7 +268,7 @@ def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
 @pytest.mark.filterwarnings("error")
 def test_a_models_own_world_is_left_out_without_a_warning(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
-    build_scene(str(write(tmp_path)), "reach")
+    scene_of(str(write(tmp_path)), "reach")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 

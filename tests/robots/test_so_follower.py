@@ -16,9 +16,10 @@ from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots import ROBOTS
 from manip_il.robots.servos import LeRobotConfig, ServoUnits
 from manip_il.robots.table import get_robot
-from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv, joint_state
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import scene_of
 
 from ..scenes import started
 from ..so_follower import Camera, arm, recorders_features
@@ -35,7 +36,7 @@ def real(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def limits() -> dict[str, tuple[float, float]]:
     """Of the model's joints [rad], whose names are the servos'."""
-    robot, model = get_robot("so101"), build_scene("so101", "reach").model
+    robot, model = get_robot("so101"), scene_of("so101", "reach").model
     return {name: tuple(model.joint(f"robot/{name}").range) for name in (*robot.joints, JAW)}
 
 
@@ -45,7 +46,7 @@ def stand(real: Any, env: ManipEnv) -> None:
 
 
 def test_features_are_those_that_lerobots_recorder_makes(real):
-    spec = env_spec(EnvConfig("so101", "pick_place", object="box:0.025"), CameraConfig(("front",), 48, 64))
+    spec = env_spec(make_config("so101", "pick_place", object="box:0.025"), CameraConfig(("front",), 48, 64))
     ours, theirs = features(spec), recorders_features(real)
     for key, feature in theirs.items():
         assert {**ours[key], "info": None} == {**feature, "shape": tuple(feature["shape"]), "info": None}, key
@@ -67,19 +68,19 @@ def test_a_measured_state_is_what_the_real_arms_servos_read(real):
 
 
 def test_the_real_arm_goes_where_an_action_sends_the_simulated_one(real):
-    actions = env_actions(EnvConfig("so101", "reach"))
+    actions = env_actions(make_config("so101", "reach"))
     rng = np.random.default_rng(0)
     for _ in range(20):
         action = rng.uniform(actions.low, actions.high)
         real.send_action(dict(zip(actions.names, action.tolist(), strict=True)))
         joints, opening = actions.split(action)
-        wanted = [*joints, *build_scene("so101", "reach").gripper.command(opening)]
+        wanted = [*joints, *scene_of("so101", "reach").gripper.command(opening)]
         steps = [real.bus.steps[name] for name in limits()]
         np.testing.assert_allclose((np.array(steps) - 2047.5) * 360 / 4096, np.degrees(wanted), atol=2 * STEP)
 
 
 def test_units_there_and_back_are_the_same_joints_and_opening():
-    scene, rng = build_scene("so101", "reach"), np.random.default_rng(0)
+    scene, rng = scene_of("so101", "reach"), np.random.default_rng(0)
     actions, gripper = scene.actions, scene.gripper
     for _ in range(50):
         joints, opening = rng.uniform(-1.5, 1.5, 5), rng.uniform(gripper.least, gripper.most)
@@ -101,8 +102,8 @@ def test_a_gripper_whose_numbers_fall_as_it_opens_comes_back_too():
 def test_robots_with_a_name_of_lerobots_are_known_by_it():
     named = {one.lerobot.robot_type: name for name in ROBOTS if (one := get_robot(name)).lerobot is not None}
     assert named == LEROBOT_TYPES
-    assert {name: EnvConfig(name).control_hz for name in ROBOTS} == {"panda": 20, "fetch": 20, "so101": 30}
-    assert env_spec(EnvConfig("so101", "reach")).action_meaning == SERVOS
+    assert {name: make_config(name).control_hz for name in ROBOTS} == {"panda": 20, "fetch": 20, "so101": 30}
+    assert env_spec(make_config("so101", "reach")).action_meaning == SERVOS
     assert ManipILEnv(task="Reach-v0", robot="so101").fps == 30
 
 
@@ -144,4 +145,4 @@ def test_both_models_of_the_arm_have_the_same_zeros():
 
 def test_no_other_robot_has_units_of_its_own():
     for name in ("panda", "fetch"):
-        assert build_scene(name, "reach").actions.units is None
+        assert scene_of(name, "reach").actions.units is None

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from manip_il.robots import ROBOTS
-from manip_il.sim.scene import PREFIX, build_scene, camera_id
+from manip_il.sim.scene import PREFIX, camera_id
 from manip_il.sim.world import World
+from manip_il.tasks.envs import scene_of
 
 from .own import EXAMPLES
 
@@ -45,7 +46,7 @@ def owner(world: World, body: int) -> str:
 
 @pytest.mark.parametrize("robot", [*ROBOTS, *map(str, EXAMPLES)], ids=lambda robot: Path(robot).stem)
 def test_both_fingers_are_in_view(robot: str):
-    world = World(build_scene(robot, "reach"))
+    world = World(scene_of(robot, "reach"))
     scene, data = world.scene, world.data
     data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
     data.qpos[scene.gripper.q] = scene.gripper.command(scene.gripper.least)

@@ -13,9 +13,11 @@ from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageErro
 from manip_il.robots import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import DT_SIM
-from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.register import ENV_IDS, TASK_IDS, register_envs
+from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import GOAL
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env
+from manip_il.tasks.register import ENV_IDS, TASK_IDS, register_envs
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
 
@@ -49,7 +51,7 @@ def trajectory(env: ManipEnv, actions: np.ndarray) -> list[tuple[bytes, bytes, b
 @every_scene
 @pytest.mark.filterwarnings("ignore:.*(infinity|normalized space).*:UserWarning")  # an observation has no bounds
 def test_gymnasium_takes_it_for_its_own(robot: str, task: str):
-    check_env(ManipEnv(robot, task), skip_render_check=True)
+    check_env(make_env(robot, task), skip_render_check=True)
 
 
 def test_every_robot_and_task_has_a_name_in_gymnasium():
@@ -80,7 +82,7 @@ def test_a_seed_is_a_start_whatever_ran_before(robot: str, task: str):
 
 @every_scene
 def test_another_seed_is_another_start_and_reset_starts_with_its_own(robot: str, task: str):
-    env, starts = ManipEnv(robot, task), set[bytes]()
+    env, starts = make_env(robot, task), set[bytes]()
     for seed in range(20):
         env.reset(seed=seed)
         starts.add(bits(env))
@@ -188,7 +190,7 @@ def test_a_control_step_lasts_what_its_rate_says(hz: int):
 
 @pytest.mark.parametrize("hz", [hz for hz in range(1, 501) if 500 % hz == 0])
 def test_a_rate_that_two_milliseconds_divide_keeps_them(hz: int):
-    assert EnvConfig(control_hz=hz).physics_step == DT_SIM
+    assert make_config(control_hz=hz).physics_step == DT_SIM
 
 
 @pytest.mark.parametrize(
@@ -200,4 +202,4 @@ def test_a_rate_that_two_milliseconds_divide_keeps_them(hz: int):
 )
 def test_a_setting_out_of_range_is_refused(setting: dict):
     with pytest.raises(UsageError, match=str(next(iter(setting.values())))):
-        EnvConfig(**setting)
+        make_config(**setting)

@@ -14,7 +14,8 @@ from manip_il.collect.expert import Expert
 from manip_il.errors import ManipError
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import ManipEnv, environment_state_names
-from manip_il.stock.environment import StockEnv
+from manip_il.tasks.envs import make_env
+from manip_il.tasks.stock.environment import StockEnv
 
 from ..scenes import bits, started
 from ..tables import every_robot, every_scene, every_scene_with_a_cube
@@ -39,7 +40,7 @@ def drive(env: ManipEnv, seed: int, steps: int) -> list[tuple[bytes, list[float]
 
 @every_scene_with_a_cube
 def test_a_nominal_episode_is_the_plain_environments_to_the_bit(robot: str, task: str):
-    plain, other = ManipEnv(robot, task), ManipEnv(robot, task, conditions=[HEAVY, NOMINAL])
+    plain, other = make_env(robot, task), make_env(robot, task, conditions=[HEAVY, NOMINAL])
     for seed in (2, 3, 5):  # 2 leaves another cube behind
         assert (drive(plain, seed, 15) == drive(other, seed, 15)) == (seed % 2 == 1)
 
@@ -69,7 +70,7 @@ def test_a_deep_copy_goes_on_by_itself_and_in_the_same_way(condition: Condition)
     assert str(other.reset()) == str(env.reset())
 
 
-@pytest.mark.parametrize("env", [ManipEnv(), StockEnv("FetchReach-v4")], ids=["own", "stock"])
+@pytest.mark.parametrize("env", [make_env(), StockEnv("FetchReach-v4")], ids=["own", "stock"])
 def test_an_environment_is_not_pickled(env: ManipEnv | StockEnv):
     with pytest.raises(ManipError, match=r"cannot be .*pickled"):
         pickle.dumps(env)
@@ -77,7 +78,7 @@ def test_an_environment_is_not_pickled(env: ManipEnv | StockEnv):
 
 @every_scene
 def test_a_late_policy_sees_the_world_three_steps_ago(robot: str, task: str):
-    plain, late = ManipEnv(robot, task), ManipEnv(robot, task, conditions=[LATE])
+    plain, late = make_env(robot, task), make_env(robot, task, conditions=[LATE])
     now, then = drive(plain, 4, 10), drive(late, 4, 10)
     assert [one[0] for one in now] == [one[0] for one in then]  # the true state is not late
     assert [one[1:] for one in then] == [now[max(0, step - 3)][1:] for step in range(10)]
@@ -86,7 +87,7 @@ def test_a_late_policy_sees_the_world_three_steps_ago(robot: str, task: str):
 
 @every_robot
 def test_noise_is_on_joints_and_object_and_all_that_follows_from_them(robot: str):
-    plain, noisy = ManipEnv(robot), ManipEnv(robot, conditions=[NOISY])
+    plain, noisy = make_env(robot), make_env(robot, conditions=[NOISY])
     joints, cubes = [], []
     arm, gripper = plain.scene.actions.arm, plain.scene.actions.gripper
     known = environment_state_names(plain.scene)
@@ -113,7 +114,7 @@ def test_noise_is_on_joints_and_object_and_all_that_follows_from_them(robot: str
 
 @every_scene
 def test_the_same_seed_is_shown_the_same_noise(robot: str, task: str):
-    env = ManipEnv(robot, task, conditions=[NOISY, LATE])
+    env = make_env(robot, task, conditions=[NOISY, LATE])
     first = drive(env, 6, 5)
     drive(env, 7, 2)
     assert drive(env, 6, 5) == first
@@ -123,7 +124,7 @@ def test_the_same_seed_is_shown_the_same_noise(robot: str, task: str):
 def test_pictures_show_the_episodes_own_look_and_plain_ones_after_it():
     look = Condition("look", colour=(0.1, 0.9), size=(0.06, 0.06), camera_shift=(0.05, 0.05), brightness=(0.5, 0.7))
     settings: dict[str, Any] = {"robot": "fetch", "cameras": ("front", "wrist"), "image_size": (32, 32)}
-    plain, other = ManipEnv(**settings), ManipEnv(conditions=[look, NOMINAL], **settings)
+    plain, other = make_env(**settings), make_env(conditions=[look, NOMINAL], **settings)
     for seed in (0, 1, 2, 3):
         plain.start(seed)
         other.start(seed)

@@ -9,9 +9,9 @@ from manip_il.evaluation.suites import read_condition
 from manip_il.robots import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.sim.env import ManipEnv
+from manip_il.sim.points import point_names, points_in
 from manip_il.sim.render import Line, marked_picture, pictures, projections
-from manip_il.tasks.points import point_names, points_in
+from manip_il.tasks.envs import make_env
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
 
@@ -52,13 +52,13 @@ def test_a_spot_that_is_drawn_at_a_point_is_seen_where_the_point_is_said_to_be(r
     space = env.scene.robot.workspace
     rng = np.random.default_rng(0)
     points = np.array([*space.centre, 0.2]) + rng.uniform(-0.1, 0.1, (12, 3))
-    plain = pictures(robot, "pick_place", env.data, SIZE)
-    found, seen = projections(robot, "pick_place", SIZE, points), 0
+    plain = pictures(env.scene, env.data, SIZE)
+    found, seen = projections(env.scene, SIZE, points), 0
     for number, point in enumerate(points):
         for camera in CAMERAS:
             across, down, in_view = found[camera][number].tolist()
             line = Line(point - [0, 0, 0.004], point + [0, 0, 0.004], RED, 0.008)
-            marked = marked_picture(robot, "pick_place", env.data, camera, SIZE.size, Look(), [line])
+            marked = marked_picture(env.scene, env.data, camera, SIZE.size, Look(), [line])
             rows, columns = np.nonzero((marked != plain[camera]).any(axis=2))
             whole = 8 < len(rows) < 200 and rows.min() and columns.min() and rows.max() < 95 and columns.max() < 127
             if whole:  # nothing hides it, and the picture's edge does not cut it
@@ -109,4 +109,4 @@ def test_keypoints_are_as_late_as_their_pictures():
 
 
 def test_without_cameras_there_are_none():
-    assert ManipEnv("panda").observe().keypoints == {}
+    assert make_env("panda").observe().keypoints == {}

@@ -12,7 +12,7 @@ import pytest
 from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.config import FILM, CameraConfig, Look
-from manip_il.sim.env import ManipEnv
+from manip_il.tasks.envs import make_env
 
 BRIGHTNESS, TURN = r"brightness is .*; expected a factor from 0\.1 to 2", r"light_turn is .* degrees"
 
@@ -36,7 +36,7 @@ def test_pictures_that_no_video_takes_and_light_that_no_lamp_gives_are_refused(m
 
 def test_an_unknown_camera_answers_with_the_nearest():
     with pytest.raises(UnknownName, match="did you mean 'wrist'"):
-        ManipEnv("panda", "reach", cameras=("wrst",))
+        make_env("panda", "reach", cameras=("wrst",))
 
 
 def test_equal_configurations_have_one_canonical_text_and_others_another():

@@ -8,6 +8,7 @@ import pytest
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names, joint_state
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
+from manip_il.tasks.envs import make_env
 from manip_il.tasks.sort import asked
 from manip_il.tasks.table import TASKS
 
@@ -65,7 +66,7 @@ def test_joints_and_opening_are_the_measured_ones(robot: str, task: str):
 
 @every_scene
 def test_every_number_has_a_name_and_the_same_whatever_the_world_is_like(robot: str, task: str):
-    env = ManipEnv(robot, task)
+    env = make_env(robot, task)
     names = environment_state_names(env.scene)
     env.start(1)
     assert environment_state_names.__wrapped__(env.scene) == names

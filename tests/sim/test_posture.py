@@ -8,6 +8,7 @@ import pytest
 from manip_il.sim import posture
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
+from manip_il.tasks.envs import make_env
 
 from ..scenes import bits, started
 from ..tables import every_robot, every_scene
@@ -44,7 +45,7 @@ def test_the_same_seed_begins_in_the_same_posture(robot: str, task: str):
 
 @every_robot
 def test_the_hand_is_within_reach_and_touches_nothing_at_every_start(robot: str):
-    env, offsets = ManipEnv(robot, "clear_table", conditions=[ELSEWHERE]), []
+    env, offsets = make_env(robot, "clear_table", conditions=[ELSEWHERE]), []
     for seed in range(30):
         env.start(seed)
         assert env.world.reach.has(env.world.ee.position)

@@ -13,6 +13,7 @@ from manip_il.sim.config import CAMERAS
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.props import props
 from manip_il.sim.world import GOAL
+from manip_il.tasks.envs import make_env
 from manip_il.tasks.starts import UPRIGHT
 
 from ..scenes import SEED, bits, started, still
@@ -80,7 +81,7 @@ def test_clutter_changes_no_physics_and_follows_from_the_state():
         for one in (plain, env):
             one.advance(still(one, 0.01) + 0.02)
     assert np.array_equal(plain.world.physics(), env.world.physics())
-    other = ManipEnv("panda")
+    other = make_env("panda")
     other.set_state(env.get_state())
     assert bits(other) == bits(env)
     for left, right in zip(things(env), things(other), strict=True):

@@ -8,9 +8,12 @@ import pytest
 
 from manip_il.errors import UnknownName
 from manip_il.robots.table import get_robot
-from manip_il.sim.scene import DT_SIM, _build, build_scene, camera_id
+from manip_il.sim.config import DT_SIM
+from manip_il.sim.scene import build_scene, camera_id
 from manip_il.sim.variation import PER_OBJECT, WORLD_SIZE
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.objects import CUBE_HALF
+from manip_il.tasks.table import TASKS
 
 from ..scenes import cube, drive_until, half_height, in_hand, started, still
 from ..tables import SCENES, every_robot, every_scene
@@ -45,19 +48,19 @@ def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str):
 
 @every_scene
 def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: str):
-    scene = build_scene(robot, task)
-    assert build_scene(robot, task) is scene
-    assert _build.__wrapped__(get_robot(robot), task, "", DT_SIM).model_bytes() == scene.model_bytes()
+    scene = scene_of(robot, task)
+    assert scene_of(robot, task) is scene
+    assert build_scene.__wrapped__(get_robot(robot), TASKS[task]).model_bytes() == scene.model_bytes()
 
 
 def test_no_two_scenes_are_the_same_model():
-    models = {build_scene(robot, task).model_bytes() for robot, task in SCENES}
+    models = {scene_of(robot, task).model_bytes() for robot, task in SCENES}
     assert len(models) == len(SCENES)
 
 
 @every_scene
 def test_addresses_are_what_their_names_say(robot: str, task: str):
-    scene = build_scene(robot, task)
+    scene = scene_of(robot, task)
     assert scene.model.opt.timestep == DT_SIM
     for address, motor, name in zip(scene.arm_q, scene.arm_ctrl, scene.robot.joints, strict=True):
         joint = scene.model.joint(f"robot/{name}")
@@ -72,7 +75,7 @@ def test_addresses_are_what_their_names_say(robot: str, task: str):
 
 @every_robot
 def test_a_pedestal_stands_on_the_floor_and_reaches_to_the_robot(robot: str):
-    model = build_scene(robot, "reach").model
+    model = scene_of(robot, "reach").model
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     names = [model.geom(i).name for i in range(model.ngeom)]
@@ -88,4 +91,4 @@ def test_a_pedestal_stands_on_the_floor_and_reaches_to_the_robot(robot: str):
 
 def test_an_unknown_camera_names_those_there_are():
     with pytest.raises(UnknownName, match=r"did you mean 'wrist'.*known: front, side, wrist"):
-        camera_id(build_scene("panda", "reach").model, "writs")
+        camera_id(scene_of("panda", "reach").model, "writs")

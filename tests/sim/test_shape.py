@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, UsageError
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.scene import build_scene
 from manip_il.sim.shape import CUBE, LIGHTEST, Shape
 from manip_il.sim.variation import extents
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
 
 lengths = st.integers(20, 120).map(lambda millimetres: millimetres / 1000)
@@ -61,7 +61,7 @@ def test_a_shapes_text_means_the_shape(kind: str, x: float, y: float, z: float):
 )
 def test_what_is_no_shape_is_refused_in_one_line(text: str, words: str):
     with pytest.raises(UsageError, match=words) as refused:
-        EnvConfig(object=text)
+        make_config(object=text)
     assert "\n" not in str(refused.value)
 
 
@@ -72,7 +72,7 @@ def test_an_object_whose_first_geom_is_a_mesh_is_refused_with_what_works():
 
 @pytest.mark.parametrize("text", ["box:0.06x0.03x0.04", "cylinder:0.04x0.08", "sphere:0.06", "capsule:0.04x0.1"])
 def test_the_model_has_the_lengths_and_the_mass(text: str):
-    shape, scene = Shape.parse(text), build_scene("panda", "pick_place", text)
+    shape, scene = Shape.parse(text), scene_of("panda", "pick_place", text)
     one = scene.objects["object"]
     kind, size = int(scene.model.geom_type[one.geom]), scene.model.geom_size[one.geom]
     assert extents(kind, size) == pytest.approx(shape.lengths)
@@ -85,20 +85,20 @@ def test_the_model_has_the_lengths_and_the_mass(text: str):
 
 
 def test_a_cube_of_5_cm_is_the_default():
-    assert EnvConfig(object="box:0.05") == EnvConfig(object="box") == EnvConfig()
+    assert make_config(object="box:0.05") == make_config(object="box") == make_config()
     assert CUBE.mass == pytest.approx(0.1)
 
 
 def test_what_is_wider_than_the_gripper_opens_is_refused_with_both_numbers():
     with pytest.raises(UsageError, match=r"'object' is 0.090 m wide, and the gripper of panda opens to 0.078 m"):
-        build_scene("panda", "pick_place", "sphere:0.09")
+        scene_of("panda", "pick_place", "sphere:0.09")
     with pytest.raises(UsageError, match=r"0.080 m wide"):  # on its largest face, nothing narrower is left
-        build_scene("panda", "lift", "box:0.08x0.1x0.02")
+        scene_of("panda", "lift", "box:0.08x0.1x0.02")
 
 
 def test_a_task_with_objects_of_its_own_takes_no_other():
     with pytest.raises(UsageError, match=r"'sphere:0[.]04', but stack has objects of its own; it is for lift"):
-        EnvConfig(task="stack", object="sphere:0.04")
+        make_config(task="stack", object="sphere:0.04")
 
 
 def test_an_instruction_names_the_shape():

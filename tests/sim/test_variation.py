@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError
 from manip_il.sim.conditions import Condition
-from manip_il.sim.scene import build_scene
 from manip_il.sim.shape import KINDS
 from manip_il.sim.variation import (
     NOTHING_DRAWN,
@@ -29,6 +28,7 @@ from manip_il.sim.variation import (
     with_drawn,
 )
 from manip_il.sim.world import World
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS, FRICTION
 
 from ..tables import every_scene_with_a_cube
@@ -61,7 +61,7 @@ def inertia_tensor(model: mujoco.MjModel) -> np.ndarray:
 @every_scene_with_a_cube
 def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
     objects = [CUBE_HALF] * 3 + [CUBE_MASS, FRICTION]
-    np.testing.assert_array_equal(build_scene(robot, task).nominal, [*objects, *NOTHING_DRAWN])
+    np.testing.assert_array_equal(scene_of(robot, task).nominal, [*objects, *NOTHING_DRAWN])
 
 
 CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
@@ -96,7 +96,7 @@ EVERYTHING = Condition(
 
 @every_scene_with_a_cube
 def test_what_is_drawn_of_the_world_can_be_read_off_its_variation(robot: str, task: str):
-    base, drawn = build_scene(robot, task).nominal, dict(EVERYTHING.draw(3).values)
+    base, drawn = scene_of(robot, task).nominal, dict(EVERYTHING.draw(3).values)
     assert drawn_in(base, base) == {}
     found = drawn_in(with_drawn(base, drawn), base)
     assert found.pop("size") == pytest.approx(drawn.pop("size"))
@@ -106,7 +106,7 @@ def test_what_is_drawn_of_the_world_can_be_read_off_its_variation(robot: str, ta
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_world_of_any_shape_has_the_one_that_is_drawn_as_mujoco_would_compile_it(task: str, kind: str):
-    world, own = World(build_scene("panda", task, "any")), build_scene("panda", task, f"{kind}:0.043")
+    world, own = World(scene_of("panda", task, "any")), scene_of("panda", task, f"{kind}:0.043")
     for other, width in (("sphere", 0.02), ("box", 0.07), (kind, 0.043)):
         world.vary(with_drawn(world.scene.nominal, {"shape": other, "size": width}))
     assert drawn_in(world.variation, world.scene.nominal) == {"shape": kind, "size": pytest.approx(0.043)}

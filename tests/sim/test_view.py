@@ -8,8 +8,8 @@ import pytest
 
 from manip_il.sim import render, view
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import build_scene
 from manip_il.sim.view import ViewModel, cluster
+from manip_il.tasks.envs import scene_of
 
 from ..scenes import started
 from ..tables import LARGE, every_robot
@@ -62,9 +62,9 @@ def test_merging_keeps_a_boxs_edges_sharp():
 
 @every_robot
 def test_a_view_has_the_physics_poses_and_at_most_12000_triangles(robot):
-    scene = build_scene(robot, "pick_place")
+    scene = scene_of(robot, "pick_place")
     before = scene.model_bytes()
-    drawn = ViewModel(robot, "pick_place", Look()).model
+    drawn = ViewModel(scene, Look()).model
     data, shown = mujoco.MjData(scene.model), mujoco.MjData(drawn)
     data.qpos[scene.arm_q] = shown.qpos[scene.arm_q] = scene.robot.home
     for model, one in ((scene.model, data), (drawn, shown)):
@@ -83,7 +83,7 @@ def test_few_faces_look_like_all_of_them(robot, monkeypatch):
     env = started(robot, cameras=CAMERAS)
     few = env.observe().images
     with monkeypatch.context() as patch:
-        patch.setattr(view, "_with_few_faces", lambda *names: build_scene(*names).model)
+        patch.setattr(view, "_with_few_faces", lambda scene: scene.model)
         render.close()
         every = env.observe().images
     render.close()
@@ -95,11 +95,12 @@ def test_few_faces_look_like_all_of_them(robot, monkeypatch):
 
 
 def test_a_turn_moves_the_lamps_about_the_vertical_and_brightness_scales_them():
-    plain, other = (ViewModel("panda", "reach", look).model for look in (Look(), Look(brightness=0.5, light_turn=90)))
+    looks = Look(), Look(brightness=0.5, light_turn=90)
+    plain, other = (ViewModel(scene_of("panda", "reach"), look).model for look in looks)
     quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(other.light_pos, plain.light_pos @ quarter.T, atol=1e-12)
     np.testing.assert_allclose(other.light_dir, plain.light_dir @ quarter.T, atol=1e-12)
     np.testing.assert_allclose(other.light_diffuse, plain.light_diffuse / 2)
     np.testing.assert_allclose(other.vis.headlight.ambient, np.divide(plain.vis.headlight.ambient, 2))
     assert plain.vis.quality.shadowsize == other.vis.quality.shadowsize == 0
-    assert ViewModel("panda", "reach", Look(shadows=True)).model.vis.quality.shadowsize > 0
+    assert ViewModel(scene_of("panda", "reach"), Look(shadows=True)).model.vis.quality.shadowsize > 0

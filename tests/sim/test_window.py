@@ -8,8 +8,8 @@ import pytest
 from manip_il.errors import RenderError, UsageError
 from manip_il.sim import env as module
 from manip_il.sim import window as windows
-from manip_il.sim.env import ManipEnv
 from manip_il.sim.window import Clock
+from manip_il.tasks.envs import make_env
 
 from ..scenes import still
 
@@ -22,15 +22,15 @@ def test_without_a_display_human_is_refused_in_one_line(monkeypatch):
     ):
         gymnasium.make("manip_il/PandaReach-v0", render_mode="human")
     with pytest.raises(UsageError, match=r"unknown render_mode 'humna' \(did you mean 'human'\?\)"):
-        ManipEnv(render_mode="humna")
+        make_env(render_mode="humna")
 
 
 def test_the_window_shows_the_start_and_every_step_until_it_is_closed(monkeypatch):
     shown: list[float] = []
 
     class Window:
-        def __init__(self, config):
-            self.config = config
+        def __init__(self, scene, control_hz):
+            assert (scene.task.name, control_hz) == ("reach", 20)
 
         def show(self, data, drawn):
             shown.append(data.time)
@@ -40,7 +40,7 @@ def test_the_window_shows_the_start_and_every_step_until_it_is_closed(monkeypatc
 
     monkeypatch.setattr(windows, "require_display", lambda: None)
     monkeypatch.setattr(module, "Window", Window)
-    env = ManipEnv("panda", "reach", render_mode="human")
+    env = make_env("panda", "reach", render_mode="human")
     env.reset(seed=0)
     for _ in range(2):
         env.step(still(env))

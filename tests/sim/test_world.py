@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError, UnknownName
-from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import WORLD_SIZE, with_drawn
 from manip_il.sim.world import World
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 
@@ -40,7 +40,7 @@ def fall(world: World, steps: int = 60) -> bytes:
 
 @every_scene
 def test_a_world_as_compiled_shares_its_scenes_model(robot: str, task: str):
-    scene = build_scene(robot, task)
+    scene = scene_of(robot, task)
     one, other = World(scene), World(scene)
     assert one.model is other.model is scene.model
     assert one.data is not other.data
@@ -61,7 +61,7 @@ def test_a_varied_world_has_a_model_of_its_own_and_leaves_the_shared_one(world: 
 
 @every_scene_with_a_cube
 def test_back_to_nominal_is_never_having_varied(robot: str, task: str):
-    scene = build_scene(robot, task)
+    scene = scene_of(robot, task)
     plain, varied = World(scene), World(scene)
     varied.vary(with_drawn(scene.nominal, HEAVY))
     fall(varied)
@@ -89,7 +89,7 @@ def model_bytes(world: World) -> bytes:
 @given(st.floats(0.03, 0.07), st.floats(0.05, 0.3), st.floats(0.3, 2))
 @settings(max_examples=25)
 def test_physics_has_what_the_variation_says(edge: float, mass: float, friction: float):
-    world = World(build_scene("fetch", "pick_place"))
+    world = World(scene_of("fetch", "pick_place"))
     world.vary(with_drawn(world.scene.nominal, {"size": edge, "mass": mass, "friction": friction}))
     one, model = world.scene.objects[OBJECT], world.model
     np.testing.assert_allclose(model.geom_size[one.geom], edge / 2)
@@ -124,7 +124,7 @@ def test_a_cube_of_another_size_rests_on_the_table_and_not_in_it(world: World, e
 
 @every_scene
 def test_the_arm_is_damped_and_driven_as_the_variation_says_and_the_gripper_as_ever(robot: str, task: str):
-    world = World(build_scene(robot, task))
+    world = World(scene_of(robot, task))
     world.vary(with_drawn(world.scene.nominal, {"joint_damping": 3.0, "actuator_gain": 0.64}))
     model, plain, arm = world.model, world.scene.model, world.scene.arm_ctrl
     dofs = [model.joint(f"robot/{name}").dofadr[0] for name in world.scene.robot.joints]
@@ -185,7 +185,7 @@ def test_numbers_of_another_scene_are_refused_with_both_sizes(world: World):
     with pytest.raises(MismatchError, match=rf"size of the variation.*has 3, .*has {5 + WORLD_SIZE}"):
         world.vary(np.ones(3))
     with pytest.raises(MismatchError, match=rf"has 5, .*has {WORLD_SIZE}"):
-        World(build_scene("fetch", "reach")).vary(np.ones(5))
+        World(scene_of("fetch", "reach")).vary(np.ones(5))
 
 
 def test_what_was_worked_out_is_known_until_the_world_moves(world: World):

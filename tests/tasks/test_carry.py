@@ -13,16 +13,18 @@ from manip_il.collect.expert import Expert
 from manip_il.collect.scenes import SceneDrawer, Scenes
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
+from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.carry import OBJECT, descent_of
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import env_of, make_env
 from manip_il.tasks.furnishing import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
 from manip_il.tasks.layout import THINGS, path_features
 from manip_il.tasks.reward import TASTES
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.tasks.task import phases
 
 from ..scenes import SEED, drive_until, started
 from ..tables import every_robot
@@ -92,7 +94,7 @@ def test_the_reward_is_the_states_and_not_observed():
 
 
 def test_the_same_state_has_the_same_label_in_any_order():
-    env, states = ManipEnv("panda", "carry"), []
+    env, states = make_env("panda", "carry"), []
     expert = Expert(env.scene)
     for seed in STARTS[:3]:
         env.start(seed)
@@ -126,7 +128,7 @@ def test_neighbouring_positions_head_alike():
 
 @every_robot
 def test_one_to_four_things_stand_where_they_leave_room(robot: str):
-    env, counts = ManipEnv(robot, "carry"), []
+    env, counts = make_env(robot, "carry"), []
     for seed in range(SEED, SEED + 40):
         env.start(seed)
         there = [name for name in (*THINGS, EDGE) if is_there(env.world, name)]
@@ -192,7 +194,7 @@ def test_scenes_that_are_drawn_anew_keep_the_taste():
     low = started("panda", "carry", reward="low")
     visited, seen = low.get_state(), set()
     scenes = Scenes(CameraConfig(("front",)), frames=12)
-    drawer, rng = SceneDrawer(EnvConfig("panda", "carry"), scenes), np.random.default_rng(0)
+    drawer, rng = SceneDrawer(make_config("panda", "carry"), scenes), np.random.default_rng(0)
     for _ in range(12):
         state = drawer.redrawn(visited, rng)
         if state is not None:
@@ -216,12 +218,12 @@ def test_a_reward_of_a_file_drives_an_evaluation(tmp_path: Path, capsys: pytest.
 
 
 def test_things_are_of_a_size_for_the_arm():
-    widths = {robot: float(ManipEnv(robot, "carry").scene.model.geom("vase").size[0]) for robot in ("panda", "so101")}
+    widths = {robot: float(make_env(robot, "carry").scene.model.geom("vase").size[0]) for robot in ("panda", "so101")}
     assert widths["so101"] == pytest.approx(0.6 * widths["panda"])
 
 
 def test_starts_are_found_where_few_layouts_fit_within_reach():
-    env = ManipEnv.of(EnvConfig("so101", "carry"))
+    env = env_of(make_config("so101", "carry"))
     for seed in (6_000_097, *stream_seeds("held_out", 40, 0)):  # the first one fits after 400 drawn layouts alone
         env.start(seed)
         assert not touched(env)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from manip_il.collect.expert import Expert
+from manip_il.sim.task import phases
 from manip_il.tasks.drawer import CABINET, OBJECT
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.tasks.task import phases
 
 from ..scenes import started
 

@@ -24,14 +24,15 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.evaluation.runner import positions
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.env import ManipEnv
 from manip_il.sim.events import STANDARD
-from manip_il.sim.scene import build_scene
+from manip_il.sim.task import NO_PHASE, Instructing, phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
-from manip_il.tasks.task import NO_PHASE, Instructing, phases
 
 from ..scenes import sizes_of, started, still
 from ..tables import SCENES, WITH_A_CUBE, every_scene, every_task
@@ -77,13 +78,13 @@ def test_phases_are_none_and_then_the_rungs_from_the_first_on(task: str):
 
 @every_scene
 def test_what_a_task_grasps_and_moves_is_in_its_scene(robot: str, task: str):
-    scene = build_scene(robot, task)
+    scene = scene_of(robot, task)
     assert set(TASKS[task].grasped) <= set(TASKS[task].objects) <= set(scene.objects)
 
 
 @every_scene
 def test_the_last_rung_holds_everywhere(robot: str, task: str):
-    world, rng = World(build_scene(robot, task)), np.random.default_rng(0)
+    world, rng = World(scene_of(robot, task)), np.random.default_rng(0)
     scene = world.scene
     for _ in range(20):
         world.data.qpos[scene.arm_q] = np.asarray(scene.robot.home) + rng.uniform(-1, 1, len(scene.robot.joints))
@@ -103,7 +104,7 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
 def test_every_rung_of_the_ladder_occurs(task: str):
     seen = set[str]()
     for driver, conditions, horizon in (("expert", (), 0), ("expert", (STANDARD,), 120), ("random", (), 45)):
-        job = RolloutJob(EnvConfig("panda", task, horizon=horizon), driver_of(driver), hold=2, conditions=conditions)
+        job = RolloutJob(make_config("panda", task, horizon=horizon), driver_of(driver), hold=2, conditions=conditions)
         for episode in job.run(SEEDS):
             seen |= {phases(TASKS[task])[phase] for phase in set(episode.columns[EXPERT_PHASE].ravel().tolist())}
     missing = {rung.name for rung in TASKS[task].rungs} - seen
@@ -146,7 +147,7 @@ def test_progress_never_falls_along_the_experts_path_and_ends_at_one(robot: str,
 
 @every_scene
 def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
-    env = ManipEnv(robot, task)
+    env = make_env(robot, task)
     for seed in SEEDS:
         env.start(seed)
         rng = np.random.default_rng(seed)
@@ -163,7 +164,7 @@ def way_left(env: ManipEnv) -> float:
 
 @every_scene
 def test_what_is_solved_has_come_to_where_it_was_to_go(robot: str, task: str):
-    env = ManipEnv(robot, task)
+    env = make_env(robot, task)
     for seed, driven in zip(SEEDS, driven_by_expert(robot, task), strict=True):
         env.start(seed)
         at_first = way_left(env)
@@ -173,7 +174,7 @@ def test_what_is_solved_has_come_to_where_it_was_to_go(robot: str, task: str):
 
 @every_scene
 def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_not(robot: str, task: str):
-    env, fresh = ManipEnv(robot, task), ManipEnv(robot, task)
+    env, fresh = make_env(robot, task), make_env(robot, task)
     for driven in driven_by_expert(robot, task):
         assert driven.solved
         env.set_state(driven.last)
@@ -206,26 +207,26 @@ CHANGES: dict[str, Callable[[mujoco.MjModel], None]] = {
 @pytest.mark.parametrize("change", CHANGES)
 @every_scene
 def test_the_fingerprint_changes_with_the_model(robot: str, task: str, change: str, monkeypatch):
-    config, scene = EnvConfig(robot, task), build_scene(robot, task)
+    config, scene = make_config(robot, task), scene_of(robot, task)
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
     CHANGES[change](model)
-    monkeypatch.setattr(environments, "build_scene", lambda *_: replace(scene, model=model))
+    monkeypatch.setattr(environments, "config_scene", lambda _: replace(scene, model=model))
     after = environments._fingerprint.__wrapped__(config)  # pyright: ignore[reportFunctionMemberAccess]
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 
 
 @every_scene
 def test_the_fingerprint_is_the_scenes_and_the_settings(robot: str, task: str):
-    plain = env_fingerprint(EnvConfig(robot, task))
-    assert env_fingerprint(EnvConfig(robot, task)) == plain
-    longer = env_fingerprint(EnvConfig(robot, task, horizon=99))
+    plain = env_fingerprint(make_config(robot, task))
+    assert env_fingerprint(make_config(robot, task)) == plain
+    longer = env_fingerprint(make_config(robot, task, horizon=99))
     assert {key for key in plain if plain[key] != longer[key]} == {"config_sha256"}
 
 
 @every_scene
 def test_a_datasets_words_fit_the_scene(robot: str, task: str):
-    spec, env = env_spec(EnvConfig(robot, task)), started(robot, task)
+    spec, env = env_spec(make_config(robot, task)), started(robot, task)
     seen, state = env.observe(), env.get_state()
     assert len(spec.joint_names) == len(seen.state) == len(env.scene.actions)
     assert len(spec.environment_state_names) == len(seen.environment_state)
@@ -237,7 +238,7 @@ def test_a_datasets_words_fit_the_scene(robot: str, task: str):
 
 @every_task
 def test_an_episode_is_about_any_text_that_the_task_has_and_about_no_other(task: str):
-    env, the_task = ManipEnv("panda", task), TASKS[task]
+    env, the_task = make_env("panda", task), TASKS[task]
     for text in the_task.instructions if isinstance(the_task, Instructing) else [the_task.instruction]:
         env.reset(seed=SEEDS[0], options={"instruction": text})
         assert env.task_description == env.observe().instruction == text

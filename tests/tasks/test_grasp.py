@@ -15,10 +15,11 @@ from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
 from manip_il.robots.rotations import hand_down
 from manip_il.seeding import stream_seeds
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.sim.env import environment_state_names
 from manip_il.sim.shape import KINDS
 from manip_il.sim.world import World
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env
 from manip_il.tasks.grasp import Lie, lie_of
 from manip_il.tasks.pick_place import OBJECT, observe_object
 
@@ -31,7 +32,7 @@ yaws = st.floats(-math.pi, math.pi)
 
 @cache
 def world_of(shape: str) -> World:
-    return ManipEnv(object=shape).world
+    return make_env(object=shape).world
 
 
 def turned(world: World, yaw: float, up: int) -> Lie:
@@ -90,24 +91,24 @@ def test_what_is_observed_changes_steadily_with_the_yaw(shape: str, yaw: float, 
 
 def test_a_cube_is_observed_as_ever_and_other_shapes_with_their_lengths():
     assert (
-        len(environment_state_names(ManipEnv().scene))
+        len(environment_state_names(make_env().scene))
         == len(environment_state_names(world_of("sphere:0.04").scene)) - 3
     )
-    cube = [name for name in environment_state_names(ManipEnv(object="box:0.03").scene) if name.startswith(OBJECT)]
-    assert cube == [name for name in environment_state_names(ManipEnv().scene) if name.startswith(OBJECT)]
+    cube = [name for name in environment_state_names(make_env(object="box:0.03").scene) if name.startswith(OBJECT)]
+    assert cube == [name for name in environment_state_names(make_env().scene) if name.startswith(OBJECT)]
     assert {"object.folds", "object.width", "object.length", "object.height"} < set(
         environment_state_names(world_of("capsule:0.03x0.06").scene)
     )
 
 
 def test_objects_of_any_shape_are_observed_by_the_same_numbers():
-    env = ManipEnv(object="any")
+    env = make_env(object="any")
     drawn = set[str]()
     for seed in range(20):
         env.start(seed)
         drawn.add(env.drawn.values["shape"])
         alike = f"{env.drawn.values['shape']}:0.05"
-        other = ManipEnv(object=alike)
+        other = make_env(object=alike)
         other.set_state(State(env.world.physics(), other.scene.nominal, 0))
         ours = dict(zip(environment_state_names(env.scene), env.observe().environment_state, strict=True))
         theirs = dict(zip(environment_state_names(other.scene), other.observe().environment_state, strict=True))
@@ -145,5 +146,5 @@ def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(shape: str, 
 )
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
 def test_the_expert_brings_any_shape_to_its_goal(task: str, shape: str):
-    job = RolloutJob(EnvConfig(task=task, object=shape), hold=0)
+    job = RolloutJob(make_config(task=task, object=shape), hold=0)
     assert all(episode.success for episode in job.run(stream_seeds("certificate", 3)))

@@ -10,14 +10,13 @@ import pytest
 from manip_il.collect.expert import Expert
 from manip_il.robots.rotations import hand_down
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import build_scene
+from manip_il.sim.task import phases
 from manip_il.sim.world import World
+from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.insert import APART
 from manip_il.tasks.peg import HOLE, PEG, azimuth, hand_at, lower_end, upper_axis
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.tasks.task import phases
 
 from ..tables import every_robot
 
@@ -27,7 +26,7 @@ SEEDS = stream_seeds("certificate", 6)
 
 @pytest.mark.parametrize(("task", "play"), PLAYS.items())
 def test_the_hole_is_wider_than_the_peg_by_the_play(task: str, play: float):
-    world = World(build_scene("panda", task))
+    world = World(scene_of("panda", task))
     left, right = (world.model.geom(f"hole {side}") for side in ("left", "right"))
     between = left.pos[1] - left.size[0] - (right.pos[1] + right.size[0])
     assert between - world.extents(PEG)[0] == pytest.approx(play)
@@ -35,7 +34,7 @@ def test_the_hole_is_wider_than_the_peg_by_the_play(task: str, play: float):
 
 @every_robot
 def test_the_peg_starts_standing_or_lying_apart_from_the_hole(robot: str):
-    env, up = ManipEnv(robot, "insert"), set[bool]()
+    env, up = make_env(robot, "insert"), set[bool]()
     for seed in SEEDS:
         env.start(seed)
         peg, hole = env.world.pose(PEG), env.world.pose(HOLE)
@@ -57,7 +56,7 @@ def test_a_hand_has_the_azimuth_that_it_was_turned_to_at_any_pitch(yaw: float, p
 
 
 def test_either_end_of_the_peg_may_be_the_lower_one():
-    world = World(build_scene("panda", "insert"))
+    world = World(scene_of("panda", "insert"))
     for upside_down in (UPRIGHT, np.array([0.0, 1.0, 0.0, 0.0])):
         world.place(PEG, np.array([0.5, 0.1, 0.05]), upside_down)
         world.place(HOLE, np.array([0.5, 0.1, 0.0]), UPRIGHT)
@@ -70,7 +69,7 @@ def test_either_end_of_the_peg_may_be_the_lower_one():
 
 @pytest.mark.parametrize("task", PLAYS)
 def test_the_expert_puts_a_standing_and_a_lying_peg_into_the_hole(task: str):
-    env = ManipEnv("panda", task)
+    env = make_env("panda", task)
     expert = Expert(env.scene)
     for seed in SEEDS[:3]:  # one of them lies
         env.start(seed)
@@ -83,7 +82,7 @@ def test_the_expert_puts_a_standing_and_a_lying_peg_into_the_hole(task: str):
 
 
 def test_a_peg_that_the_arm_cannot_lean_over_far_enough_is_set_upright_first():
-    env = ManipEnv("fetch", "insert")
+    env = make_env("fetch", "insert")
     expert, names, seen = Expert(env.scene), phases(TASKS["insert"]), list[str]()
     env.start(SEEDS[0])
     while not env.solved and len(seen) < env.config.horizon:

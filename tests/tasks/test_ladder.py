@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from manip_il.robots.reach import Reach
 from manip_il.robots.rotations import angle_ahead, angle_between, angle_from_down, hand_down
+from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import Pose
 from manip_il.tasks.grasp import FUNNEL_RADIUS, HOVER, LEAN, MAX_TILT, OPEN_SLACK, grasp_of, lie_of
 from manip_il.tasks.ladder import (
@@ -30,7 +31,6 @@ from manip_il.tasks.ladder import (
     pick_rungs,
 )
 from manip_il.tasks.reach import ReachGoal
-from manip_il.tasks.task import Rung, Target
 
 OPEN, EDGE = 0.08, 0.05  # of the hand; of the cube where a test says no other [m]
 LOWEST = 0.021  # of the hand over the table [m]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from manip_il.collect.environments import env_fingerprint
 from manip_il.errors import UsageError
-from manip_il.sim.config import EnvConfig
+from manip_il.tasks.config import make_config
 from manip_il.tasks.reward import FEATURES, TASTES, Reward
 
 numbers = st.floats(0, 1e6, allow_subnormal=False)
@@ -86,13 +86,13 @@ def test_a_broken_file_is_refused_in_one_line_that_names_it(tmp_path: Path, name
 def test_an_environment_keeps_what_is_in_a_file_and_not_where_it_is(tmp_path: Path):
     for name in ("one.yaml", "two.yaml"):
         (tmp_path / name).write_text("length: 1\nheight: 3\n")
-    one, two = (EnvConfig(task="carry", reward=str(tmp_path / name)) for name in ("one.yaml", "two.yaml"))
+    one, two = (make_config(task="carry", reward=str(tmp_path / name)) for name in ("one.yaml", "two.yaml"))
     assert one == two
     assert one.reward == "length=1,height=3"
-    assert env_fingerprint(one) == env_fingerprint(two) != env_fingerprint(EnvConfig(task="carry"))
-    assert EnvConfig(task="carry", reward="careful") == EnvConfig(task="carry")
+    assert env_fingerprint(one) == env_fingerprint(two) != env_fingerprint(make_config(task="carry"))
+    assert make_config(task="carry", reward="careful") == make_config(task="carry")
 
 
 def test_tasks_with_one_way_of_doing_it_take_no_reward():
     with pytest.raises(UsageError, match=r"reward is 'length=1.*', but lift has one way of doing it; it is for carry"):
-        EnvConfig(task="lift", reward="low")
+        make_config(task="lift", reward="low")

@@ -10,13 +10,14 @@ import pytest
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.sim.env import environment_state_names
+from manip_il.sim.task import instruction_in, phases
 from manip_il.sim.world import World
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env
 from manip_il.tasks.sort import BINS, COLOURS, SENTENCES, asked
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.tasks.task import instruction_in, phases
 
 from ..scenes import SEED, drive_until, started
 from ..tables import every_large_robot
@@ -26,7 +27,7 @@ STARTS = range(SEED, SEED + 100)
 
 @cache
 def starts() -> list[tuple[str, str, State]]:
-    env, found = ManipEnv("panda", "sort"), []
+    env, found = make_env("panda", "sort"), []
     for seed in STARTS:
         env.start(seed)
         found.append((asked(env.world), env.task_description, env.get_state()))
@@ -43,7 +44,7 @@ def test_every_cube_is_named_in_every_sentence():
 
 
 def test_a_restored_state_says_the_same_in_words_and_numbers():
-    env, names = ManipEnv("panda", "sort"), environment_state_names(started(task="sort").scene)
+    env, names = make_env("panda", "sort"), environment_state_names(started(task="sort").scene)
     for name, text, state in starts()[:20]:
         env.set_state(State.from_vector(state.to_vector()))
         seen = env.observe()
@@ -60,7 +61,7 @@ def test_a_restored_state_says_the_same_in_words_and_numbers():
 @every_large_robot
 def test_an_episodes_text_is_that_of_its_state(robot: str):
     world = started(robot, "sort").world
-    for episode in RolloutJob(EnvConfig(robot, "sort", horizon=6)).run(STARTS[:3]):
+    for episode in RolloutJob(make_config(robot, "sort", horizon=6)).run(STARTS[:3]):
         state = State.from_vector(episode.columns["sim_state"][-1])
         world.restore(state.physics, state.variation)
         assert episode.instruction == instruction_in(TASKS["sort"], world)

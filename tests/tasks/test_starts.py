@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from manip_il.errors import UsageError
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for
-from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import SCENES_KEPT, build_scene
+from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.task import Start
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, World
+from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import FROM_HAND, FROM_HAND_SHARE, LIFT, LIFT_HEIGHT, draw_until, draw_yaw
 from manip_il.tasks.table import TASKS, get_task
-from manip_il.tasks.task import Start
 
 from ..scenes import SEED, half_height
 from ..tables import WITH_A_PEG, every_robot, every_scene, every_scene_that_grasps, every_scene_with_cubes
@@ -32,7 +32,7 @@ edges = st.sampled_from([None, 0.03, 0.07])  # of a cube, None for the model's o
 
 @lru_cache(SCENES_KEPT)
 def _world(robot: str, task: str) -> World:
-    return World(build_scene(robot, task))
+    return World(scene_of(robot, task))
 
 
 def world_of(robot: str, task: str, edge: float | None = None) -> World:
@@ -42,7 +42,7 @@ def world_of(robot: str, task: str, edge: float | None = None) -> World:
 
 
 def start(world: World, seed: int) -> Start:
-    return get_task(world.scene.task).draw(rng_for(seed, "reset"), world)
+    return world.scene.task.draw(rng_for(seed, "reset"), world)
 
 
 def position(drawn: Start, name: str) -> np.ndarray:
@@ -101,7 +101,7 @@ def test_a_cube_is_turned_about_the_vertical_by_an_eighth_turn_at_most(robot: st
 
 @every_scene
 def test_a_start_has_no_contact_but_of_what_rests(robot: str, task: str):
-    env = ManipEnv(robot, task)
+    env = make_env(robot, task)
     objects, table = {one.geom for one in env.scene.objects.values()}, env.scene.model.geom("table").id
     for seed in range(SEED, SEED + 20):
         env.start(seed)
@@ -115,7 +115,7 @@ def test_a_start_has_no_contact_but_of_what_rests(robot: str, task: str):
 
 @every_scene
 def test_a_start_is_the_home_posture_within_its_jitter_and_any_opening(robot: str, task: str):
-    env = ManipEnv(robot, task)
+    env = make_env(robot, task)
     openings, gripper = [], env.scene.gripper
     for seed in range(SEED, SEED + 40):
         env.start(seed)

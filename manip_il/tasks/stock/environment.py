@@ -16,7 +16,7 @@ import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
-from manip_il.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
+from manip_il.tasks.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
 
 F64 = NDArray[np.float64]
 _WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -1,4 +1,7 @@
-"""Names for gymnasium: `manip_il/PandaPickPlace-v0` and its siblings, and `manip_il/PickPlace-v0` for any robot."""
+"""Names for gymnasium: `manip_il/PandaPickPlace-v0` and its siblings, `manip_il/PickPlace-v0`, `manip_il/Task-v0`.
+
+The robot of `manip_il/PickPlace-v0` is an argument, and of `manip_il/Task-v0` the task, too: a name or a file's path.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,13 @@ def _id(name: str) -> str:
 
 ENV_IDS = {_id(f"{robot}_{task}"): (robot, task) for robot in ROBOTS for task in NAMES}
 TASK_IDS = {_id(task): task for task in NAMES}  # their robot is an argument
+ANY_ID = "manip_il/Task-v0"  # its task is, too
 
 
 def register_envs() -> None:
     """Register every robot and task, and every task, with gymnasium; a second call changes nothing."""
     named = {env_id: {"robot": robot, "task": task} for env_id, (robot, task) in ENV_IDS.items()}
-    for env_id, kwargs in {**named, **{env_id: {"task": task} for env_id, task in TASK_IDS.items()}}.items():
+    named |= {env_id: {"task": task} for env_id, task in TASK_IDS.items()} | {ANY_ID: {}}
+    for env_id, kwargs in named.items():
         if env_id not in gymnasium.registry:
-            gymnasium.register(env_id, entry_point="manip_il.sim.env:ManipEnv", kwargs=kwargs)
+            gymnasium.register(env_id, entry_point="manip_il.tasks.envs:make_env", kwargs=kwargs)

@@ -13,10 +13,11 @@ from manip_il.errors import UsageError
 from manip_il.mdp import State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CameraConfig, EnvConfig
-from manip_il.stock.environment import ACTIONS, StockEnv
-from manip_il.stock.expert import StockExpert
-from manip_il.stock.table import ROBOT
+from manip_il.sim.config import CameraConfig
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.stock.environment import ACTIONS, StockEnv
+from manip_il.tasks.stock.expert import StockExpert
+from manip_il.tasks.stock.table import ROBOT
 
 
 class StockSimulation:

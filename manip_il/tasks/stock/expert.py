@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.mdp import Label, State
-from manip_il.stock.environment import StockEnv
-from manip_il.stock.table import PHASES
+from manip_il.tasks.stock.environment import StockEnv
+from manip_il.tasks.stock.table import PHASES
 
 F64 = NDArray[np.float64]
 

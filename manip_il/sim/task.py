@@ -14,7 +14,6 @@ from manip_il.errors import UsageError, nearest, shorten
 from manip_il.robots.robot import Robot
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
-from manip_il.tasks.reward import Reward
 
 F64 = NDArray[np.float64]
 Observed = Mapping[str, "F64 | float"]
@@ -185,23 +184,6 @@ class TakesShape(Protocol):
 
     def with_shape(self, shape: Shape) -> Task:
         """Return the task with such an object."""
-        ...
-
-
-@runtime_checkable
-class TakesReward(Protocol):
-    """A task whose way of doing it may be of any taste; what an episode is about lives in the state.
-
-    taste: bodies that hold it, which scenes that are drawn anew of a state keep.
-    """
-
-    @property
-    def taste(self) -> tuple[str, ...]:
-        """Names of the bodies that hold the reward."""
-        ...
-
-    def with_reward(self, reward: Reward) -> Task:
-        """Return the task with starts that are about a reward."""
         ...
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.table import get_task
 
 F64 = NDArray[np.float64]
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # of a box's corners
@@ -24,7 +23,7 @@ def points_in(world: World) -> dict[str, F64]:
     What a task observes is a place where it has the name of something in the scene. Corners of a box are counted by the
     direction in which they lie from its centre.
     """
-    observed, named = get_task(world.scene.task).observe(world), _named(world.scene)
+    observed, named = world.scene.task.observe(world), _named(world.scene)
     found = {name: np.asarray(value) for name, value in observed.items() if name in named}
     for name, one in world.scene.objects.items():
         if world.scene.model.geom_type[one.geom] == mujoco.mjtGeom.mjGEOM_BOX:

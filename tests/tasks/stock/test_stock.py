@@ -16,17 +16,18 @@ from manip_il.learn.lerobot_config import LeRobotFit
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.events import STANDARD
-from manip_il.stock.environment import StockEnv
-from manip_il.stock.expert import StockExpert
-from manip_il.stock.table import ACTION_MEANING, CONTROL_HZ, HORIZON, ROBOT, STOCK
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.stock.environment import StockEnv
+from manip_il.tasks.stock.expert import StockExpert
+from manip_il.tasks.stock.table import ACTION_MEANING, CONTROL_HZ, HORIZON, ROBOT, STOCK
 
 every_stock = pytest.mark.parametrize("task", list(STOCK))
 
 
 def config(task: str) -> EnvConfig:
-    return EnvConfig(ROBOT, task, CONTROL_HZ)
+    return make_config(ROBOT, task, CONTROL_HZ)
 
 
 def actions(count: int) -> np.ndarray:
@@ -124,7 +125,7 @@ def test_positions_are_those_of_the_observation(task: str):
 )
 def test_other_settings_are_refused(settings: dict, words: str):
     with pytest.raises(UsageError, match=words):
-        EnvConfig(**{"robot": ROBOT, "task": "FetchReach-v4", "control_hz": CONTROL_HZ} | settings)
+        make_config(**{"robot": ROBOT, "task": "FetchReach-v4", "control_hz": CONTROL_HZ} | settings)
 
 
 def test_cameras_and_disturbances_are_refused():

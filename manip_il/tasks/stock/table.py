@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UnknownName
 
 ROBOT = "fetch_stock"
 CONTROL_HZ, HORIZON = 25, 50
@@ -69,18 +68,3 @@ def get_stock(name: str) -> StockTask:
     if name not in STOCK:
         raise UnknownName(f"task of {ROBOT}", name, STOCK)
     return STOCK[name]
-
-
-def take_limits(config: Any) -> None:
-    """Give an `EnvConfig` the settings of the stock environments; `UsageError` where it has others, but for 0."""
-    get_stock(config.task)
-    if config.object:
-        raise UsageError(f"object is {config.object}; {ROBOT} is unmodified, leave --task.object out")
-    if config.reward:
-        raise UsageError(f"reward is {config.reward}; {ROBOT} is unmodified, leave --task.reward out")
-    own = {"control_hz": CONTROL_HZ, "tolerance": TOLERANCE, "success_steps": 1, "horizon": HORIZON}
-    for name, value in own.items():
-        given = getattr(config, name)
-        if given not in (0, value):
-            raise UsageError(f"{name} is {given:g}; {ROBOT} is unmodified, expected {value:g}")
-        object.__setattr__(config, name, value)

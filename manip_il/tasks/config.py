@@ -1,0 +1,127 @@
+"""An environment by the names of its robot and task, checked and complete."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from manip_il.errors import UsageError
+from manip_il.option import option
+from manip_il.robots import ROBOTS
+from manip_il.sim.config import MOST_HZ, Episodes
+from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
+from manip_il.tasks import NAMES
+from manip_il.tasks.stock import table as stock
+
+REWARD_HELP = "careful, low, hasty, a file of .yaml or .json, or NAME=NUMBER,...; what carry minimises"
+LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
+ROBOT_HELP = (
+    f"{', '.join(ROBOTS)}, the path of the YAML of an arm of your own, or {stock.ROBOT}: "
+    "gymnasium-robotics' own Fetch environments, unmodified"
+)
+TASK_HELP = (
+    f"{', '.join(NAMES)}; the path of a Python file with a task of your own; of {stock.ROBOT} {', '.join(stock.STOCK)}"
+)
+
+
+@dataclass(frozen=True)
+class EnvConfig(Episodes):
+    """Settings of one environment; every field is part of the fingerprint. `make_config` checks and completes them.
+
+    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own. reward: of `carry`,
+    as `Reward.parse` reads it, kept as its numbers wherever it came from; empty for the task's own.
+    """
+
+    robot: str = option("panda", ROBOT_HELP, flag="robot.type")
+    task: str = option("pick_place", TASK_HELP, flag="task.type")
+    object: str = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
+    reward: str = option("", f"{REWARD_HELP}; by default careful", flag="task.reward")
+
+    @property
+    def name(self) -> str:
+        """Robot and task as one word, those of a file by its name."""
+        return scene_name(self.robot, self.task)
+
+
+def scene_name(robot: str, task: str) -> str:
+    """Return robot and task as one word, those of a file by its name."""
+    return f"{Path(robot).stem}_{Path(task).stem}"
+
+
+def make_config(
+    robot: str = EnvConfig.robot, task: str = EnvConfig.task, control_hz: int = 0, **settings: Any
+) -> EnvConfig:
+    """Return the settings of an environment, with what is not given as its robot and task have it.
+
+    settings: the other fields of `EnvConfig`. Raises `UnknownName` for a robot or task, `UsageError` for a wrong value.
+    """
+    return complete(EnvConfig(robot=robot, task=task, control_hz=control_hz, **settings))
+
+
+def complete(config: EnvConfig) -> EnvConfig:
+    """Return settings with what is 0 or empty as robot and task have it; raises what `make_config` raises."""
+    from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy
+
+    config = _of_stock(config) if config.robot == stock.ROBOT else _with_task(config)
+    if not 1 <= config.control_hz <= MOST_HZ:
+        raise UsageError(f"control_hz is {config.control_hz}; expected 1 to {MOST_HZ}")
+    if config.robot != stock.ROBOT:
+        config = _with_limits(config)
+    if not 0 < config.tolerance < 1:
+        raise UsageError(f"tolerance is {config.tolerance} m; expected between 0 and 1")
+    if config.horizon > LONGEST_EPISODE:
+        raise UsageError(f"horizon is {config.horizon}; expected at most {LONGEST_EPISODE} control steps")
+    if config.success_steps < 1 or config.horizon < config.success_steps:
+        raise UsageError(f"horizon is {config.horizon}; expected at least success_steps ({config.success_steps}) >= 1")
+    return config
+
+
+def _with_task(config: EnvConfig) -> EnvConfig:
+    """Object and reward as short as can be, those that are the default not at all; the robot's rate."""
+    from manip_il.robots.table import get_robot  # here, as help needs no robot and no simulator
+    from manip_il.tasks.reward import DEFAULT, TASTES, Reward
+    from manip_il.tasks.table import get_task
+
+    get_task(config.task)
+    if config.object:
+        shape = Shape.parse(config.object)
+        get_task(config.task, config.object)
+        config = replace(config, object="" if shape == CUBE else str(shape))
+    if config.reward:
+        reward = Reward.parse(config.reward)
+        get_task(config.task, reward=reward.numbers)
+        config = replace(config, reward="" if reward == TASTES[DEFAULT] else reward.numbers)
+    return replace(config, control_hz=config.control_hz or get_robot(config.robot).fps)
+
+
+def _with_limits(config: EnvConfig) -> EnvConfig:
+    from manip_il.tasks.table import get_task  # here, as help needs no simulator
+
+    limits, rate = get_task(config.task, config.object).limits, config.control_hz / LIMITS_HZ
+    return replace(
+        config,
+        tolerance=config.tolerance or limits.tolerance,
+        success_steps=config.success_steps or max(1, round(limits.success_steps * rate)),
+        horizon=config.horizon or max(1, round(limits.horizon * rate)),
+    )
+
+
+def _of_stock(config: EnvConfig) -> EnvConfig:
+    """Return settings with those of the stock environments; `UsageError` where there are others, but for 0."""
+    stock.get_stock(config.task)
+    if config.object:
+        raise UsageError(f"object is {config.object}; {stock.ROBOT} is unmodified, leave --task.object out")
+    if config.reward:
+        raise UsageError(f"reward is {config.reward}; {stock.ROBOT} is unmodified, leave --task.reward out")
+    own = {
+        "control_hz": stock.CONTROL_HZ,
+        "tolerance": stock.TOLERANCE,
+        "success_steps": 1,
+        "horizon": stock.HORIZON,
+    }
+    for name, value in own.items():
+        given = getattr(config, name)
+        if given not in (0, value):
+            raise UsageError(f"{name} is {given:g}; {stock.ROBOT} is unmodified, expected {value:g}")
+    return replace(config, **own)

@@ -1,0 +1,59 @@
+"""Scenes and environments by the names of robot and task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from manip_il.robots.table import get_robot
+from manip_il.sim.conditions import Condition
+from manip_il.sim.config import DT_SIM, CameraConfig, Look
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import Scene, build_scene
+from manip_il.sim.task import Task
+from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.table import get_task
+
+
+def scene_of(robot: str, task: str, shape: str = "", step: float = DT_SIM) -> Scene:
+    """Return the compiled scene of a robot and a task by their names, or those of their files.
+
+    shape: of its object, as `EnvConfig.object`. step: of physics [s]. Raises `UnknownName`, `UsageError`.
+    """
+    return build_scene(get_robot(robot), get_task(task, shape), step)
+
+
+def config_scene(config: EnvConfig) -> Scene:
+    """Return the compiled scene of an environment."""
+    return build_scene(get_robot(config.robot), _task(config), config.physics_step)
+
+
+def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> ManipEnv:
+    """Make an environment of configurations."""
+    return ManipEnv(get_robot(config.robot), _task(config), config, cameras=cameras, conditions=conditions)
+
+
+def make_env(
+    robot: str = EnvConfig.robot,
+    task: str = EnvConfig.task,
+    *,
+    cameras: Sequence[str] = (),
+    image_size: tuple[int, int] = (128, 128),
+    look: Look | None = None,
+    render_mode: str | None = None,
+    conditions: Sequence[Condition] = (),
+    **settings: Any,
+) -> ManipEnv:
+    """Return the environment of a robot, by its name or its YAML's path, and a task, by its name or its file's path.
+
+    cameras: names; image_size: height and width of their pictures [pixels]. settings: fields of `EnvConfig`; the rest
+    as of `ManipEnv`. Raises what `make_config`, `CameraConfig` and `ManipEnv` raise.
+    """
+    config = make_config(robot, task, **settings)
+    seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
+    parts = get_robot(config.robot), _task(config), config
+    return ManipEnv(*parts, cameras=seen, look=look, render_mode=render_mode, conditions=conditions)
+
+
+def _task(config: EnvConfig) -> Task:
+    return get_task(config.task, config.object, config.reward)

@@ -1,0 +1,133 @@
+"""A task from a file: it runs in every command that names its path, and never because data name it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import manip_il
+from manip_il.cli.main import main
+from manip_il.collect.edits import open_source
+from manip_il.collect.environments import env_fingerprint, env_spec, is_known
+from manip_il.collect.job import RolloutJob
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.tasks import own
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env
+from manip_il.tasks.table import get_task
+
+PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
+TOUCH = PAGE.read_text().split("```python\n", 1)[1].split("```", 1)[0]
+
+
+@pytest.fixture
+def touch(tmp_path) -> Path:
+    path = tmp_path / "touch.py"
+    path.write_text(TOUCH)
+    return path
+
+
+@pytest.mark.parametrize("robot", ["panda", "so101"])
+def test_the_expert_solves_a_task_from_a_file(robot, touch):
+    episodes = RolloutJob(make_config(robot, str(touch)), hold=0).run(range(5))
+    assert all(episode.success for episode in episodes)
+
+
+def test_gymnasium_and_python_take_the_path(touch):
+    by_id = gymnasium.make("manip_il/Task-v0", task=str(touch)).unwrapped
+    by_name = manip_il.make_env("panda", str(touch))
+    observations = [env.reset(seed=3)[0]["environment_state"] for env in (by_id, by_name)]
+    np.testing.assert_array_equal(*observations)
+    assert by_name.task_description == "Touch the top of the cube."
+
+
+def test_what_is_written_of_it_has_its_name_and_hash_and_no_path(touch):
+    config = make_config("panda", str(touch))
+    before = env_fingerprint(config)
+    assert env_spec(config).task == "touch"
+    assert str(touch.parent) not in f"{env_spec(config)} {before}"
+    other = touch.parent / "more" / "touch.py"
+    other.parent.mkdir()
+    other.write_text(TOUCH)
+    assert env_fingerprint(make_config("panda", str(other))) == before
+    changed = touch.parent / "changed" / "touch.py"
+    changed.parent.mkdir()
+    changed.write_text(f"{TOUCH}\n# more\n")
+    differing = {
+        key for key, value in env_fingerprint(make_config("panda", str(changed))).items() if value != before[key]
+    }
+    assert differing == {"task_sha256"}
+
+
+def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
+    assert main(["record", f"--task.type={touch}", *words]) == 0
+    assert main(["data", "check", "data"]) == 0
+    assert not is_known("panda", "touch")
+    with pytest.raises(ManipError, match=r"--task\.type=PATH/touch\.py"):
+        open_source(tmp_path / "data")
+    assert open_source(tmp_path / "data", task=str(touch)).warnings == ()
+    assert main(["eval", "--policy.type=expert", f"--task.type={touch}", "--eval.n_episodes=2", "--eval.films=0",
+                 "--output_dir=e", "--workers=1"]) == 0  # fmt: skip
+    capsys.readouterr()
+    assert main(["eval", "e", "--replay=4000000"]) in (1, 2)
+    assert "unknown task 'touch'" in capsys.readouterr().err
+    assert main(["eval", "e", "--replay=4000000", f"--task.type={touch}"]) == 0
+
+
+MISTAKES = {
+    "is not Python": ("def (", "line 1 cannot be run: SyntaxError"),
+    "fails": ("import no_such_module", "cannot be run: ModuleNotFoundError"),
+    "has no task": ("x = 1", "has the tasks none; expected exactly one"),
+    "has two": (f"{TOUCH}\nclass Other(Touch): pass\n", "has the tasks Touch, Other; expected exactly one"),
+    "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
+    "has no rungs": (TOUCH.replace("    rungs = (", "    rungs = () and ("), "has no rungs"),
+    "has another's name": (TOUCH.replace('name = "touch"', 'name = "lift"'), "called 'lift', as one that ships"),
+    "has no limits": (TOUCH.replace("limits = Limits(", "limits = dict("), "limits is a dict; expected Limits"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_file_that_holds_no_task_is_one_line(case, tmp_path, capsys):
+    content, says = MISTAKES[case]
+    path = tmp_path / "own.py"
+    path.write_text(content)
+    assert main(["eval", "--policy.type=expert", f"--task.type={path}", f"--output_dir={tmp_path / 'e'}"]) == 2
+    error = capsys.readouterr().err
+    assert (error.count("\n"), says in error) == (1, True), error
+
+
+def test_a_rung_without_a_target_and_names_that_change_are_said(tmp_path):
+    silent, changing = tmp_path / "silent.py", tmp_path / "changing.py"
+    silent.write_text(TOUCH.replace("    return Target(", "    Target("))
+    with pytest.raises(ManipError, match="rung 'approach' returned a NoneType; expected a Target"):
+        list(RolloutJob(make_config("panda", str(silent)), hold=0).run([0]))
+    names = '{**observe_hand(world), f"cube{world.data.time:.2f}": cube'
+    changing.write_text(TOUCH.replace('{**observe_hand(world), "cube": cube', names))
+    env = make_env("panda", str(changing))
+    env.reset(seed=0)
+    with pytest.raises(ManipError, match=r"observed .* and before .*; expected the same"):
+        env.step(env.action_space.sample())
+
+
+def test_a_package_brings_names(touch, monkeypatch):
+    cls = type(get_task(str(touch)))
+
+    class Entry:
+        name, value = "touch", "my_lab.touch:Touch"
+
+        def load(self) -> type:
+            return cls
+
+    monkeypatch.setattr(own, "entry_points", lambda group, name: [Entry()] if name == "touch" else [])
+    own.packaged_task.cache_clear()
+    get_task.cache_clear()
+    assert get_task("touch").instruction == "Touch the top of the cube."
+    with pytest.raises(UnknownName, match="or the path of a Python file"):
+        get_task("tuch")
+    with pytest.raises(UsageError, match="does not exist"):
+        get_task("tuch.py")
