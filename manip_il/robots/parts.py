@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import mujoco
 import numpy as np
 
 from manip_il import checks
@@ -102,6 +103,38 @@ class Workspace:
             for name in ("half_width", "height")
         )
         return cls(numbers(f"{what}.centre", tree["centre"], 2, FURTHEST), half_width, height)
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """Where a camera stands and looks at in the world, (3,) [m], and how much it sees up and down [deg].
+
+    z = 0 is the table's top, x points away from the robot. Looking straight down, x is up in the picture.
+    """
+
+    position: tuple[float, ...]
+    target: tuple[float, ...]
+    fovy: float = 42.0
+
+    @classmethod
+    def read(cls, what: str, tree: Any) -> Self:
+        """Make it of what YAML holds; `ManipError` names what is wrong."""
+        tree = tree_of(what, tree, cls)
+        position, target = (numbers(f"{what}.{name}", tree[name], 3, FURTHEST) for name in ("position", "target"))
+        if np.linalg.norm(np.subtract(position, target)) < 0.01:
+            raise ManipError(f"{what}: position and target are the same place; expected a direction to look in")
+        return cls(position, target, checks.number(f"{what}.fovy", tree.get("fovy", cls.fovy), 1.0, 170.0))
+
+    @property
+    def quaternion(self) -> tuple[float, ...]:
+        """Its axes as MuJoCo has them, wxyz: x right, y up, z back."""
+        back = np.subtract(self.position, self.target)
+        back = back / np.linalg.norm(back)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([0.0, -1.0, 0.0])
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, np.stack([right, np.cross(back, right), back], axis=1).flatten())
+        return tuple(quaternion.tolist())
 
 
 @dataclass(frozen=True)

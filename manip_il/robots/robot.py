@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from manip_il.errors import ManipError
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.parts import Costs, EndEffector, GripperConfig, Workspace
+from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Workspace
 from manip_il.robots.servos import RATE, LeRobotConfig
 
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
@@ -22,12 +22,13 @@ YAWS = ("world", "shoulder")
 class Robot:
     """A joint-position-controlled arm with a gripper.
 
-    hand: body that carries the gripper. joints: of the arm, base to hand. home: a posture over the workspace with the
-    hand down [rad]. gains, forces, armature: kp of each joint [N m/rad], its greatest torque [N m], and what is added
-    to its inertia [kg m^2]. base: of the root body [m]. fixed: where joints stand that are neither the arm's nor the
-    gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad]. yaw: where
-    a hand's yaw is zero, along the world's x or straight ahead of the shoulder. wrist_camera: the model's own, on its
-    hand. colours: red, green and blue of meshes without contacts, by patterns of names, later ones first. lerobot: how
+    hand: body that carries the gripper. joints: of the arm, base to hand. home: a posture over the workspace with
+    the hand down [rad]. gains, forces, armature: kp of each joint [N m/rad], its greatest torque [N m], and what is
+    added to its inertia [kg m^2]. base: of the root body [m]. fixed: where joints stand that are neither the arm's
+    nor the gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
+    yaw: where a hand's yaw is zero, along the world's x or straight ahead of the shoulder. wrist_camera: the
+    model's own, on its hand. cameras: of the scene, where they do not stand as for every robot: front, side.
+    colours: red, green and blue of meshes without contacts, by patterns of names, later ones first. lerobot: how
     LeRobot's recorder writes it, where its servos' numbers are wanted in place of [rad] and [m].
     """
 
@@ -45,6 +46,7 @@ class Robot:
     costs: Costs = UPRIGHT
     yaw: str = "world"
     wrist_camera: str = ""
+    cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
     base: tuple[float, ...] | None = None
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     max_joint_step: float = JOINT_STEP

@@ -13,12 +13,13 @@ from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles, try_models
-from manip_il.robots.parts import Costs, EndEffector, GripperConfig, Workspace
+from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Workspace
 from manip_il.robots.reading import FURTHEST, missing, names, numbers, tree_of
 from manip_il.robots.robot import FOUND, JOINT_STEP, UPRIGHT, YAWS, Robot, costs_of, yaw_of
 from manip_il.robots.servos import LeRobotConfig
 
 SUFFIXES = (".yaml", ".yml")
+SCENE_CAMERAS = ("front", "side")  # that a YAML may place
 GROUP = "manip_il.robots"  # of entry points: a name, and the path of a YAML
 
 
@@ -80,6 +81,10 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
     said["hand"] = checks.text("hand", tree["hand"]) if "hand" in tree else said["ee"].body
     if "wrist_camera" in tree:
         said["wrist_camera"] = checks.text("wrist_camera", tree["wrist_camera"], checks.LONGEST_NAME)
+    cameras = checks.mapping("cameras", tree.get("cameras", {}))
+    if unknown := [name for name in cameras if name not in SCENE_CAMERAS]:
+        raise UnknownName("camera in a robot's YAML:", unknown[0], SCENE_CAMERAS)
+    said["cameras"] = {name: CameraPose.read(f"cameras.{name}", one) for name, one in cameras.items()}
     if tree.get("base") is not None:
         said["base"] = numbers("base", tree["base"], 3, FURTHEST)
     if "lerobot" in tree:

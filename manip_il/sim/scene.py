@@ -14,6 +14,7 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
+from manip_il.robots.parts import CameraPose
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.servos import ServoUnits
@@ -251,10 +252,5 @@ def _add_cameras(spec: mujoco.MjSpec, robot: Robot) -> None:
     scale = max(space.half_width / SEEN, space.height / SEEN_HEIGHT)
     middle, at = np.array([*space.centre, 0.0]), np.array([*space.centre, _LOOK_AT * scale])
     for name, way in _CAMERAS.items():
-        eye = middle + scale * np.array(way)
-        back = (eye - at) / np.linalg.norm(eye - at)
-        right = np.cross([0.0, 0.0, 1.0], back)
-        right = right / np.linalg.norm(right)
-        quat = np.zeros(4)
-        mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
-        spec.worldbody.add_camera(name=name, pos=eye, quat=quat, fovy=_FIELD)
+        pose = robot.cameras.get(name) or CameraPose(tuple(middle + scale * np.array(way)), tuple(at), _FIELD)
+        spec.worldbody.add_camera(name=name, pos=pose.position, quat=pose.quaternion, fovy=pose.fovy)

@@ -1,0 +1,65 @@
+"""Cameras of the scene stand where a robot's YAML says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from manip_il.errors import UsageError
+from manip_il.robots.table import get_robot
+from manip_il.sim.config import CameraConfig
+from manip_il.sim.render import pictures, projections
+from manip_il.sim.scene import camera_id
+from manip_il.tasks.envs import make_env, scene_of
+
+from .own import tree_of, write
+
+PLACED = {
+    "obliquely": {"position": [0.9, -0.4, 0.6], "target": [0.3, 0.0, 0.1], "fovy": 50},
+    "straight down": {"position": [0.3, 0.0, 0.9], "target": [0.3, 0.0, 0.0]},
+}
+
+
+def placed(cameras: dict[str, Any]) -> dict[str, Any]:
+    return tree_of("slides") | {"cameras": cameras}
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("pose", PLACED.values(), ids=PLACED)
+def test_the_target_is_in_the_middle_of_the_picture(pose, tmp_path):
+    env = make_env(str(write(tmp_path, tree=placed({"front": pose}))), "reach", cameras=("front",))
+    env.start(0)
+    config = CameraConfig(("front",), 64, 96)
+    pictures(env.scene, env.data, config)
+    target = np.array(pose["target"])
+    points = np.array([target, target + [0.1, 0.0, 0.0], target + [0.0, 0.1, 0.0]])
+    middle, ahead, left = projections(env.scene, config, points)["front"]
+    np.testing.assert_allclose(middle, [0.5, 0.5, 1.0], atol=1e-5)
+    if pose["position"][:2] == pose["target"][:2]:
+        assert ahead[1] < 0.5 - 0.05  # away from the robot is up
+        assert left[0] < 0.5 - 0.05
+
+
+def test_what_is_not_said_stays_and_another_cameras_place_is_that_of_every_robot(tmp_path):
+    own = scene_of(str(write(tmp_path, tree=placed({"front": PLACED["obliquely"]}))), "reach").model
+    plain = scene_of(str(write(tmp_path, "plain")), "reach").model
+    front, side = (camera_id(own, name) for name in ("front", "side"))
+    np.testing.assert_allclose(own.cam_pos[front], PLACED["obliquely"]["position"])
+    assert own.cam_fovy[front] == 50
+    np.testing.assert_array_equal(own.cam_pos[side], plain.cam_pos[side])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "says"),
+    [
+        ({"frnt": PLACED["obliquely"]}, "did you mean 'front'"),
+        ({"front": {"position": [1, 0, 1]}}, "cameras.front has no 'target'"),
+        ({"front": {"position": [0, 0, 1], "target": [0, 0, 1]}}, "the same place"),
+        ({"front": {"position": [0, 0], "target": [0, 0, 1]}}, "has 2 numbers; expected 3"),
+    ],
+)
+def test_a_wrong_place_is_one_line(cameras, says, tmp_path):
+    with pytest.raises(UsageError, match=says):
+        get_robot(str(write(tmp_path, tree=placed(cameras))))
