@@ -107,7 +107,7 @@ class Workspace:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where a camera stands and looks at in the world, (3,) [m], and how much it sees up and down [deg].
+    """Place of a camera and of what it looks at in the world, (3,) [m], and its view up and down [deg].
 
     z = 0 is the table's top, x points away from the robot. Looking straight down, x is up in the picture.
     """
@@ -127,7 +127,7 @@ class CameraPose:
 
     @property
     def quaternion(self) -> tuple[float, ...]:
-        """Its axes as MuJoCo has them, wxyz: x right, y up, z back."""
+        """Axes of the camera as MuJoCo has them, wxyz: x right, y up, z back."""
         back = np.subtract(self.position, self.target)
         back = back / np.linalg.norm(back)
         right = np.cross([0.0, 0.0, 1.0], back)

@@ -155,7 +155,7 @@ def test_the_package_shows_what_a_user_wants_and_alone_loads_no_simulator():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "['Expert', '__version__', 'make_env', 'record']\n"
     env = manip_il.make_env("fetch", "reach")
-    assert (env.config.robot, env.config.task) == ("fetch", "reach")
+    assert (env.scene.robot.name, env.task) == ("fetch", "reach")
     assert manip_il.Expert(env.scene).label(env.get_state()).valid
     assert callable(manip_il.record)
 

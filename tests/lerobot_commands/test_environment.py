@@ -13,7 +13,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 from manip_il.errors import UnknownName, UsageError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.lerobot_plugin.environment import TASKS
-from manip_il.sim import config as settings
+from manip_il.tasks.config import make_config
 
 from ..tables import BEYOND
 
@@ -44,7 +44,7 @@ def test_a_policys_inputs_are_those_of_the_chosen_observation(observation: str, 
 
 @pytest.mark.parametrize("task", [name for name, names in TASKS.items() if names not in BEYOND])
 def test_every_task_gives_what_its_features_say(task: str):
-    config, ours = ManipILEnv(task=task), settings.EnvConfig(*TASKS[task])
+    config, ours = ManipILEnv(task=task), make_config(*TASKS[task])
     envs = vector_env(config, 2)
     observation, _ = envs.reset(seed=[1, 2])
     seen = preprocess_observation(observation)

@@ -223,7 +223,7 @@ def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, kind: 
     drive_until(env, "descend")  # with open fingers; one jaw that moves alone is not all open
     env.set_state(replace(env.get_state(), streak=3))
     state = env.get_state()
-    perturbed = started(env.config.robot, env.task, conditions=(Perturbation(kind, {SEED: state.step}),))
+    perturbed = started(env.scene.robot.name, env.task, conditions=(Perturbation(kind, {SEED: state.step}),))
     perturbed.set_state(state)
     perturbed.begin_step()
     same = kind == "open" and not env.world.lopsided

@@ -99,7 +99,7 @@ def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env:
 @pytest.mark.gl
 @with_every_robot
 def test_pictures_of_25_environments_are_those_of_one_alone(env: ManipEnv):
-    crowd = [started(env.config.robot, seed=seed, cameras=CAMERAS) for seed in range(SEED, SEED + 25)]
+    crowd = [started(env.scene.robot.name, seed=seed, cameras=CAMERAS) for seed in range(SEED, SEED + 25)]
     together = [one.observe().images for one in crowd]
     for seed, images in enumerate(together, SEED):
         env.start(seed)
@@ -141,7 +141,7 @@ def _drawn(robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig) ->
 def test_another_process_draws_the_same_bytes(env: ManipEnv):
     config = CameraConfig(CAMERAS)
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        there = pool.submit(_drawn, env.config.robot, env.config.task, env.data, config).result()
+        there = pool.submit(_drawn, env.scene.robot.name, env.task, env.data, config).result()
     for camera, picture in env.observe().images.items():
         np.testing.assert_array_equal(there[camera], picture)
 
@@ -159,7 +159,7 @@ def test_the_picture_is_the_mean_of_finer_pixels_the_right_way_up():
 @pytest.mark.gl
 @with_every_robot
 def test_pictures_leave_the_physics_alone(env: ManipEnv):
-    blind = started(env.config.robot)
+    blind = started(env.scene.robot.name)
     for _ in range(5):
         env.observe()
         for one in (env, blind):

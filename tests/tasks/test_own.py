@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+import zstandard
 
 import manip_il
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
 from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.collect.job import RolloutJob
+from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.tasks import own
 from manip_il.tasks.config import make_config
@@ -77,6 +80,16 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     assert main(["eval", "e", "--replay=4000000"]) in (1, 2)
     assert "unknown task 'touch'" in capsys.readouterr().err
     assert main(["eval", "e", "--replay=4000000", f"--task.type={touch}"]) == 0
+
+
+def test_a_node_gets_the_file(touch):
+    job = RolloutJob(make_config("panda", str(touch)), hold=0)
+    files, [here] = {"touch.py": touch.read_bytes()}, list(job.run([5]))
+    touch.unlink()
+    answer = run_there(manip_il.__version__, job, (5,), None, files)
+    [(there, _)] = pickle.loads(zstandard.decompress(answer))
+    for name, column in here.without_pictures().columns.items():
+        np.testing.assert_array_equal(there.columns[name], column)
 
 
 MISTAKES = {
