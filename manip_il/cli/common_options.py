@@ -136,9 +136,17 @@ def _require_suite(suite: str) -> None:
 
 def own_names(robot: str, task: str) -> str:
     """Return the options, after a space, that a next command needs for a robot and a task that do not ship."""
-    given = [] if robot in (*ROBOTS, stock.ROBOT) else [f"--robot.type={_file(robot, '.yaml')}"]
+    given = [] if robot in (*ROBOTS, stock.ROBOT) else [f"--robot.type={_arm(robot)}"]
     given += [] if task in (*NAMES, *stock.STOCK, "unknown") else [f"--task.type={_file(task, '.py')}"]
     return "".join(f" {one}" for one in given)
+
+
+def _arm(robot: str) -> str:
+    """Return the robot that LeRobot records under this type, else the robot's file."""
+    from manip_il.robots.table import get_robot  # here, as help needs no robot
+
+    types = {servos.robot_type: name for name in ROBOTS if (servos := get_robot(name).lerobot) is not None}
+    return types.get(robot) or _file(robot, ".yaml")
 
 
 def _file(name: str, suffix: str) -> str:
