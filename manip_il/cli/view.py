@@ -14,7 +14,6 @@ from manip_il.cli.options import Given
 from manip_il.cli.progress import say, warn
 from manip_il.errors import RenderError, UsageError
 from manip_il.option import option
-from manip_il.tasks.envs import env_of
 from manip_il.tasks.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:
@@ -77,6 +76,7 @@ class ViewOptions:
         from manip_il.collect.job import observed_cameras, run_steps
         from manip_il.evaluation.watch import outcome
         from manip_il.seeding import BLOCK, stream_seeds
+        from manip_il.tasks.envs import env_of
 
         job = self._job()
         seeds = stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)
@@ -113,6 +113,7 @@ class ViewOptions:
     def _cameras(self, env: EnvConfig) -> CameraConfig | None:
         """Return cameras for people, with shadows if nobody waits; None, with a warning, without OpenGL."""
         from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
+        from manip_il.tasks.envs import env_of
 
         cameras = CameraConfig(CAMERAS, *SIZE, FILM if self.output else Look())
         try:

@@ -195,7 +195,7 @@ def result(successes: int, n: int) -> EvalResult:
 
 
 def rounds(*successes: int, n: int) -> list[Any]:
-    return [SimpleNamespace(round=index, validation=result(count, n)) for index, count in enumerate(successes)]
+    return [SimpleNamespace(number=index, validation=result(count, n)) for index, count in enumerate(successes)]
 
 
 @pytest.mark.parametrize(

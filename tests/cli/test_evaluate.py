@@ -85,11 +85,11 @@ def feature(kind: str, *shape: int) -> dict[str, object]:
         (lambda policy: (policy / "pytorch_model.bin").write_bytes(b"\x80\x04N."), "pytorch_model.bin is a pickle"),
         (
             {"input_features": {STATE: feature("STATE", 8), "observation.images.top": feature("VISUAL", 3, 32, 32)}},
-            "top, the environment has front, side, wrist",
+            "unknown camera 'top'; known: front, side, wrist",
         ),
         (
             {"input_features": {STATE: feature("STATE", 8), "observation.effort": feature("STATE", 8)}},
-            "observation.effort, panda/reach has observation.state",
+            "observation.effort differs: the policy has 8, panda/reach has None",
         ),
         ({"output_features": {"action": feature("ACTION", 7)}}, "the policy has 7, panda/reach has 8"),
         ({"input_features": {STATE: feature("STATE", 6)}}, "the policy has 6, panda/reach has 8"),

@@ -147,7 +147,7 @@ def test_a_mistake_is_one_line_with_the_nearest_name_and_leaves_nothing(tmp_path
 def test_the_environments_are_registered_in_whatever_order_one_imports(imports: str):
     code = f"{imports}; print(gymnasium.spec('manip_il/PandaPickPlace-v0').entry_point, gymnasium.__spec__.loader)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("manip_il.sim.env:ManipEnv <_frozen_importlib_external.SourceFileLoader")
+    assert done.stdout.startswith("manip_il.tasks.envs:make_env <_frozen_importlib_external.SourceFileLoader")
 
 
 def test_the_package_shows_what_a_user_wants_and_alone_loads_no_simulator():

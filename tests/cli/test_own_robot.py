@@ -42,7 +42,7 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert "pretrained_model --robot.type=arms/mine.yaml --output_dir=dagger/test" in capsys.readouterr().out
     render = ["data", "render", "datasets/mine_reach", "seen", "--cameras=front"]
     assert main(render) == 1
-    assert "a robot of your own is given by --robot.type=PATH/mine.yaml" in capsys.readouterr().err
+    assert "give --robot.type=PATH/mine.yaml" in capsys.readouterr().err
     assert main([*render, "--robot.type=panda"]) == 1
     assert "robot differs" in capsys.readouterr().err
     assert main([*render, robot]) == 0

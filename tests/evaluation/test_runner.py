@@ -19,7 +19,7 @@ from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import make_env
+from manip_il.tasks.envs import env_of, make_env
 
 from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint
@@ -71,7 +71,7 @@ def test_an_episode_of_a_suite_is_that_of_its_condition_alone(act):
 
 def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
     result = evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it", suite="all")
-    env = make_env(conditions=ALL, config=ENV)
+    env = env_of(ENV, conditions=ALL)
     for episode in result.episodes:
         env.start(episode.seed)
         assert episode.detail["drawn"] == dict(env.drawn.values)
@@ -85,7 +85,7 @@ def test_places_are_the_true_ones_of_first_and_last_state():
     job = RolloutJob(make_config("fetch"), label="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),))
     [episode] = job.run(SEEDS[:1])
     result = episode_result(job, episode)
-    env = make_env(config=make_config("fetch"))
+    env = make_env("fetch")
     env.start(SEEDS[0])
     assert result.detail["start"]["object"] == pytest.approx(env.world.pose("object").position, abs=1e-4)
     assert result.detail["start"]["hand"] == pytest.approx(env.data.site_xpos[env.scene.ee_site], abs=1e-4)

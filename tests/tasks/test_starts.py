@@ -170,6 +170,6 @@ def test_a_drawn_turn_is_about_the_vertical_and_no_wider_than_asked(widest: floa
 
 
 def test_where_nothing_fits_the_error_names_task_thing_and_robot():
-    scene = SimpleNamespace(task="stack", robot=SimpleNamespace(name="dwarf"))
+    scene = SimpleNamespace(task=SimpleNamespace(name="stack"), robot=SimpleNamespace(name="dwarf"))
     with pytest.raises(UsageError, match="stack: none of 1000 places drawn for the goal fits within reach of dwarf"):
         draw_until(lambda: np.zeros(3), lambda at: False, SimpleNamespace(scene=scene), "the goal")
