@@ -152,13 +152,14 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
     from manip_il.learn.policy_files import policy_cameras
 
     path, origin, cameras = checkpoint.path, checkpoint.origin, policy_cameras(checkpoint.path)
-    checkpoint.check_fits(env_spec(env, cameras))
+    spec = env_spec(env, cameras)
+    checkpoint.check_fits(spec)
     checkpoint.require_trust(trust)
     if origin is None:
         lit = f", nor how its pictures were lit: {cameras.look} is assumed" if cameras else ""
         warn(f"{path} was written by another tool and does not say which robot and task it is for{lit}")
-    elif origin.task != env.task:  # and with it the model and its hash
-        warn(f"task differs: {path} has {origin.task}, the environment has {env.task}")
+    elif origin.task != spec.task:  # and with it the model and its hash
+        warn(f"task differs: {path} has {origin.task}, the environment has {spec.task}")
     else:
         theirs = {name: value for name, value in origin.fingerprint.items() if cameras or name != "cameras_sha256"}
         warn(*compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras)))

@@ -82,6 +82,19 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     assert main(["eval", "e", "--replay=4000000", f"--task.type={touch}"]) == 0
 
 
+def test_a_policy_of_it_is_evaluated_by_its_path_without_a_warning(touch, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["--demonstrations=2", "--rounds=1", "--episodes_per_round=2", "--steps=20", "--policy.width=16",
+             "--validation_episodes=2", "--env.horizon=40", "--workers=1", "--output_dir=run"]  # fmt: skip
+    assert main(["dagger", f"--task.type={touch}", *words]) == 0
+    capsys.readouterr()
+    last = ["--policy.path=run/best", "--eval.n_episodes=2", "--eval.films=0", "--workers=1", "--output_dir=e"]
+    assert main(["eval", *last]) == 2
+    assert "unknown task 'touch'" in capsys.readouterr().err
+    assert main(["eval", f"--task.type={touch}", "--env.horizon=40", *last]) == 0
+    assert "differs" not in capsys.readouterr().err
+
+
 def test_a_node_gets_the_file(touch):
     job = RolloutJob(make_config("panda", str(touch)), hold=0)
     files, [here] = {"touch.py": touch.read_bytes()}, list(job.run([5]))
