@@ -28,13 +28,12 @@ from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
 from manip_il.tasks.own import source_hash
-from manip_il.tasks.stock.simulation import StockSimulation, require_no_cameras
+from manip_il.tasks.stock.environment import ACTIONS, described_stock, make_stock, require_no_cameras
+from manip_il.tasks.stock.expert import StockExpert
 from manip_il.tasks.stock.table import ACTION_MEANING, PHASES, STATE_NAMES, get_stock
 from manip_il.tasks.stock.table import ROBOT as STOCK
 from manip_il.tasks.stock.table import STOCK as STOCK_TASKS
 from manip_il.tasks.table import TASKS, get_task, is_task
-
-_STOCK = StockSimulation()
 
 
 def is_known(robot: str, task: str) -> bool:
@@ -47,14 +46,14 @@ def make_env(
 ) -> Environment:
     """Make an environment. Raises `UsageError` for cameras or conditions that it does not have."""
     if config.robot == STOCK:
-        return _STOCK.make(config, cameras, conditions)
+        return make_stock(config.task, cameras, conditions)
     return env_of(config, cameras, conditions)
 
 
 @lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
     """Make the expert of an environment, or return the one that was made."""
-    return _STOCK.expert(config) if config.robot == STOCK else Expert(config_scene(config))
+    return StockExpert(config.task) if config.robot == STOCK else Expert(config_scene(config))
 
 
 @cache
@@ -69,7 +68,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
             fps=config.control_hz,
             joint_names=STATE_NAMES,
             environment_state_names=stock.observed,
-            sim_state_size=_STOCK.state_size(config),
+            sim_state_size=described_stock(config.task).state_size,
             instruction=stock.instruction,
             action_meaning=ACTION_MEANING,
             phases=PHASES,
@@ -96,7 +95,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
 
 def env_actions(config: EnvConfig) -> ActionSpace:
     """Return names, bounds and scale of an environment's actions, (n,)."""
-    return _STOCK.actions(config) if config.robot == STOCK else config_scene(config).actions
+    return ACTIONS if config.robot == STOCK else config_scene(config).actions
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
@@ -116,5 +115,5 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
     for name in ("object", "reward"):  # as before there were any
         if not settings[name]:
             del settings[name]
-    model = _STOCK.model_bytes(config) if config.robot == STOCK else config_scene(config).model_bytes()
+    model = described_stock(config.task).model_bytes if config.robot == STOCK else config_scene(config).model_bytes()
     return environment_fingerprint(model, settings) | own

@@ -31,10 +31,9 @@ from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.task import objects_in
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.envs import scene_of
-from manip_il.tasks.stock.simulation import StockSimulation
+from manip_il.tasks.envs import config_scene
+from manip_il.tasks.stock.environment import described_stock
 from manip_il.tasks.stock.table import ROBOT as STOCK
-from manip_il.tasks.table import get_task
 
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
@@ -147,12 +146,19 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
     The first object that the episode is about is called `object`; `goal` is where it, or the hand, is to go.
     """
     state = State.from_vector(sim_state)
-    found = StockSimulation().positions(env, state) if env.robot == STOCK else _positions(env, state)
+    found = _stock_positions(env.task, state) if env.robot == STOCK else _positions(env, state)
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
 
 
+def _stock_positions(task: str, state: State) -> dict[str, F64]:
+    env = described_stock(task)
+    env.set_state(state)
+    return env.positions
+
+
 def _positions(env: EnvConfig, state: State) -> dict[str, F64]:
-    world, task = _world(scene_of(env.robot, env.task, env.object)), get_task(env.task, env.object)
+    world = _world(config_scene(env))
+    task = world.scene.task
     world.restore(state.physics, state.variation)
     found = {"hand": world.ee.position, "goal": task.destination(world)}
     for name in world.scene.objects:

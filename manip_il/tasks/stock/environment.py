@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Sequence
+from functools import cache
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -13,10 +15,12 @@ from numpy.typing import NDArray
 
 # First: it chooses the OpenGL that mujoco takes on import.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
-from manip_il.tasks.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
+from manip_il.sim.conditions import Condition
+from manip_il.sim.config import CameraConfig
+from manip_il.tasks.stock.table import ROBOT, STATE_NAMES, TOLERANCE, StockTask, get_stock
 
 F64 = NDArray[np.float64]
 _WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -146,6 +150,18 @@ class StockEnv:
         """Length of `State.to_vector`."""
         return len(self.get_state().to_vector())
 
+    @property
+    def model_bytes(self) -> bytes:
+        """Compiled model of the environment."""
+        buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
+        mujoco.mj_saveModel(self.model, None, buffer)
+        return buffer.tobytes()
+
+    @property
+    def positions(self) -> dict[str, F64]:
+        """Positions (3,) [m] of hand and goal, and of the cube where there is one."""
+        return {"hand": self.gripper, "goal": self.goal} | ({"object": self.object} if self.task.has_object else {})
+
     def _remember(self) -> None:
         """Poses are those of positions and velocities as they are now."""
         self._begun = (self.data.qpos.copy(), self.data.qvel.copy())
@@ -155,6 +171,29 @@ class StockEnv:
         mujoco.mj_step(self.model, self.data, nstep=self._env.n_substeps - 1)
         self._remember()
         mujoco.mj_step(self.model, self.data, nstep=1)
+
+
+def make_stock(task: str, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> StockEnv:
+    """Make an environment. Raises `UsageError` for cameras, or conditions that change it."""
+    require_no_cameras(cameras)
+    if changed := [one.name for one in conditions if one.ranges]:
+        raise UsageError(
+            f"{ROBOT} is unmodified and takes no {', '.join(changed)}; use --suite=nominal, for manip-il dagger "
+            "--disturbed_share=0"
+        )
+    return StockEnv(task)
+
+
+def require_no_cameras(cameras: CameraConfig | None) -> None:
+    """Raise `UsageError` for cameras."""
+    if cameras is not None:
+        raise UsageError(f"{ROBOT} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
+
+
+@cache
+def described_stock(task: str) -> StockEnv:
+    """Return an environment for descriptions, which no episode runs in."""
+    return StockEnv(task)
 
 
 def _make(task: StockTask) -> Any:
