@@ -24,7 +24,7 @@ from manip_il.sim.variation import completed, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import env_of
-from manip_il.tasks.reward import TakesReward
+from manip_il.tasks.table import TakesReward
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time

@@ -30,7 +30,12 @@ def get_robot(name: str) -> Robot:
     if name.endswith(SUFFIXES):
         return _read(Path(name).absolute())
     for found in entry_points(group=GROUP, name=name):
-        return _read(Path(found.load()).absolute())
+        try:
+            path = Path(found.load())
+        except Exception as error:
+            why = checks.one_line(error)
+            raise UsageError(f"robot {name} of {found.value}: {why}; expected the path of a YAML") from error
+        return _read(path.absolute())
     raise UnknownName("robot", name, ROBOTS, f"known: {', '.join(sorted(ROBOTS))}, or the path of a YAML")
 
 

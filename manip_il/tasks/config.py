@@ -12,9 +12,9 @@ from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.tasks import NAMES
+from manip_il.tasks.reward import DEFAULT, REWARD_HELP, TASTES, Reward
 from manip_il.tasks.stock import table as stock
 
-REWARD_HELP = "careful, low, hasty, a file of .yaml or .json, or NAME=NUMBER,...; what carry minimises"
 LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
 ROBOT_HELP = (
     f"{', '.join(ROBOTS)}, the path of the YAML of an arm of your own, or {stock.ROBOT}: "
@@ -36,7 +36,7 @@ class EnvConfig(Episodes):
     robot: str = option("panda", ROBOT_HELP, flag="robot.type")
     task: str = option("pick_place", TASK_HELP, flag="task.type")
     object: str = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
-    reward: str = option("", f"{REWARD_HELP}; by default careful", flag="task.reward")
+    reward: str = option("", f"{REWARD_HELP}; by default {DEFAULT}", flag="task.reward")
 
     @property
     def name(self) -> str:
@@ -80,7 +80,6 @@ def complete(config: EnvConfig) -> EnvConfig:
 def _with_task(config: EnvConfig) -> EnvConfig:
     """Object and reward as short as can be, those that are the default not at all; the robot's rate."""
     from manip_il.robots.table import get_robot  # here, as help needs no robot and no simulator
-    from manip_il.tasks.reward import DEFAULT, TASTES, Reward
     from manip_il.tasks.table import get_task
 
     get_task(config.task)

@@ -6,11 +6,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from manip_il import checks
 from manip_il.errors import ManipError, UsageError, nearest, shorten
-from manip_il.sim.task import Task
 
 FEATURES = (
     "length",  # 1
@@ -148,20 +147,4 @@ TASTES: dict[str, Reward] = {
     "hasty": Reward((1.0, 0.2, 0.5, 0.0, 1.0, 0.2, 0.0, 0.5, 0.2)),
 }
 DEFAULT = "careful"
-
-
-@runtime_checkable
-class TakesReward(Protocol):
-    """A task whose way of doing it may be of any taste; what an episode is about lives in the state.
-
-    taste: bodies that hold it, which scenes that are drawn anew of a state keep.
-    """
-
-    @property
-    def taste(self) -> tuple[str, ...]:
-        """Names of the bodies that hold the reward."""
-        ...
-
-    def with_reward(self, reward: Reward) -> Task:
-        """Return the task with starts that are about a reward."""
-        ...
+REWARD_HELP = f"{', '.join(TASTES)}, {_FORMS}; what carry minimises"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.shape import Shape
@@ -18,9 +19,27 @@ from manip_il.tasks.pick_place import PickPlace
 from manip_il.tasks.press import Press
 from manip_il.tasks.push import Push
 from manip_il.tasks.reach import ReachGoal
-from manip_il.tasks.reward import Reward, TakesReward
+from manip_il.tasks.reward import Reward
 from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
+
+
+@runtime_checkable
+class TakesReward(Protocol):
+    """A task whose way of doing it may be of any taste; what an episode is about lives in the state.
+
+    taste: bodies that hold it, which scenes that are drawn anew of a state keep.
+    """
+
+    @property
+    def taste(self) -> tuple[str, ...]:
+        """Names of the bodies that hold the reward."""
+        ...
+
+    def with_reward(self, reward: Reward) -> Task:
+        """Return the task with starts that are about a reward."""
+        ...
+
 
 TASKS: dict[str, Task] = {
     "reach": ReachGoal(),

@@ -17,6 +17,8 @@ from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.robots import ROBOTS
+from manip_il.robots import table as robots
 from manip_il.tasks import own
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env
@@ -157,3 +159,18 @@ def test_a_package_brings_names(touch, monkeypatch):
         get_task("tuch")
     with pytest.raises(UsageError, match="does not exist"):
         get_task("tuch.py")
+
+
+def test_a_package_brings_robots_or_is_refused_in_one_line(monkeypatch):
+    class Entry:
+        def __init__(self, place: object):
+            self.value, self._place = "my_lab.robots:ARM", place
+
+        def load(self) -> object:
+            return self._place
+
+    brought = {"my_arm": Entry(ROBOTS["panda"]), "broken": Entry(3)}
+    monkeypatch.setattr(robots, "entry_points", lambda group, name: [brought[name]] if name in brought else [])
+    assert robots.get_robot("my_arm") == robots.get_robot("panda")
+    with pytest.raises(UsageError, match=r"robot broken of my_lab\.robots:ARM: .*; expected the path of a YAML"):
+        robots.get_robot("broken")
