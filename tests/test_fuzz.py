@@ -27,7 +27,6 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from manip_il.checks import MEMORY_IN_CHILD
-from manip_il.cli.main import LONGEST_LINE
 from manip_il.collect.workers import open_pool
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import open_files
@@ -47,6 +46,7 @@ from .robots import own
 
 SAMPLE = Path(__file__).parents[1] / "datasets" / "sample"
 INPUTS = int(os.environ.get("FUZZ", "2000"))
+LONGEST_LINE = 2_000  # of an error [characters]
 BATCH = 50  # inputs that a process is asked for at once
 ODD: tuple[Any, ...] = (
     *(None, True, 0, -1, 2**63, 2**80, 10**400, 0.5, -0.0, 1e308, math.nan, math.inf, "", " ", "x", "20", "../x"),

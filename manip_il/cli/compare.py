@@ -49,7 +49,7 @@ class CompareOptions:
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
-    first: ClassVar[tuple[str, ...]] = ("at", "eval.n_episodes", "suite", "output_dir", "resume", "training_seeds")
+    first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
         MISSING, "two sides, or the YAML of a study", positional=True, check=_require_side, free=True
     )

@@ -49,16 +49,7 @@ class DaggerOptions:
     """
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
-    first: ClassVar[tuple[str, ...]] = (
-        "robot.type",
-        "task.type",
-        "demonstrations",
-        "rounds",
-        "episodes_per_round",
-        "policy",
-        "output_dir",
-        "resume",
-    )
+    first: ClassVar[str] = "robot.type task.type demonstrations rounds episodes_per_round policy output_dir resume"
     env: Given = common.env_given()
     method: Method = option(
         "dagger", f"who drives after round 0: {', '.join(one.driver for one in ALGORITHMS.values())}"

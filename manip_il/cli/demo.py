@@ -44,7 +44,7 @@ class DemoOptions:
     """
 
     example: ClassVar[str] = "manip-il demo --output_dir=runs/demo"
-    first: ClassVar[tuple[str, ...]] = ("robot.type", "task.type", "rounds", "test_episodes", "output_dir", "resume")
+    first: ClassVar[str] = "robot.type task.type rounds test_episodes output_dir resume"
     env: Given = common.env_given()
     settings: Given = given(RunConfig, prefix="", only=_OF_RUN, defaults=RUN)
     fit: Given = given(FitConfig, prefix="", only=("policy", "steps", "batch_size"), defaults=FIT)

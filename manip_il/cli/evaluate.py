@@ -67,17 +67,7 @@ class EvalOptions:
     """
 
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
-    first: ClassVar[tuple[str, ...]] = (
-        "policy.path",
-        "policy.type",
-        "eval.n_episodes",
-        "suite",
-        "robot.type",
-        "task.type",
-        "output_dir",
-        "replay",
-        "resume",
-    )
+    first: ClassVar[str] = "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay resume"
     evaluation: list[Path] = option(
         list, "evaluations that are there: one, with --replay, or several to merge", positional=True, check=require_eval
     )

@@ -31,7 +31,7 @@ _OF_ALL = (
     *("steps", "episodes", "episode_steps", "action_space", "log_std", "warmup", "validation_every"),
     *("validation_episodes", "seed"),
 )
-_FIRST = ("dataset.root", "init", "steps", "reward", "validation_episodes", "output_dir", "resume")
+_FIRST = "dataset.root init steps reward validation_episodes output_dir resume"
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Learning:
 
     title: ClassVar[str]
     method: ClassVar[str]
-    first: ClassVar[tuple[str, ...]] = _FIRST
+    first: ClassVar[str] = _FIRST
     settings: Given
     ppo: PPOConfig
     workers: int | None

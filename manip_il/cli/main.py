@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import os
-import select
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -24,8 +22,6 @@ from manip_il.errors import ManipError, UnknownName, UsageError, printable
 
 PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
-EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
-LONGEST_LINE = 2_000  # of an error [characters]
 
 
 class Command(NamedTuple):
@@ -83,18 +79,14 @@ RENAMED = {
     "study": "compare STUDY.yaml",
     "certify": "robot certify",
     "irl": "reward irl",
-    **{name: f"rl {name}" for name in ("gail", "airl", "ppo")},
-    **{f"preferences {name}": f"reward {name}" for name in ("pairs", "ask", "answer", "fit")},
     "preferences": "reward",
     "doctor": "data check, and manip-il data repair in place of --repair",
-    **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
-    "mcap export": "data to-mcap",
-    "mcap import": "data from-mcap",
     "mcap": "data to-mcap, and manip-il data from-mcap",
+    **{name: f"rl {name}" for name in ("gail", "airl", "ppo")},
+    **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
 }
 
-HELP_ALL = "--help=all"
-_HELP_WORDS = ("--help", "-h", "help", HELP_ALL)
+HELP = ("--help", "-h", "--help=all")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
   --quiet      no progress on standard error"""
@@ -102,19 +94,13 @@ _GLOBAL_HELP = """\
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 done, 1 the work failed, 2 the command line was invalid, 130 interrupted."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    debug, quiet = "--debug" in words, "--quiet" in words
-    words = [word for word in words if word not in ("--debug", "--quiet")]
-    progress.set_quiet(quiet)
+    given = list(sys.argv[1:] if argv is None else argv)
+    words = [word for word in given if word not in ("--debug", "--quiet")]
+    progress.set_quiet("--quiet" in given)
     try:
         _dispatch(words)
-        sys.stdout.flush()  # here, where a reader that has gone away can still be answered
     except (Exception, KeyboardInterrupt) as error:
-        if isinstance(error, BrokenPipeError) and _stdout_is_gone():  # and not the pipe to a worker
-            # Python flushes once more at exit, and would complain there.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return EXIT_BROKEN_PIPE
-        if debug:
+        if "--debug" in given:
             print(_clean(traceback.format_exc(), words), file=sys.stderr, end="")
         return _report(error, words)
     return 0
@@ -134,47 +120,43 @@ def load(name: str) -> type:
 
 
 def _dispatch(words: list[str]) -> None:
-    if words and words[0] in _HELP_WORDS and (rest := [word for word in words if word not in _HELP_WORDS]):
-        words = [*rest, "--help"]
-    if not words or words[0] in _HELP_WORDS:
+    if not words or words[0] in (*HELP, "help"):
         print(_help())
     elif words[0] == "--version":
         print(f"{PROGRAM} {__version__}")
-    elif words[0].startswith("-"):
-        raise UsageError(f"{words[0]!r} is given before a command; write {PROGRAM} COMMAND {words[0]} (see --help)")
-    elif words == [words[0]] and words[0] in GROUPS:
+    elif words[0] in GROUPS and (len(words) == 1 or words[1] in HELP):
         print(_group_help(words[0]))
-    elif {"--help", "-h", HELP_ALL} & {*words}:
-        name, rest = _split(words)
-        print(_command_help(name, load(name), rest) if name not in GROUPS else _group_help(name))
     else:
         name, words = _split(words)
-        options = parse(load(name), words, command=name)
-        check_values(options)
-        if hasattr(options, "check"):
-            options.check()
-        elif hasattr(getattr(options, "output", None), "check"):
-            options.output.check()
-        from manip_il.errors import silence_ffmpeg_warning
-        from manip_il.sim.gl import require_known_backend
+        if {*HELP} & {*words}:
+            print(_command_help(name, load(name), words))
+        else:
+            _run(name, words)
 
-        require_known_backend()
-        silence_ffmpeg_warning()
-        options.run()
+
+def _run(name: str, words: list[str]) -> None:
+    options = parse(load(name), words, command=name)
+    check_values(options)
+    if hasattr(options, "check"):
+        options.check()
+    from manip_il.errors import silence_ffmpeg_warning
+    from manip_il.sim.gl import require_known_backend
+
+    require_known_backend()
+    silence_ffmpeg_warning()
+    options.run()
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
-    """A command's name, of one word or two, and the words behind it; a group's name if only help is asked for."""
+    """A command's name, of one word or two, and the words behind it."""
     name, of_two = words[0], " ".join(words[:2])
-    if found := next((RENAMED[old] for old in (of_two, name) if old in RENAMED), ""):
-        raise UsageError(f"{of_two if of_two in RENAMED else name!r} has a new name: {PROGRAM} {found}")
+    if name in RENAMED:
+        raise UsageError(f"{name!r} has a new name: {PROGRAM} {RENAMED[name]}")
     if name not in GROUPS:
         return name, words[1:]
-    if of_two in COMMANDS:
-        return of_two, words[2:]
-    if words[1].startswith("-"):
-        return name, []
-    raise UnknownName("command", of_two, _inside(name))
+    if of_two not in COMMANDS:
+        raise UnknownName("command", of_two, _inside(name))
+    return of_two, words[2:]
 
 
 def _inside(group: str) -> list[str]:
@@ -193,18 +175,12 @@ def _report(error: BaseException, words: list[str]) -> int:
         text = f"error: {error.strerror}: {error.filename}"
     else:
         text = f"error: {type(error).__name__}: {error}; run again with --debug for the traceback"
-    line = " ".join(_clean(text, words).split())
-    if len(line) > LONGEST_LINE:  # without its middle: what to do next stands at the end
-        line = f"{line[: LONGEST_LINE - 500]} ... {line[-400:]}"
-    print(f"{PROGRAM}: {line}", file=sys.stderr, flush=True)
+    print(f"{PROGRAM}: {' '.join(_clean(text, words).split())}", file=sys.stderr, flush=True)
     return code
 
 
 def _clean(text: str, words: list[str]) -> str:
-    """Without tokens, keys and passwords, which a word that was given may hold, or an error of a library.
-
-    Without control characters, too.
-    """
+    """Without tokens, keys and passwords, which a word or a library's error may hold, and control characters."""
     from manip_il.store.errors import redact
 
     return printable(redact(text, words))
@@ -227,36 +203,31 @@ def _group_help(group: str) -> str:
     return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
 
 
-def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
+def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
     """Help of one command: the options that people use first (`first`), or with `--help=all` every option.
 
     words: all that was given: `--policy.type=act` lists the options of that policy, too.
     """
     options = options_of(cls)
-    first = () if HELP_ALL in words else getattr(cls, "first", ())
+    first = () if "--help=all" in words else getattr(cls, "first", "").split()
     positional = [option for option in options if option.positional]
     places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
     rows = dict(_row(option) for option in options if not first or option.positional or option.name in first)
     rest = len(options) - len(rows)
     rows["--config_path=FILE.yaml"] = "read options from YAML; those on the command line win"
     if rest:
-        rows[HELP_ALL] = f"list the other {rest} options, too"
-    more = _policy_help(words) if any(one.is_open for one in options) else ""
+        rows["--help=all"] = f"list the other {rest} options, too"
+    kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
+    more = ""
+    if kind and any(one.is_open for one in options):
+        from manip_il.learn.lerobot_config import option_lines
+
+        lines = _table({left: f"[{right}]" for left, right in option_lines(kind)})
+        more = f"\n\noptions of {kind}:\n{lines}"
     return (
         f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{inspect.getdoc(cls)}\n\n"
         f"options:\n{_table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {cls.example}"
     )
-
-
-def _policy_help(words: Sequence[str]) -> str:
-    """The options of the policy that `--policy.type=` in a command's words names; nothing if none does."""
-    kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
-    if not kind:
-        return ""
-    from manip_il.learn.lerobot_config import option_lines
-
-    lines = _table({left: f"[{right}]" for left, right in option_lines(kind)})
-    return f"\n\noptions of {kind}:\n{lines}"
 
 
 def _table(rows: Mapping[str, str]) -> str:
@@ -273,14 +244,7 @@ def _row(option: Option) -> tuple[str, str]:
         default = "none"
     else:
         default = word(option.default) or "empty"
-    return left, f"{option.help} [{default}]".lstrip()
-
-
-def _stdout_is_gone() -> bool:
-    """Whether nobody reads our output any more."""
-    poll = select.poll()
-    poll.register(sys.stdout, select.POLLOUT)
-    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+    return left, f"{option.metadata.get('help', '')} [{default}]".lstrip()
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ class Option:
 
     path: the attributes and keys that lead from the command's options to its value. metadata: of its field: `help`, one
     line; `positional` for a value without a name; `command_line_only` for one that no file may set; `flag`, its whole
-    name; `at_least` and `at_most`.
+    name; `at_least` and `at_most`. is_given: it is in a `Given` group, which holds it only if it was given.
     """
 
     name: str  # dotted: `dataset.root`
@@ -58,12 +58,7 @@ class Option:
     type: Any
     default: Any
     metadata: Mapping[str, Any]
-    is_given: bool = False  # in a `Given` group, which holds it only if it was given
-
-    @property
-    def help(self) -> str:
-        """One line of help."""
-        return self.metadata.get("help", "")
+    is_given: bool = False
 
     @property
     def positional(self) -> bool:
@@ -73,11 +68,9 @@ class Option:
     @property
     def label(self) -> str:
         """Name as the user writes it."""
-        if self.is_open:
-            return f"--{self.name}.NAME"
         if self.positional:
             return f"{self.name.upper()}..." if self.is_list else self.name.upper()
-        return f"--{self.name}"
+        return f"--{self.name}.NAME" if self.is_open else f"--{self.name}"
 
     @property
     def is_list(self) -> bool:
@@ -105,13 +98,9 @@ def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, .
             source, only, defaults = (one.metadata[key] for key in ("given", "only", "defaults"))
             for theirs in dataclasses.fields(source):
                 if "help" in theirs.metadata and (not only or theirs.name in only):
-                    name = theirs.metadata.get("flag", inner + theirs.name)
-                    own = defaults.get(theirs.name, _default(theirs))
-                    found.append(
-                        Option(
-                            name, (*here, theirs.name), _type_of(source, theirs), own, theirs.metadata, is_given=True
-                        )
-                    )
+                    name, place = theirs.metadata.get("flag", inner + theirs.name), (*here, theirs.name)
+                    own, their_kind = defaults.get(theirs.name, _default(theirs)), _type_of(source, theirs)
+                    found.append(Option(name, place, their_kind, own, theirs.metadata, is_given=True))
         elif dataclasses.is_dataclass(kind):
             found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
         else:
@@ -142,19 +131,18 @@ def to_plain(options: Any) -> dict[str, Any]:
     """Return a command's options as a tree of dicts, lists, text, numbers, booleans and None, by their names."""
     tree: dict[str, Any] = {}
     for one in options_of(type(options)):
-        if one.metadata.get("command_line_only"):
-            continue
-        *groups, last = one.name.split(".")
-        place = functools.reduce(lambda inner, name: inner.setdefault(name, {}), groups, tree)
-        place[last] = _plain(one.value(options))
+        if not one.metadata.get("command_line_only"):
+            *groups, last = one.name.split(".")
+            place = functools.reduce(lambda inner, name: inner.setdefault(name, {}), groups, tree)
+            place[last] = _plain(one.value(options))
     return tree
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in typing.cast(Mapping[str, Any], value).items()}
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in typing.cast(list[Any], value)]
+        return [_plain(item) for item in value]
     return str(value) if isinstance(value, Path) or hasattr(value, "parse") else value
 
 
@@ -168,7 +156,7 @@ def command_line(name: str, options: Any) -> str:
         elif one.is_open:
             texts = {key: text if isinstance(text, str) else json.dumps(text) for key, text in value.items()}
             words += [f"--{one.name}.{key}={text}" for key, text in texts.items()]
-        elif (one.default is MISSING or value != one.default) and one.name not in ("resume", "overwrite"):
+        elif value != one.default and one.name not in ("resume", "overwrite"):
             words.append(f"--{one.name}={word(value)}")
     return shlex.join(words)
 
@@ -210,48 +198,27 @@ def from_word(option_type: Any, word: str) -> Any:
 
 
 def decode(option_type: Any, value: Any) -> Any:
-    """Return `value`, as YAML gives it or as text, as the declared type; `ValueError` if it is none."""
-    if (some := without_none(option_type)) is not option_type:
-        return None if value is None else decode(some, value)
-    if typing.get_origin(option_type) is list:
-        (item_type,) = typing.get_args(option_type)
-        items = [value] if item_type is Path and isinstance(value, str) else value  # one path for a list of one
-        if not isinstance(items, list):
-            raise ValueError
-        return [decode(item_type, item) for item in typing.cast(list[Any], items)]
-    if named := choices(option_type):
-        if value not in named:
-            raise ValueError
-        return value
-    if hasattr(option_type, "parse") and isinstance(value, str):
-        return option_type.parse(value)
-    return _decode_scalar(option_type, value)
+    """Return `value`, as YAML gives it or as text, as the declared type; raises one of several errors if it is none.
+
+    Draccus takes a boolean for a number or text, NaN for a number and nothing for the current folder, which is refused.
+    """
+    import draccus  # here, as help needs no YAML
+
+    some = without_none(option_type)
+    if hasattr(some, "parse") and isinstance(value, str):
+        return some.parse(value)
+    if some == list[Path] and isinstance(value, str):
+        value = [value]
+    decoded: Any = draccus.decode(option_type, value)
+    if decoded != decoded or (isinstance(value, bool) and some is not bool) or (some is Path and value == ""):
+        raise ValueError
+    if isinstance(decoded, list):
+        return [_expand(item) for item in typing.cast(list[Any], decoded)]
+    return _expand(decoded)
 
 
-def _decode_scalar(option_type: Any, value: Any) -> Any:
-    if isinstance(value, bool):
-        if option_type is bool:
-            return value
-    elif isinstance(value, int | float):
-        if option_type is float and value == value:  # NaN would slip through every range check
-            return float(value)
-        if option_type is int and isinstance(value, int):
-            return value
-    elif isinstance(value, str):
-        return _decode_text(option_type, value)
-    raise ValueError
-
-
-def _decode_text(option_type: Any, text: str) -> Any:
-    if option_type is str:
-        return text
-    if option_type is bool and text in ("true", "false"):
-        return text == "true"
-    if option_type is int or (option_type is float and float(text) == float(text)):
-        return option_type(text)
-    if option_type is Path and text:  # a shell leaves the tilde of `--root=~/x` alone
-        return Path(text).expanduser() if text == "~" or text.startswith("~/") else Path(text)
-    raise ValueError
+def _expand(value: Any) -> Any:
+    return value.expanduser() if isinstance(value, Path) else value  # a shell leaves the tilde of `--root=~/x` alone
 
 
 def without_none(option_type: Any) -> Any:

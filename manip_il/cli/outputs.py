@@ -27,15 +27,10 @@ class Output:
     output_dir: Path = option(MISSING, "folder of what is written", free=True)
     overwrite: bool = option(False, "replace what is there", free=True)
 
-    @property
-    def goes_on(self) -> bool:
-        """Whether what is there is continued."""
-        return getattr(self, "resume", False)
-
     def check(self) -> None:
         """Raise `UsageError` if a command cannot begin to write."""
-        resumable = hasattr(self, "resume")
-        check_output(self.output_dir, resume=self.goes_on, overwrite=self.overwrite, resumable=resumable)
+        resumable, resume = hasattr(self, "resume"), getattr(self, "resume", False)
+        check_output(self.output_dir, resume=resume, overwrite=self.overwrite, resumable=resumable)
 
     @contextmanager
     def open(self, options: Any) -> Generator[Path]:
@@ -43,17 +38,18 @@ class Output:
 
         Raises `ManipError` if the folder cannot be written to.
         """
-        folder = self.output_dir
+        self.check()
+        folder, resume = self.output_dir, getattr(self, "resume", False)
         with ExitStack() as held:
             try:
                 held.enter_context(exclusive(folder))
-                prepare_output(folder, resume=self.goes_on, overwrite=self.overwrite)
+                prepare_output(folder, resume=resume, overwrite=self.overwrite)
             except OSError as error:
                 raise ManipError(
                     f"{folder} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
                     'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
                 ) from error
-            if self.goes_on:
+            if resume:
                 check_same_options(folder, options)
             save_options(folder, options)
             yield folder
@@ -77,8 +73,7 @@ def prepare_output(folder: Path, *, resume: bool = False, overwrite: bool = Fals
         if path.is_file():  # a folder has a lock of its own, and is removed by the next writer
             path.unlink()
     if overwrite and folder.is_dir():
-        # The marks first, so that a kill leaves nothing that could be continued; not the folder: it may be a mount.
-        for path in sorted(folder.iterdir(), key=lambda path: not any(one.startswith(path.name) for one in _MARKS)):
+        for path in folder.iterdir():  # not the folder: it may be a mount
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
@@ -89,8 +84,6 @@ def check_output(folder: Path, *, resume: bool = False, overwrite: bool = False,
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
-    if folder.is_symlink() and not folder.exists():
-        raise UsageError(f"{folder} is a link to nothing; expected a folder")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file; expected a folder")
     if resume or not folder.exists() or not any(folder.iterdir()):
@@ -139,11 +132,8 @@ def require_ours(folder: Path) -> None:
     real = folder.resolve()
     if folder.is_symlink():
         raise UsageError(f"{folder} is a link to {real}; --overwrite=true deletes no links, name the folder itself")
-    for name, kept in (("your home folder", Path.home().resolve()), ("the current folder", Path.cwd().resolve())):
-        if kept.is_relative_to(real):
-            raise UsageError(f"{folder} is or contains {name}; --overwrite=true will not delete it")
-    if next(real.rglob(".git"), None) is not None:
-        raise UsageError(f"{folder} holds a git checkout; --overwrite=true will not delete it")
+    if any(kept.resolve().is_relative_to(real) for kept in (Path.home(), Path.cwd())) or any(real.rglob(".git")):
+        raise UsageError(f"{folder} holds your home or current folder, or a git checkout; it will not be deleted")
     files = {real / name: mark.encode() for name, mark in _MARKS.items() if (real / name).is_file()}
     if not any(mark in path.read_bytes() for path, mark in files.items()):
         raise UsageError(

@@ -1,20 +1,20 @@
 """Options from the command line (`--a.b=c`) and from YAML, in LeRobot's style; words beat YAML beats defaults.
 
-The parser is our own, as LeRobot's cannot be taught to answer with one line: it exits through argparse, turns a range
-error of a nested dataclass into a decoding error, takes `true` for a number, and knows no open groups.
+Draccus reads the values (see `options.decode`). What is around them is our own, as its parser exits through argparse,
+turns a range error of a nested dataclass into a decoding error, and knows no open groups.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from manip_il import __version__
-from manip_il.checks import shorten
+from manip_il.checks import parse_yaml, read_yaml, shorten
 from manip_il.cli.options import (
     Option,
     choices,
@@ -26,7 +26,7 @@ from manip_il.cli.options import (
     to_plain,
     without_none,
 )
-from manip_il.errors import UsageError, did_you_mean, nearest, nearest_names
+from manip_il.errors import ManipError, UsageError, did_you_mean, nearest, nearest_names
 from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
@@ -52,15 +52,13 @@ def parse[T](cls: type[T], words: Sequence[str], command: str = "") -> T:
 
     command: whose options they are, for the message.
     """
-    known = _known(cls)
-    from_words, config_paths = _read_words(words, known, command)
-    from_files = _read_layers(((path, _read_yaml(Path(path))) for path in config_paths), known)
-    return _make(cls, from_files | from_words, known)
+    from_words, paths = _read_words(words, _known(cls), command)
+    return _make(cls, [(path, read_yaml(Path(path), "a YAML file of options")) for path in paths], from_words)
 
 
 def from_yaml[T](path: Path, cls: type[T]) -> T:
     """Read options from a YAML file of differences, or from one that `dump_yaml` wrote."""
-    return from_layers(cls, [(str(path), _read_yaml(path))])
+    return _make(cls, [(str(path), read_yaml(path, "a YAML file of options"))])
 
 
 def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]]) -> T:
@@ -68,7 +66,7 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]]) -> T:
 
     layers: the origin of a tree, for error messages, and the tree. `UsageError` as from a YAML file.
     """
-    return _make(cls, _read_layers(layers, _known(cls)), _known(cls))
+    return _make(cls, layers)
 
 
 def check_values(options: Any, prefix: str | None = None) -> None:
@@ -97,32 +95,34 @@ def _known(cls: type) -> Known:
 
 
 def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[str, _Said], list[str]]:
+    """Return what was said of each option, and the YAML files that are to be read."""
     said: dict[str, _Said] = {}
     config_paths: list[str] = []
     places = [option for option in known.values() if option.positional]
     rest = list(words)
     while rest:
         word = rest.pop(0)
+        name, equals, value = word.removeprefix("--").partition("=")
+        group = _open_group(name, known)
         if not word.startswith("--"):
-            if not places:
-                raise _unexpected_word(word, command)
+            if not places or word.startswith("-"):
+                raise UsageError(f"unexpected {shorten(word)}; options are written --name=value, {_lists(command)}")
             option = places[0] if places[0].is_list else places.pop(0)
             before = said[option.name].value if option.is_list and option.name in said else []
             said[option.name] = _Said([*before, word] if option.is_list else word, option.label)
-            continue
-        name, equals, value = word[2:].partition("=")
-        if name not in known and name.replace("-", "_") in known:  # as other programs write it
-            name = name.replace("-", "_")
-        group = _open_group(name, known)
-        is_option = name in known and not known[name].positional and not known[name].is_open
-        if not group and not is_option and name != CONFIG_PATH:
-            raise unknown_option("option", name, known, "--", command)
-        if not equals:
-            value = _next_value(name, known, rest)
-        if name == CONFIG_PATH:
-            config_paths.append(value)
+        elif name == CONFIG_PATH:
+            config_paths.append(value if equals else _next_value(name, "a path", rest))
+        elif group:
+            said[name] = _Said(_as_yaml(value if equals else _next_value(name, "a value", rest), group), f"--{name}")
+        elif name not in known or known[name].positional or known[name].is_open:
+            raise _unknown_option("option", name, known, "--", command)
         else:
-            said[name] = _Said(_as_yaml(value, group) if group else from_word(known[name].type, value), f"--{name}")
+            kind = known[name].type
+            if not equals and kind is bool and (not rest or rest[0] not in ("true", "false")):
+                value = "true"
+            elif not equals:
+                value = _next_value(name, expected(kind), rest)
+            said[name] = _Said(from_word(kind, value), f"--{name}")
     return said, config_paths
 
 
@@ -134,64 +134,48 @@ def _open_group(name: str, known: Known) -> str:
 
 
 def _as_yaml(word: str, group: str) -> Any:
-    from manip_il.checks import parse_yaml
-
     try:
         return parse_yaml(word)
     except ValueError as error:
         raise UsageError(f"--{group}: {shorten(word)} is not a YAML value: {error}") from error
 
 
-def _next_value(name: str, known: Known, rest: list[str]) -> str:
-    """Take the value of `--name value` from `rest`; a flag without one is true."""
-    if name in known and known[name].type is bool and not (rest and rest[0] in ("true", "false")):
-        return "true"
+def _next_value(name: str, wanted: str, rest: list[str]) -> str:
+    """Take the value of `--name value` from `rest`."""
     if not rest or rest[0].startswith("--"):
-        wanted = expected(known[name].type) if name in known else "a path"
         raise UsageError(f"--{name} has no value; expected {wanted}")
     return rest.pop(0)
 
 
-def _read_yaml(path: Path) -> Any:
-    from manip_il.checks import read_yaml
-
-    return read_yaml(path, "a YAML file of options")
-
-
-def _read_layers(layers: Iterable[tuple[str, Any]], known: Known) -> dict[str, _Said]:
+def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _Said]:
+    """Return what a tree of options says of each."""
+    if not isinstance(tree, dict | None):
+        where = f"{origin}: {prefix[:-1]}" if prefix else origin
+        raise UsageError(f"{where}: expected a mapping of options, got {shorten(tree)}")
     said: dict[str, _Said] = {}
-    for origin, tree in layers:
-        if not isinstance(tree, dict | None):
-            raise UsageError(f"{origin}: expected a mapping of options, got {shorten(tree)}")
-        said |= _read_tree(tree or {}, known, origin)
-    return said
-
-
-def _read_tree(tree: Mapping[Any, Any], known: Known, origin: str, prefix: str = "") -> dict[str, _Said]:
-    said: dict[str, _Said] = {}
-    for key, value in tree.items():
+    for key, value in typing.cast(dict[Any, Any], tree or {}).items():
         name = f"{prefix}{key}"
-        is_open = name in known and known[name].is_open
-        if not is_open and (name in known or _open_group(name, known)):
+        if (name in known and not known[name].is_open) or _open_group(name, known):
             said[name] = _Said(value, f"{origin}: {name}")
-        elif not is_open and not any(option.startswith(f"{name}.") for option in known):
-            raise unknown_option(f"key in {origin}:", name, known, "", "")
-        elif not isinstance(value, dict | None):
-            raise UsageError(f"{origin}: {name}: expected a mapping of options, got {shorten(value)}")
+        elif name in known or any(option.startswith(f"{name}.") for option in known):
+            said |= _read_tree(value, known, origin, f"{name}.")
         else:
-            said |= _read_tree(value or {}, known, origin, f"{name}.")
+            raise _unknown_option(f"key in {origin}:", name, known, "", "")
     return said
 
 
-def _make[T](cls: type[T], said: Mapping[str, _Said], known: Known) -> T:
+def _make[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Said] | None = None) -> T:
+    known, said = _known(cls), dict[str, _Said]()
+    for origin, tree in layers:
+        said |= _read_tree(tree, known, origin)
+    said |= words or {}
     values: dict[tuple[str, ...], Any] = {}
     for option in known.values():
         if option.is_open:
-            inside = {name: one.value for name, one in said.items() if name.startswith(f"{option.name}.")}
+            begin = f"{option.name}."
+            inside = {name.removeprefix(begin): one.value for name, one in said.items() if name.startswith(begin)}
             if inside:
-                before = {} if option.default is MISSING else option.default
-                named = {name.removeprefix(f"{option.name}."): value for name, value in inside.items()}
-                values[option.path] = before | named
+                values[option.path] = ({} if option.default is MISSING else option.default) | inside
         elif option.name in said:
             one = said[option.name]
             if option.metadata.get("command_line_only") and not one.is_word:
@@ -221,33 +205,26 @@ def _build[T](cls: type[T], values: Mapping[tuple[str, ...], Any], base: Any = N
 def _decode_said(option_type: Any, said: _Said) -> Any:
     try:
         return decode(option_type, said.value)
-    except (ValueError, OverflowError):
+    except ManipError:  # of a class that parses itself
+        raise
+    except Exception:  # draccus raises bare ones, too
         hint = nearest(said.value, choices(option_type)) if isinstance(said.value, str) else ""
         quotes = "; YAML needs quotes around text like this" if option_type is str and not said.is_word else ""
         text = f"{said.origin}: expected {expected(option_type)}, got {shorten(said.value)}{hint}{quotes}"
         raise UsageError(text) from None
 
 
-def unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
+def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
     """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
 
     kind: `option`, or which file's key. dashes: before the names. command: empty if none is known.
     """
-    if name in known and known[name].is_open:
-        return UsageError(f"{dashes}{name} is a group of options; expected {dashes}{name}.NAME=VALUE")
-    inside = [option for option in known if option.startswith(f"{name}.")]
+    inside = [one.label for one in known.values() if one.label.startswith(f"--{name}.")]
     if inside:
-        return UsageError(f"{dashes}{name} is a group of options; known: {', '.join(dashes + one for one in inside)}")
+        return UsageError(f"{dashes}{name} is a group of options; known: {', '.join(inside)}")
     named = [one.name for one in known.values() if not (dashes and one.positional) and not one.is_open]
     near = did_you_mean([dashes + one for one in nearest_options(name, named)])
-    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; {_help(command)} lists all")
-
-
-def _unexpected_word(word: str, command: str) -> UsageError:
-    """Return the error for a word that is neither an option nor a value."""
-    if word.startswith("-") or "=" in word:
-        return UsageError(f"unexpected {shorten(word)}; options begin with two dashes: --{word.lstrip('-')}")
-    return UsageError(f"unexpected {shorten(word)}; options are written --name=value, and {_help(command)} lists them")
+    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; {_lists(command)}")
 
 
 def nearest_options(name: str, known: Collection[str]) -> list[str]:
@@ -262,5 +239,5 @@ def nearest_options(name: str, known: Collection[str]) -> list[str]:
     return list(dict.fromkeys([*of_leaf, *nearest_names(name, known)]))[:_FEW]
 
 
-def _help(command: str) -> str:
-    return f"manip-il {command or 'COMMAND'} --help=all"
+def _lists(command: str) -> str:
+    return f"manip-il {command or 'COMMAND'} --help=all lists all"

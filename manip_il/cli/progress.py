@@ -67,59 +67,54 @@ class Progress:
     """
 
     def __init__(self, total: int | None, description: str):
-        self._total, self._description = total, description
-        self._done, self._fields = 0, dict[str, object]()
+        from rich import progress
+        from rich.console import Console
+
+        columns = (
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.fields[details]}", markup=False),
+        )
+        # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
+        redirect, hidden = sys.stdout.isatty(), total == 0 or not has_bars()
+        console = Console(stderr=True)
+        self._bar = progress.Progress(*columns, console=console, redirect_stdout=redirect, disable=hidden)
+        self._bar.add_task(description, total=total, details="")
+        [self._task] = self._bar.tasks
+        self._fields: dict[str, object] = {}
         self._start = self._printed = time.monotonic()
-        self._bar = _bar(total, description) if total != 0 and has_bars() else None
 
     def __enter__(self) -> Progress:
-        if self._bar is not None:
-            self._bar.start()
+        self._bar.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-        elif self._done:
+        self._bar.stop()
+        if self.done:
             self._print()
+
+    @property
+    def done(self) -> int:
+        """Steps so far."""
+        return int(self._task.completed)
 
     def advance(self, n: int = 1, **fields: object) -> None:
         """Add `n` steps; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
-        self._done += n
         self._fields |= fields
-        if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=self._done, details=self._details())
-        elif time.monotonic() - self._printed >= INTERVAL:
+        texts = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in self._fields.items()}
+        self._bar.update(self._task.id, advance=n, details=", ".join(f"{name} {text}" for name, text in texts.items()))
+        if time.monotonic() - self._printed >= INTERVAL:
             self._print()
 
     def _print(self) -> None:
         self._printed = time.monotonic()
-        count = self._done if self._total is None else f"{self._done}/{self._total}"
-        rate = f"{self._done / max(self._printed - self._start, 1e-9):.3g}/s"
-        if not _quiet:
-            details = ", ".join(filter(None, [rate, self._details()]))
-            print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
-
-    def _details(self) -> str:
-        texts = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in self._fields.items()}
-        return ", ".join(f"{name} {text}" for name, text in texts.items())
-
-
-def _bar(total: int | None, description: str) -> Any:
-    from rich import progress
-    from rich.console import Console
-
-    columns = (
-        progress.TextColumn("{task.description}", markup=False),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TimeRemainingColumn(),
-        progress.TextColumn("{task.fields[details]}", markup=False),
-    )
-    # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
-    bar = progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty())
-    bar.add_task(description, total=total, details="")
-    return bar
+        if self._bar.disable and not _quiet:
+            count = self.done if self._task.total is None else f"{self.done}/{self._task.total:.0f}"
+            rate = f"{self.done / max(self._printed - self._start, 1e-9):.3g}/s"
+            details = ", ".join(filter(None, [rate, self._task.fields["details"]]))
+            print(f"{self._task.description}: {count} ({details})", file=sys.stderr, flush=True)
 
 
 class Stages:
@@ -134,7 +129,7 @@ class Stages:
         self._stopping = False
         self._handlers: dict[int, Any] = {}
         self._bar: Progress | None = None
-        self._done = self._solved = 0
+        self._solved = 0
 
     def __enter__(self) -> Stages:
         self._handlers = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -160,8 +155,12 @@ class Stages:
         """Close the bar of the stage before and open one of `total` episodes or steps."""
         self.close()
         self.check()
-        self._done = self._solved = 0
+        self._solved = 0
         self._bar = Progress(total, description).__enter__()
+
+    @property
+    def _done(self) -> int:
+        return self._bar.done if self._bar else 0
 
     def close(self) -> None:
         """Close the bar."""
@@ -169,8 +168,8 @@ class Stages:
             self._bar.__exit__()
             self._bar = None
 
-    def _advance(self, n: int = 1, **fields: object) -> None:
-        self._done += n
+    def step(self, n: int = 1, **fields: object) -> None:
+        """Count `n` steps that are done; `fields` say something of them."""
         if self._bar is not None:
             self._bar.advance(n, **fields)
         self.check()
@@ -178,15 +177,11 @@ class Stages:
     def episode(self, episode: Episode | EpisodeResult) -> None:
         """Count an episode that has ended."""
         self._solved += episode.success
-        self._advance(success=self._solved / (self._done + 1))
-
-    def step(self) -> None:
-        """Count a step that is done."""
-        self._advance()
+        self.step(success=self._solved / (self._done + 1))
 
     def reach(self, step: int, **fields: object) -> None:
         """Show that a stage has reached a step, and what `fields` say of it."""
-        self._advance(step - self._done, **fields)
+        self.step(step - self._done, **fields)
 
     def log(self, record: dict[str, Any]) -> None:
         """Show a fit's metrics at a step; {} if there are none."""

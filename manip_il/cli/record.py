@@ -52,15 +52,7 @@ class RecordOptions:
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
-    first: ClassVar[tuple[str, ...]] = (
-        "robot.type",
-        "task.type",
-        "dataset.root",
-        "dataset.num_episodes",
-        "cameras",
-        "seed",
-        "resume",
-    )
+    first: ClassVar[str] = "robot.type task.type dataset.root dataset.num_episodes cameras seed resume"
     env: Given = common.env_given()
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     cameras: list[str] = option(list, f"{common.CAMERAS_HELP}; by default no pictures")

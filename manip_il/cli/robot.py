@@ -149,7 +149,7 @@ class CertifyOptions:
     """
 
     example: ClassVar[str] = "manip-il robot certify --policy.path=runs/dagger --output_dir=runs/certificate"
-    first: ClassVar[tuple[str, ...]] = ("policy.path", "robot.type", "task.type", "cases", "output_dir")
+    first: ClassVar[str] = "policy.path robot.type task.type cases output_dir"
     policy: VisitorGroup = field(default_factory=VisitorGroup)
     env: Given = common.env_given(of_policy=True)
     cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)

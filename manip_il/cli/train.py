@@ -50,16 +50,7 @@ class TrainOptions:
     example: ClassVar[str] = (
         "manip-il train --dataset.root=datasets/demos --policy.type=act --policy.chunk_size=16 --output_dir=runs/act"
     )
-    first: ClassVar[tuple[str, ...]] = (
-        "dataset.root",
-        "policy",
-        "observation",
-        "action_space",
-        "steps",
-        "batch_size",
-        "output_dir",
-        "resume",
-    )
+    first: ClassVar[str] = "dataset.root policy observation action_space steps batch_size output_dir resume"
     dataset: SourceGroup
     weights: Path | None = option(
         None,

@@ -49,7 +49,7 @@ class ViewOptions:
     """
 
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
-    first: ClassVar[tuple[str, ...]] = ("policy.path", "policy.type", "robot.type", "task.type", "n_episodes", "output")
+    first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = common.env_given(of_policy=True)
     suite: str = common.suite_option()

@@ -26,7 +26,7 @@ class FakeOptions:
     """
 
     example: ClassVar[str] = "manip-il fake --act=say"
-    act: Literal["say", "fail", "usage", "bug", "chatter", "stop", "interrupt", "foreign_pipe"] = "say"
+    act: Literal["say", "fail", "usage", "bug", "stop", "interrupt"] = "say"
     dataset: Group = field(default_factory=Group)
     resume: bool = False
 
@@ -40,14 +40,9 @@ class FakeOptions:
                 raise UsageError("0 episodes; expected 1 or more")
             case "bug":
                 raise ZeroDivisionError("by\nzero")
-            case "chatter":
-                for _ in range(100_000):
-                    say("line")
             case "stop":
                 with Stages("1 of 50 episodes in x") as stages:
                     os.kill(os.getpid(), signal.SIGTERM)
                     stages.check()
             case "interrupt":
                 raise KeyboardInterrupt
-            case "foreign_pipe":
-                raise BrokenPipeError(32, "a worker went away")

@@ -93,14 +93,14 @@ def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monk
         with pytest.raises(UsageError, match=why):
             overwrite(folder)
 
-    refused(Path("/"), "will not delete")
+    refused(Path("/"), "will not be deleted")
     refused(link, "is a link")
     with monkeypatch.context() as patch:
         patch.chdir(inside)
-        refused(ours, "current folder")
+        refused(ours, "will not be deleted")
     with monkeypatch.context() as patch:
         patch.setenv("HOME", str(inside))
-        refused(ours, "home folder")
+        refused(ours, "will not be deleted")
     (inside / ".git").mkdir()
     refused(ours, "git checkout")
     assert (ours / "config.yaml").exists()

@@ -84,7 +84,7 @@ def test_no_file_may_say_it_and_the_resolved_options_do_not(command, tmp_path):
     cls = load(command)
     [option] = [option for option in options_of(cls) if option.name == "trust"]
     assert option.default is False
-    assert "only for sources that you trust" in option.help
+    assert "only for sources that you trust" in option.metadata["help"]
     said = parse(cls, [*REQUIRED.get(command, []), "--trust=true"])
     assert said.trust is True  # pyright: ignore[reportAttributeAccessIssue]
     assert "trust" not in dump_yaml(said)
