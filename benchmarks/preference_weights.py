@@ -36,7 +36,7 @@ from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.preferences.fitting import TIE, true_difference
 from manip_il.preferences.frames import find_datasets
-from manip_il.preferences.pairs import Clips, choose_pairs, open_supply
+from manip_il.preferences.pairs import choose_pairs
 
 AGREEMENT, AREA, POINTS, P_VALUE = 0.90, 0.95, 0.15, 0.001
 _FRESH, _CLIP, _DRAWS = 2_000, 20, 5
@@ -70,7 +70,8 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
     )
     join(folder / "good", folder / "bad" / "round_001" / "dataset", half)
     run(f"data score {half} --reward={rewards[0]}", folder / "scores")
-    scores = json.loads((folder / "scores" / "scores.json").read_text())
+    run(f"data score {half} --reward=progress", folder / "true_scores")
+    area, true = (json.loads((folder / name / "scores.json").read_text())["auc"] for name in ("scores", "true_scores"))
     weights = f"--weights={folder / 'scores' / 'rabc.parquet'}"
     sources = {"weighted": f"{half} {weights}", "as it is": half, "demonstrations alone": folder / "good"}
     results = {name: clone(folder, name, source, steps, seeds) for name, source in sources.items()}
@@ -78,12 +79,12 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
     agreement = float(np.mean([one.rate for one in agreements]))
     print(f"agreement with true progress on pairs that nobody answered: mean {agreement:.1%}")
     print("\n".join(f"  draw {draw}: {one} of {one.n:,}" for draw, one in enumerate(agreements)))
-    print(f"area under the ROC curve, failed episodes: {scores['auc']}; by true progress {scores['auc_of_progress']}")
+    print(f"area under the ROC curve, failed episodes: {area}; by true progress {true}")
     print("\n".join(f"{name}: {result.success}" for name, result in results.items()))
     print(f"weighted against as it is: {compared.verdict}")
     reached = (
         agreement >= AGREEMENT,
-        (scores["auc"] or 0) >= AREA,
+        (area or 0) >= AREA,
         compared.difference >= POINTS and compared.p_value < P_VALUE,
     )
     return 0 if quick or all(reached) else 1
@@ -116,8 +117,7 @@ def clone(folder: Path, name: str, source: object, steps: int, seeds: int) -> Ev
 
 def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
     """Share of other pairs of clips in which the reward agrees with true progress, but for ties."""
-    supply = open_supply(find_datasets([rounds]), _CLIP)
-    clips = Clips(choose_pairs(supply, count, 0, np.random.default_rng(999)), supply.frames)
+    clips = choose_pairs(find_datasets([rounds]), _CLIP, count, 0, np.random.default_rng(999))
     returns = LearnedReward.load(reward / PRETRAINED_MODEL).of_inputs(clips.inputs)[clips.rows].sum(-1)
     difference = true_difference(clips)
     assert difference is not None

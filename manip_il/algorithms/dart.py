@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.imitation import ImitationRun
@@ -14,9 +13,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError
-from manip_il.learn.policy import LearnedPolicy
-
-F64 = NDArray[np.float64]
+from manip_il.learn.policy import LearnedPolicy, actions_along
 
 
 def dart(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
@@ -39,14 +36,8 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tupl
     without a sound label.
     """
     table = Dataset.open(root).columns((STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX))
-    learner, episodes = LearnedPolicy.load(policy, trust=trust), table[EPISODE_INDEX].reshape(-1)
-    starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
-    steps = np.arange(len(episodes)) - np.repeat(starts, np.diff(np.append(starts, len(episodes))))
-    errors: list[F64] = []
-    for step in range(int(steps.max()) + 1):  # in the order of time, for a policy with a memory
-        rows = np.flatnonzero(steps == step)
-        actions = learner.act(table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, episodes[rows].tolist())
-        errors.append((actions - table[ACTION][rows])[table[LABEL_VALID][rows].reshape(-1) != 0])
+    learner, sound = LearnedPolicy.load(policy, trust=trust), table[LABEL_VALID].reshape(-1) != 0
+    errors = [(actions - table[ACTION][rows])[sound[rows]] for rows, actions in actions_along(learner, table)]
     off = np.concatenate(errors)
     if not len(off):
         raise ManipError(f"{root} holds no valid label to compare the policy with")

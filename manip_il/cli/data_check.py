@@ -121,8 +121,8 @@ class ScoreOptions:
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
     Writes scores.json, report.html, and rabc.parquet: weights of frames, for manip-il train --weights= and for
-    lerobot-train --sample_weighting.progress_path=. Where the dataset says which episodes failed, how well the score
-    finds them stands beside what true progress would find.
+    lerobot-train --sample_weighting.progress_path=. Where the dataset says which episodes failed, it says how well the
+    score finds them.
     """
 
     example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"

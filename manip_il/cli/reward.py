@@ -91,21 +91,17 @@ class PairsOptions:
         """Read the sources, choose, and write the pairs."""
         from manip_il.evaluation.results import write_json
         from manip_il.preferences.frames import find_datasets
-        from manip_il.preferences.pairs import choose_pairs, open_supply
+        from manip_il.preferences.pairs import choose_pairs
         from manip_il.seeding import rng_for, stream_base
 
         check_new_file(self.output, self.overwrite)
         reward = load_reward(self.reward) if self.reward else None
-        supply = open_supply(find_datasets(self.sources), self.clip)
-        if reward is not None:
-            reward.check_fits(str(supply.roots[0]), supply.frames[0].spec)
         rng = rng_for(stream_base("training", self.seed), "pairs")
-        members = reward.members if reward is not None else None
-        pairs = choose_pairs(supply, self.count, self.seed, rng, members)
-        write_json(self.output, pairs.to_json())
-        if supply.too_short:
-            warn(f"{supply.too_short:,} episodes are shorter than {self.clip} control steps: no clip is from them")
-        say(f"{len(pairs):,} pairs from {len(pairs.sources)} datasets: {self.output}")
+        clips = choose_pairs(find_datasets(self.sources), self.clip, self.count, self.seed, rng, reward)
+        write_json(self.output, clips.pairs.to_json())
+        if clips.too_short:
+            warn(f"{clips.too_short:,} episodes are shorter than {self.clip} control steps: no clip is from them")
+        say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {self.output}")
         say(f"next: manip-il reward ask {self.output} --output=ask.html")
 
 
@@ -144,13 +140,12 @@ class AnswerOptions:
     """Answer pairs by a simulated teacher, who compares the clips' true progress (B-Pref, Lee et al. 2021).
 
     perfect; boltzmann:TEMPERATURE, who is less sure where returns are near; mistaken:EPSILON, the wrong way round in a
-    share of the pairs; myopic:GAMMA, for whom a clip's end counts most; skipping:DELTA, who skips pairs in which
-    neither clip has DELTA of the mean return. A clip's return is the sum of progress over its steps.
+    share of the pairs. A clip's return is the sum of progress over its steps.
     """
 
     example: ClassVar[str] = "manip-il reward answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
     pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
-    teacher: str = option("perfect", "perfect, boltzmann[:1], mistaken[:0.1], myopic[:0.9] or skipping[:0.1]")
+    teacher: str = option("perfect", "perfect, boltzmann[:1] or mistaken[:0.1]")
     seed: int = _seed("the teacher's chances")
     output: Path = option(Path("preferences.json"), "the file")
     overwrite: bool = option(False, "replace an existing file")

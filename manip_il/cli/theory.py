@@ -53,7 +53,7 @@ class TheoryOptions:
                 shift = self._shift(self.source)
                 timings["the run"] = time.monotonic() - begin
             begin, curves = time.monotonic(), []
-            with Progress(6 * len(PROCESSES), "theorems") as bar:
+            with Progress(2 * len(PROCESSES), "theorems") as bar:
                 for curve in all_curves():
                     curves.append(curve)
                     bar.advance()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from manip_il import checks
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion
@@ -134,6 +136,19 @@ class LearnedPolicy:
             levels = torch.from_numpy(np.ascontiguousarray(picture)).permute(0, 3, 1, 2)
             batch[IMAGES + camera] = levels.contiguous().to(torch.float32) / 255
         return batch
+
+
+def actions_along(policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]) -> Iterator[tuple[NDArray[np.int64], F64]]:
+    """Yield rows (B,) and a policy's actions (B, n) in whole episodes that somebody else drove, in the order of time.
+
+    table: their `observation.state`, `observation.environment_state` and `episode_index`, an episode after the other.
+    """
+    episodes = table[EPISODE_INDEX].reshape(-1)
+    starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
+    steps = np.arange(len(episodes)) - np.repeat(starts, np.diff(starts, append=len(episodes)))
+    for step in range(int(steps.max()) + 1):  # so that a policy with a memory remembers
+        rows = np.flatnonzero(steps == step)
+        yield rows, policy.act(table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, episodes[rows].tolist())
 
 
 class _Perceptron:

@@ -2,8 +2,7 @@
 
 Teachers compare clips by true progress (B-Pref, Lee et al. 2021, section 3):
 
-    P(left is better) = sigmoid(beta (G(left) - G(right)))
-    G(clip) = sum over its steps t = 1 ... L of gamma^(L - t) progress_t
+    P(left is better) = sigmoid(beta (G(left) - G(right))),    G(clip) = sum over its steps of progress
 
 A clip's return is the sum of progress over its steps, as B-Pref's is of the task's reward: progress is what is true of
 a state, so a clip that is farther on is the better one, and one that gets on faster is, too.
@@ -19,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
-from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.preferences.pairs import Clips, Pairs, read_file
 
@@ -104,62 +103,47 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
 
 @dataclass(frozen=True)
 class Teacher:
-    """B-Pref's parameters, in its notation.
+    """One of `TEACHERS`, with B-Pref's parameters in its notation.
 
-    beta: rationality; infinite: the better clip always. gamma: a step later counts for the one before. epsilon: share
-    of answers that are the wrong way round. delta_skip: a pair is skipped if both clips have less than this share of
-    the mean return of all clips.
+    beta: rationality; infinite: the better clip always. epsilon: share of answers that are the wrong way round.
     """
 
     name: str
     beta: float = math.inf
-    gamma: float = 1.0
     epsilon: float = 0.0
-    delta_skip: float = 0.0
 
     @classmethod
     def parse(cls, text: str) -> Teacher:
-        """Return the teacher of `NAME` or `NAME:NUMBER`, see `TEACHERS`."""
-        name, colon, number = text.partition(":")
+        """Return the teacher of `perfect`, `boltzmann[:TEMPERATURE]` or `mistaken[:EPSILON]`."""
+        name, _, number = text.partition(":")
         if name not in TEACHERS:
             raise UnknownName("teacher", name, TEACHERS)
-        parameter, value, (low, high) = TEACHERS[name]
-        if colon:
-            try:
-                value = checks.number("it", float(number), low, high)
-            except (ValueError, ManipError) as error:
-                expected = f"a number from {low:g} to {high:g}" if parameter else "no number"
-                raise UsageError(f"--teacher is {text!r}; expected {expected} behind {name}:") from error
-        if parameter == "temperature":
+        try:
+            value = float(number or TEACHERS[name])
+        except ValueError:
+            value = math.nan
+        if name == "boltzmann" and 0 < value < math.inf:
             return cls(text, beta=1 / value)
-        return cls(text, **{parameter: value} if parameter else {})
+        if (name == "mistaken" and 0 <= value <= 1) or text == "perfect":
+            return cls(text, epsilon=value)
+        raise UsageError(f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE")
 
     def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
         """Return what it answers about every pair. Raises `ManipError` if the sources have no true progress."""
         if clips.progress is None:
             raise ManipError("the sources have no column progress, by which teachers compare; ask people")
-        discounts = self.gamma ** np.arange(clips.pairs.clip - 1, -1, -1)
-        returns = (clips.progress[clips.rows] * discounts).sum(-1)
+        returns = clips.progress[clips.rows].sum(-1)
         difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
         mistaken = rng.random(len(returns)) < self.epsilon
-        left = difference > 0
-        if not math.isinf(self.beta):
-            left = chance < 1 / (1 + np.exp(-np.clip(self.beta * difference, -50, 50)))
+        sure = math.isinf(self.beta)
+        left = difference > 0 if sure else chance < expit(self.beta * difference)
         found = np.where(left != mistaken, LEFT, RIGHT)
-        if math.isinf(self.beta):
+        if sure:
             found[np.abs(difference) < _ALIKE] = EQUAL
-        found[returns.max(axis=1) < self.delta_skip * returns.mean()] = SKIP
         return found.tolist()
 
 
-# name -> what a number behind the name sets, its default, and its range
-TEACHERS: dict[str, tuple[str, float, tuple[float, float]]] = {
-    "perfect": ("", 0.0, (0.0, -1.0)),
-    "boltzmann": ("temperature", 1.0, (1e-6, 1e6)),
-    "mistaken": ("epsilon", 0.1, (0.0, 1.0)),
-    "myopic": ("gamma", 0.9, (0.0, 1.0)),
-    "skipping": ("delta_skip", 0.1, (0.0, 100.0)),
-}
+TEACHERS = {"perfect": 0.0, "boltzmann": 1.0, "mistaken": 0.1}  # by default the number behind the name
 
 
 def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:

@@ -29,27 +29,20 @@ _MODEL = (
 class Fitted:
     """A fit, and its agreement on pairs that were held out, each by one network of the ensemble.
 
-    answered: with the answers left and right; true: with the clips' true progress, None where there is none; ties:
-    pairs left out of that, as their progress differs by less than `TIE`. teachers: answers' own agreement with true
-    progress. brier: mean square of answer minus probability.
+    answered: with the answers left and right; true: with the clips' true progress, but where that differs by less than
+    `TIE`; None where there is none.
     """
 
     fit: Fit
     shape: RewardShape
     answered: Proportion
     true: Proportion | None
-    teachers: Proportion | None
-    ties: int
-    brier: float
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers for `fit.json`."""
         return {
             "agreement_with_answers": _counts(self.answered),
             "agreement_with_progress": None if self.true is None else _counts(self.true),
-            "answers_agreement_with_progress": None if self.teachers is None else _counts(self.teachers),
-            "ties": self.ties,
-            "brier": self.brier,
             "epochs": self.fit.epochs,
         }
 
@@ -61,28 +54,13 @@ def fit_answers(
     rows = clips.rows[answers.pair]
     compared = Compared(rows[:, 0], rows[:, 1], answers.better, answers.pair)
     fit = fit_reward(clips.inputs, compared, shape, seed, on_epoch)
-    decided = answers.better != 0.5
     right = (fit.logits > 0) == (answers.better > 0.5)
-    probability = (1 - BY_CHANCE) / (1 + np.exp(-np.clip(fit.logits, -50, 50))) + BY_CHANCE / 2
-    difference = true_difference(clips)
-    true = teachers = None
-    ties = 0
+    difference, true = true_difference(clips), None
     if difference is not None:
         pairs, first = np.unique(answers.pair, return_index=True)
         told = np.abs(difference[pairs]) >= TIE
-        ties = int((~told).sum())
         true = _proportion(((fit.logits[first] > 0) == (difference[pairs] > 0))[told])
-        clear = decided & (np.abs(difference[answers.pair]) >= TIE)
-        teachers = _proportion(((answers.better > 0.5) == (difference[answers.pair] > 0))[clear])
-    return Fitted(
-        fit=fit,
-        shape=shape,
-        answered=_proportion(right[decided]),
-        true=true,
-        teachers=teachers,
-        ties=ties,
-        brier=float(np.mean((probability - answers.better) ** 2)),
-    )
+    return Fitted(fit, shape, _proportion(right[answers.better != 0.5]), true)
 
 
 def true_difference(clips: Clips) -> F64 | None:
@@ -127,12 +105,11 @@ def fit_report(
     agreement = Section(
         "Agreement",
         formulas=_MODEL,
-        tables=(_agreement_table(found),),
         notes=(
             f"{found.shape.members} networks of {found.shape.depth} x {found.shape.width}; the pairs are dealt into as "
             "many folds. Each network leaves one fold out, from which its numbers above are; all stopped at epoch "
-            f"{found.fit.epochs}, where the loss on these was lowest. Mean square of answer minus probability: "
-            f"{found.brier:.3f}. The reward is their mean, which has seen every pair.",
+            f"{found.fit.epochs}, where the loss on these was lowest. The reward is their mean, which has seen every "
+            f"pair. Pairs whose true progress differs by less than {TIE:g} are ties and left out.",
         ),
     )
     from_where = Section("Where the clips are from", tables=(Table(("dataset", "episodes", "frames"), sources),))
@@ -146,14 +123,3 @@ def fit_report(
         timings=timings,
         sections=(agreement, from_where),
     )
-
-
-def _agreement_table(found: Fitted) -> Table:
-    """With what the reward agrees on held-out pairs, and how far the answers do themselves."""
-    rows = [("answers", found.answered, "left or right was answered, and the reward says so")]
-    if found.true is not None:
-        rows.append(("true progress", found.true, f"ties left out, by less than {TIE:g}: {found.ties}"))
-    if found.teachers is not None:
-        rows.append(("the answers themselves with true progress", found.teachers, ""))
-    cells = tuple((name, str(p), f"{p.n:,}", note) for name, p, note in rows)
-    return Table(("with", "agreement", "of", "note"), cells).filled()

@@ -14,7 +14,7 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import UsageError
 from manip_il.learn.samples import require_finite
 from manip_il.learn.sources import check_same_sources
 
@@ -64,8 +64,6 @@ def read_frames(root: Path) -> Frames:
     spec, there = dataset.spec, list(dataset.features)
     action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in there else schema.ACTION
     needed = [schema.STATE, schema.ENVIRONMENT_STATE, action]
-    if missing := [name for name in needed if name not in there]:
-        raise ManipError(f"{root} lacks {', '.join(missing)}, of which a reward is a function")
     more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in there]
     table = dataset.columns([*needed, *more, EPISODE_INDEX])
     require_finite(table, [*needed, *(name for name in more if name == schema.PROGRESS)])
@@ -101,6 +99,4 @@ def find_datasets(folders: Sequence[Path]) -> list[Path]:
             state = "holds no dataset" if folder.exists() else "does not exist"
             raise UsageError(f"{folder} {state}; expected a LeRobot dataset or a run with rounds")
         found += [folder] if (folder / INFO).is_file() else rounds
-    if twice := next((path for path in found if found.count(path) > 1), None):
-        raise UsageError(f"{twice} is given twice; expected each source once")
     return found

@@ -11,11 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from manip_il import checks
 from manip_il.data.build import dataset_sha256
 from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.reward import LearnedReward
 from manip_il.preferences.frames import Frames, read_all
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
@@ -122,6 +124,11 @@ class Clips:
         found = [one.progress for one in self.frames]
         return None if any(one is None for one in found) else np.concatenate([one for one in found if one is not None])
 
+    @property
+    def too_short(self) -> int:
+        """Number of episodes of the sources that no clip is from."""
+        return sum(int((one.lengths < self.pairs.clip).sum()) for one in self.frames)
+
     @cached_property
     def rows(self) -> I64:
         """Rows of the left and the right clips' frames in `inputs`, (P, 2, L)."""
@@ -160,64 +167,47 @@ def read_clips(pairs: Pairs) -> Clips:
     return Clips(pairs, tuple(read_all([Path(source.root) for source in pairs.sources])))
 
 
-@dataclass(frozen=True, eq=False)
-class Supply:
-    """Datasets that clips of `length` control steps are drawn from."""
+def choose_pairs(
+    roots: Sequence[Path],
+    length: int,
+    count: int,
+    seed: int,
+    rng: np.random.Generator,
+    reward: LearnedReward | None = None,
+) -> Clips:
+    """Return pairs of clips of `length` control steps from datasets; see `Clips.too_short` for what is left out.
 
-    roots: tuple[Path, ...]
-    frames: tuple[Frames, ...]
-    length: int
-
-    @property
-    def too_short(self) -> int:
-        """Number of episodes that no clip is from."""
-        return sum(int((one.lengths < self.length).sum()) for one in self.frames)
-
-    def draw(self, source: int, rng: np.random.Generator) -> Clip:
-        """Return one clip of a source: every episode alike, every place in it alike."""
-        lengths = self.frames[source].lengths
-        episode = int(rng.choice(np.flatnonzero(lengths >= self.length)))
-        return Clip(source, episode, int(rng.integers(0, int(lengths[episode]) - self.length + 1)))
-
-
-def open_supply(roots: Sequence[Path], length: int) -> Supply:
-    """Read datasets. Raises `MismatchError` unless they are of one task, `ManipError` if all episodes are short."""
-    supply = Supply(tuple(roots), tuple(read_all(roots)), length)
-    longest = max(int(one.lengths.max()) for one in supply.frames)
+    With `reward`, those of `POOL` times as many are kept about which its networks disagree most: the standard deviation
+    over them of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021). Raises `MismatchError`
+    unless datasets and reward are of one task, `ManipError` if there are not so many pairs.
+    """
+    frames = tuple(read_all(roots))
+    longest = max(int(one.lengths.max()) for one in frames)
     if longest < length:
         raise ManipError(f"--clip is {length} control steps; the longest episode has {longest}")
-    return supply
-
-
-def choose_pairs(
-    supply: Supply, count: int, seed: int, rng: np.random.Generator, members: Members | None = None
-) -> Pairs:
-    """Return pairs; with `members`, those of `POOL` times as many about which the ensemble disagrees most.
-
-    The disagreement about a pair is the standard deviation over the ensemble of P(left is better) (Christiano et al.
-    2017, section 2.2.4; Lee et al. 2021).
-    """
-    drawn = _draw(supply, count * (POOL if members is not None else 1), rng)
+    if reward is not None:
+        reward.check_fits(str(roots[0]), frames[0].spec)
+    drawn = _draw(frames, length, count * (1 if reward is None else POOL), rng)
     if len(drawn) < count:
-        raise ManipError(f"--count is {count}; {len(drawn)} pairs of clips of {supply.length} steps were found")
-    spec = supply.frames[0].spec
+        raise ManipError(f"--count is {count}; {len(drawn)} pairs of clips of {length} steps were found")
+    spec = frames[0].spec
     made = Pairs(
         robot=spec.robot,
         task=spec.task,
         control_hz=spec.fps,
-        clip=supply.length,
+        clip=length,
         sources=tuple(
             Source(str(root), dataset_sha256(root), len(one.firsts), len(one.states))
-            for root, one in zip(supply.roots, supply.frames, strict=True)
+            for root, one in zip(roots, frames, strict=True)
         ),
         pairs=tuple(drawn),
         seed=seed,
     )
-    if members is None:
-        return made
-    doubt = disagreement(Clips(made, supply.frames), members)
-    kept = np.sort(np.argsort(-doubt, kind="stable")[:count])
-    return replace(made, pairs=tuple(made.pairs[place] for place in kept.tolist()), chosen="where rewards disagree")
+    if reward is not None:
+        doubt = disagreement(Clips(made, frames), reward.members)
+        kept = np.sort(np.argsort(-doubt, kind="stable")[:count])
+        made = replace(made, pairs=tuple(drawn[place] for place in kept), chosen="where rewards disagree")
+    return Clips(made, frames)
 
 
 def disagreement(clips: Clips, members: Members) -> F64:
@@ -225,16 +215,23 @@ def disagreement(clips: Clips, members: Members) -> F64:
     rows = clips.rows
     rewards = members(clips.inputs[rows.reshape(-1)])
     returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
-    return (1 / (1 + np.exp(-np.clip(returns[:, :, 0] - returns[:, :, 1], -50, 50)))).std(axis=0)
+    return expit(returns[:, :, 0] - returns[:, :, 1]).std(axis=0)
 
 
-def _draw(supply: Supply, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
+def _draw(frames: Sequence[Frames], length: int, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
     """Different pairs of clips; every source is in as many as any other, with another or itself."""
     found = dict[tuple[Clip, Clip], None]()
-    sources = [number for number, one in enumerate(supply.frames) if one.lengths.max() >= supply.length]
+    sources = [number for number, one in enumerate(frames) if one.lengths.max() >= length]
+
+    def draw(source: int) -> Clip:
+        """One clip of a source: every episode alike, every place in it alike."""
+        lengths = frames[source].lengths
+        episode = int(rng.choice(np.flatnonzero(lengths >= length)))
+        return Clip(source, episode, int(rng.integers(0, int(lengths[episode]) - length + 1)))
+
     for left, right in rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist():
         for _ in range(_TRIES):
-            pair = supply.draw(left, rng), supply.draw(right, rng)
+            pair = draw(left), draw(right)
             if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
                 found[pair] = None
                 break

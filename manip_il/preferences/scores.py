@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from scipy.stats import mannwhitneyu, spearmanr
+from scipy.stats import mannwhitneyu
 
 from manip_il.data.atomic import writing
 from manip_il.data.lerobot_layout import EPISODE_INDEX
@@ -53,11 +53,6 @@ class Scores:
         """Score of every episode, (E,)."""
         return episode_scores(self.frames, self.data)
 
-    @cached_property
-    def true(self) -> F64 | None:
-        """Score of every episode by true progress, (E,); None if there is none."""
-        return None if self.data.progress is None else episode_scores(self.data.progress, self.data)
-
     @property
     def bar(self) -> float:
         """Score below which an episode's frames weigh nothing: where the best quarter begins, less `BELOW`."""
@@ -75,26 +70,13 @@ class Scores:
         """Area under the ROC curve of finding failed episodes by a low score; None without both kinds."""
         return roc_auc(self.episodes, self.succeeded)
 
-    @property
-    def true_auc(self) -> float | None:
-        """The same by true progress: what a perfect reward would reach; None if there is none."""
-        return None if self.true is None else roc_auc(self.true, self.succeeded)
-
-    @property
-    def correlation(self) -> float | None:
-        """Spearman's correlation of the frames' scores with true progress; None if there is none."""
-        if self.data.progress is None or np.ptp(self.data.progress) == 0 or np.ptp(self.frames) == 0:
-            return None
-        found: Any = spearmanr(self.frames, self.data.progress)
-        return float(found.statistic)
-
     def worst(self, count: int) -> list[int]:
         """Return the numbers of the episodes with the lowest scores, lowest first."""
         return np.argsort(self.episodes, kind="stable")[:count].tolist()
 
     def to_json(self) -> dict[str, Any]:
         """Return everything for `scores.json`; frames' scores are in the parquet file."""
-        true, succeeded, bar = self.true, self.succeeded, self.bar
+        succeeded, bar = self.succeeded, self.bar
         numbers = self.data.episodes[self.data.firsts].tolist()
         episodes: list[Mapping[str, Any]] = [
             {
@@ -102,7 +84,6 @@ class Scores:
                 "frames": int(self.data.lengths[place]),
                 "score": float(self.episodes[place]),
                 "kept": bool(self.episodes[place] > bar),
-                "progress": None if true is None else float(true[place]),
                 "success": None if succeeded is None else bool(succeeded[place]),
             }
             for place, number in enumerate(numbers)
@@ -111,8 +92,6 @@ class Scores:
             "dataset": self.root,
             "reward": self.reward,
             "auc": self.auc,
-            "auc_of_progress": self.true_auc,
-            "correlation_with_progress": self.correlation,
             "bar": bar,
             "episodes": episodes,
         }
@@ -163,29 +142,25 @@ def write_weights(path: Path, scores: Scores) -> None:
 
 def worst_table(scores: Scores, count: int = WORST) -> Table:
     """Return the episodes with the lowest scores, lowest first."""
-    data, true, succeeded = scores.data, scores.true, scores.succeeded
+    data, succeeded = scores.data, scores.succeeded
     rows = tuple(
         (
             str(data.episodes[data.firsts[place]]),
             f"{scores.episodes[place]:.2f}",
-            "" if true is None else f"{true[place]:.2f}",
             "" if succeeded is None else ("yes" if succeeded[place] else "no"),
             f"{data.lengths[place]:,}",
         )
         for place in scores.worst(count)
     )
-    return Table(("episode", "score", "true progress", "success", "frames"), rows).filled()
+    return Table(("episode", "score", "success", "frames"), rows).filled()
 
 
 def fact_lines(scores: Scores) -> list[str]:
-    """Return which episodes are kept, how well the score finds failed ones, and how it follows true progress."""
+    """Return which episodes are kept, and how well the score finds failed ones."""
     kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
     lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}: the frames of the others weigh 0"]
     if scores.auc is not None:
-        beside = "" if scores.true_auc is None else f", by true progress {scores.true_auc:.3f}"
-        lines.append(f"area under the ROC curve of finding failed episodes: {scores.auc:.3f}{beside}")
-    if scores.correlation is not None:
-        lines.append(f"rank correlation of frames' scores with true progress: {scores.correlation:.3f}")
+        lines.append(f"area under the ROC curve of finding failed episodes: {scores.auc:.3f}")
     return lines
 
 

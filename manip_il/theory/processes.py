@@ -80,12 +80,11 @@ class Process:
     def seen(self, policy: F64, count: int, rngs: list[np.random.Generator]) -> NDArray[np.bool_]:
         """Return whether one of `count` trajectories of each policy (B, H, S) is in a state at a step, (B, H, S).
 
-        rngs: one or more; the policies are as many or a multiple, and those of one generator meet the same chances.
+        rngs: one for each policy.
         """
         (leads, counts), (batch, horizon, _) = self._ways, policy.shape
-        again = batch // len(rngs)
-        now = np.tile([rng.choice(self.states, count, p=self.start) for rng in rngs], (again, 1))
-        chances = np.tile([rng.random((horizon, 2, count)) for rng in rngs], (again, 1, 1, 1))
+        now = np.stack([rng.choice(self.states, count, p=self.start) for rng in rngs])
+        chances = np.stack([rng.random((horizon, 2, count)) for rng in rngs])
         found, rows = np.zeros(policy.shape, np.bool_), np.arange(batch)[:, None]
         for t in range(horizon):
             found[rows, t, now] = True

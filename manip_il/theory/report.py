@@ -13,14 +13,12 @@ from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.theory.bounds import DRAWS, ERROR, Curve
-from manip_il.theory.linear import GUST, SYSTEMS, Drift
+from manip_il.theory.linear import GUST, OPEN_LOOPS, Drift
 from manip_il.theory.processes import PROCESSES
 from manip_il.theory.shift import WRONG, RoundShift, Shift
 
 FILE_NAME = "theory.json"
-_FITS = {"worst": "fitted", "even": "fitted, ties even", "constructed": "constructed"}
 _LOOKS = {"cloning": (CLONING, "o"), "DAgger": (DAGGER, "s")}
-_SIZES = {"scalar": "one dimension", "plane": "two, demonstrations on a line"}
 _LEAST = 1e-7  # of a distance on a logarithmic axis
 _CLOUDS, _POINTS = 5, 1_500  # rounds whose clouds are shown, and points of a cloud
 _DATA = "#b9bfc6"
@@ -40,9 +38,9 @@ class Theory:
         return sum(curve.above for curve in self.curves)
 
     @property
-    def fitted(self) -> dict[tuple[str, str], Curve]:
-        """The curves that the theorems speak of, by process and learner: fits to data, the worst that these allow."""
-        return {(curve.problem, curve.learner): curve for curve in self.curves if curve.fit == "worst"}
+    def by_name(self) -> dict[tuple[str, str], Curve]:
+        """The curves by process and learner."""
+        return {(curve.problem, curve.learner): curve for curve in self.curves}
 
     def to_json(self) -> dict[str, Any]:
         """Return everything for `theory.json`."""
@@ -55,10 +53,10 @@ class Theory:
 
 
 def slope_table(theory: Theory) -> Table:
-    """Return the slopes of fitted policies, one row a process."""
+    """Return the slopes, one row a process."""
     rows = []
     for process in PROCESSES:
-        cloned, improved = (theory.fitted[process.name, learner] for learner in ("cloning", "DAgger"))
+        cloned, improved = (theory.by_name[process.name, learner] for learner in ("cloning", "DAgger"))
         last = cloned.horizons[-1]
         u = f"{process.recoverability(last):g} at H = {last}"
         rows.append((process.name, u, *map(str, process.slopes), _slope(cloned), _slope(improved)))
@@ -69,15 +67,15 @@ def slope_table(theory: Theory) -> Table:
 
 def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
     """Return the report of all that was found."""
-    sections = [_theorems(theory), _numbers(theory), _linear(theory)]
+    sections = [_theorems(theory), _linear(theory)]
     facts = [
-        f"{sum(len(draws) for curve in theory.curves for draws in curve.losses):,} policies on three processes, every "
-        f"value by dynamic programming: {theory.above or 'none'} above its bound.",
+        f"{sum(curve.gaps.size for curve in theory.curves):,} policies on three processes, every value by dynamic "
+        f"programming: {theory.above or 'none'} above its bound.",
     ]
     if theory.shift is not None:
         sections = [*_arm(theory.shift), *sections]
         facts.append(_shift_fact(theory.shift))
-    slopes = {key: curve.slope for key, curve in theory.fitted.items()}
+    slopes = {key: curve.slope for key, curve in theory.by_name.items()}
     walk, rope = PROCESSES[0].name, PROCESSES[1].name
     return Report(
         title="What is proved of imitation, seen",
@@ -116,9 +114,7 @@ def _theorems(theory: Theory) -> Section:
             "nothing mends a mistake, as on the tightrope, u is H, and DAgger pays as cloning does (Ross et al. 2011; "
             "Rajaraman et al. 2020).",
             f"Points: {DRAWS} fits a horizon to trajectories that leave about {ERROR:g}/H of the states unseen; there "
-            "a fit takes the worst action that is left open, or (hollow) either evenly. Thick pale lines: policies "
-            "that err with a given probability. Cloning with even ties finds back to the way by luck, on which "
-            "the theorem does not count.",
+            "a fit takes the worst action that is left open.",
         ),
     )
 
@@ -134,41 +130,20 @@ def _theorem_figure(curves: Sequence[Curve]) -> Figure:
             axis.plot(horizons, horizons * u, ":", color=DAGGER, lw=1.2, label="bound 8.2: u H")
             for curve in own:
                 colour, marker = _LOOKS[curve.learner]
-                if curve.fit == "constructed":
-                    axis.plot(horizons, curve.ratios, "-", color=colour, lw=4, alpha=0.2)
-                    continue
-                fill, more = (colour, "") if curve.fit == "worst" else ("white", ", ties even")
-                axis.plot(horizons, curve.ratios, marker, color=colour, mfc=fill, ms=4.5, label=curve.learner + more)
+                axis.plot(horizons, curve.ratios, marker, color=colour, ms=4.5, label=curve.learner)
             axis.set(xscale="log", yscale="log", xlabel="horizon H", title=process.name)
             axis.set_xticks([10, 40, 160, 640], ["10", "40", "160", "640"])
             axis.minorticks_off()
         axes[0, 0].set_ylabel("gap / ε")
-        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         return to_figure(drawn, "Gap over error against the horizon, three processes, cloning and DAgger, with bounds")
-
-
-def _numbers(theory: Theory) -> Section:
-    rows = [
-        (
-            f"{curve.problem}, {curve.learner}, {_FITS[curve.fit]}",
-            _slope(curve),
-            f"{curve.ratios[0]:.4g}",
-            f"{curve.ratios[-1]:.4g}",
-            f"{curve.largest_error:.2g}",
-            str(curve.above),
-        )
-        for curve in theory.curves
-    ]
-    first, *_, last = theory.curves[0].horizons
-    columns = ("policy", "slope", f"gap / ε, H = {first}", f"H = {last}", "largest ε H", "above its bound")
-    return Section("The numbers behind the points", tables=(Table(columns, tuple(rows)),))
 
 
 def _linear(theory: Theory) -> Section:
     rows = [
         (
-            f"{drift.system.size}, {drift.system.words}",
-            f"{drift.system.pole:g}",
+            OPEN_LOOPS[drift.pole],
+            f"{drift.pole:g}",
             f"{drift.noise:g}",
             f"{drift.error:.1e}",
             f"{drift.apart[-1]:.1e}",
@@ -180,7 +155,7 @@ def _linear(theory: Theory) -> Section:
     return Section(
         "Continuous control: what becomes of an error",
         lead=(
-            f"x' = A x + u + w, with gusts w of {GUST:g}; the expert halves every state. Its demonstrations hold "
+            f"x' = a x + u + w, with gusts w of {GUST:g}; the expert halves every state. Its demonstrations hold "
             "little of what lies beside them, so there a clone does not correct: an error dies out where the open loop "
             "is stable, as under servos that hold joint targets, and grows by the open loop's factor a step where it "
             "is not, however small the clone's error in the expert's states.",
@@ -195,21 +170,17 @@ def _linear(theory: Theory) -> Section:
 
 
 def _linear_figure(drifts: Sequence[Drift]) -> Figure:
-    """How far clones get from the expert, step by step: one panel a size of system."""
-    poles = sorted({system.pole for system in SYSTEMS})
-    with drawing(len(_SIZES), size=(4.4, 3.1)) as (drawn, axes):
-        for axis, (size, title) in zip(axes[0], _SIZES.items(), strict=True):
-            for drift in drifts:
-                if drift.system.size == size:
-                    style = {"color": ARMS[poles.index(drift.system.pole)], "ls": "--" if drift.noise else "-"}
-                    words = f"{drift.system.words}, open loop {drift.system.pole:g}"
-                    label = words + (", noisy demonstrations" if drift.noise else "")
-                    apart = np.maximum(drift.apart, _LEAST)
-                    axis.plot(range(1, len(apart) + 1), apart, lw=1.6, label=label, **style)
-            axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
-            axis.set(yscale="log", xlabel="step", title=title, ylim=(_LEAST, 100))
-        axes[0, 0].set_ylabel("distance from the expert")
-        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    """How far clones get from the expert, step by step."""
+    with drawing(1, size=(5.4, 3.4)) as (drawn, axes):
+        axis, poles = axes[0, 0], list(OPEN_LOOPS)
+        for drift in drifts:
+            words = f"{OPEN_LOOPS[drift.pole]}, open loop {drift.pole:g}"
+            label = words + (", noisy demonstrations" if drift.noise else "")
+            look = {"color": ARMS[poles.index(drift.pole)], "ls": "--" if drift.noise else "-"}
+            axis.plot(range(1, len(drift.apart) + 1), np.maximum(drift.apart, _LEAST), lw=1.6, label=label, **look)
+        axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
+        axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=(_LEAST, 100))
+        drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=2)
         return to_figure(drawn, "Distance of clones from the expert over the steps, of stable and unstable systems")
 
 
@@ -222,8 +193,8 @@ def _arm(shift: Shift) -> list[Section]:
         (
             one.name,
             str(one.success),
-            "" if one.on_expert is None else format_percent(one.on_expert.rate),
-            format_percent(one.on_own.rate),
+            "" if one.on_expert is None else format_percent(one.on_expert),
+            format_percent(one.on_own),
             f"{one.distance:.2f}",
             f"{one.gap:.1f}",
             f"{one.bound:,.0f}",
@@ -233,7 +204,6 @@ def _arm(shift: Shift) -> list[Section]:
     return [
         Section(
             f"The arm: {shift.env.robot} {shift.env.task}",
-            figures=(_errors_figure(shift),),
             tables=(Table(columns, tuple(rows)),),
             notes=(
                 f"An action is wrong if a joint is farther off the expert's label than {WRONG:g} of its largest step. "
@@ -255,28 +225,12 @@ def _arm(shift: Shift) -> list[Section]:
 
 def _shift_fact(shift: Shift) -> str:
     first, last = shift.rounds[0], shift.rounds[-1]
-    words = "" if first.on_expert is None else f" against {format_percent(first.on_expert.rate)} in the expert's"
+    words = "" if first.on_expert is None else f" against {format_percent(first.on_expert)} in the expert's"
     return (
-        f"On the arm, the cloned policy errs in {format_percent(first.on_own.rate)} of its own states{words}, "
+        f"On the arm, the cloned policy errs in {format_percent(first.on_own)} of its own states{words}, "
         f"{first.distance:.1f} times as far from its data as the expert; round {last.round} errs in "
-        f"{format_percent(last.on_own.rate)}, {last.distance:.1f} times as far."
+        f"{format_percent(last.on_own)}, {last.distance:.1f} times as far."
     )
-
-
-def _errors_figure(shift: Shift) -> Figure:
-    """The share of wrong actions at each step, in the expert's states and in the policy's own: round 0, best round."""
-    best = max(range(len(shift.rounds)), key=lambda index: (shift.rounds[index].success.rate, index))
-    chosen = [shift.rounds[index] for index in dict.fromkeys((0, best))]
-    with drawing(len(chosen), size=(4.4, 2.9)) as (drawn, axes):
-        for axis, one in zip(axes[0], chosen, strict=True):
-            colour = CLONING if one.round == 0 else DAGGER
-            axis.plot(100 * np.array(one.on_own.by_step), color=colour, lw=1.8, label="in its own states")
-            if one.on_expert is not None:
-                axis.plot(100 * np.array(one.on_expert.by_step), color=SOFT, lw=1.4, label="in the expert's states")
-            axis.set(xlabel="control step", title=one.name, ylim=(0, 100), xlim=(0, shift.env.horizon))
-            axis.legend(loc="upper right")
-        axes[0, 0].set_ylabel("wrong actions [%]")
-        return to_figure(drawn, "Share of wrong actions by step, for cloning and for the best round")
 
 
 def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:

@@ -1,13 +1,13 @@
 """Distribution shift on an arm, measured for every round of a DAgger run.
 
-How often a round's policy errs in the expert's states and in its own, step by step; how far its own states lie from the
-data that it was fitted on; what it costs more than the expert, beside what Theorem 8.2 allows for as many errors.
+How often a round's policy errs in the expert's states and in its own; how far its own states lie from the data that it
+was fitted on; what it costs more than the expert, beside what Theorem 8.2 allows for as many errors.
 Costs are control steps until the task is solved, the horizon where it is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,9 +22,10 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.dataset import joined_columns
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
-from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.policy import LearnedPolicy, actions_along
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.tasks.config import EnvConfig
@@ -32,10 +33,11 @@ from manip_il.tasks.config import EnvConfig
 F64 = NDArray[np.float64]
 EPISODES = 50  # of the expert and of every round's policy
 WRONG = 0.25  # of the largest step: an action that is farther off the label, in any joint, is wrong
-FEWEST = 5  # episodes that still run at a step, for its share of wrong actions to be shown
 MOST_STATES = 4_000  # of a kind, that are compared
 _HAND = ("ee.x", "ee.y", "ee.z")
 _OBSERVED = (schema.STATE, schema.ENVIRONMENT_STATE)
+_COLUMNS = (*_OBSERVED, schema.ACTION, schema.EXECUTED_ACTION, schema.LABEL_VALID)
+Columns = dict[str, NDArray[Any]]
 OnEpisode = Callable[[Episode], None]
 
 
@@ -47,38 +49,21 @@ class RoundData(NamedTuple):
     datasets: tuple[Path, ...]
 
 
-class Visited(NamedTuple):
-    """States of some episodes: what a policy observes (N, d), and the hand (N, 3) [m]."""
-
-    observed: F64
-    hand: F64
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Wrong actions. by_step: share of the running episodes that err at a step, while `FEWEST` run.
-
-    rate: of all states; per_episode: wrong actions in an episode, on average.
-    """
-
-    by_step: tuple[float, ...]
-    rate: float
-    per_episode: float
-
-
 @dataclass(frozen=True)
 class RoundShift:
-    """One round's policy. on_expert: None for a policy on pictures; on_own: in the states that it visits itself.
+    """One round's policy. on_expert, on_own: share of the expert's states, and of its own, in which it is wrong.
 
-    distance: of its states from the data, median to the nearest; of the expert's, in new episodes, it is 1. cost, gap:
-    its own, and above the expert's; bound: what Theorem 8.2 allows that to be, u times its wrong actions an episode
-    [control steps]. data, hand: where the hand was in the data and in its rollouts, (N, 3) [m].
+    on_expert: None for a policy on pictures. mistakes: wrong actions in an episode of its own, on average. distance: of
+    its states from the data, median to the nearest; of the expert's, in new episodes, it is 1. cost, gap: its own, and
+    above the expert's; bound: what Theorem 8.2 allows that to be, u times its mistakes [control steps]. data, hand:
+    where the hand was in the data and in its rollouts, (N, 3) [m].
     """
 
     round: int
     success: Proportion
-    on_expert: Errors | None
-    on_own: Errors
+    on_expert: float | None
+    on_own: float
+    mistakes: float
     distance: float
     cost: float
     gap: float
@@ -93,14 +78,9 @@ class RoundShift:
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers but the places."""
-        return {
-            "round": self.round,
-            "success": self.success.rate,
-            "interval": list(self.success.interval),
-            "on_expert": None if self.on_expert is None else vars(self.on_expert),
-            "on_own": vars(self.on_own),
-            **{name: getattr(self, name) for name in ("distance", "cost", "gap", "bound")},
-        }
+        names = ("round", "on_expert", "on_own", "mistakes", "distance", "cost", "gap", "bound")
+        success = {"success": self.success.rate, "interval": list(self.success.interval)}
+        return {name: getattr(self, name) for name in names} | success
 
 
 @dataclass(frozen=True)
@@ -150,60 +130,78 @@ def measure_shift(
 
     u: of the expert on `env`, see `certify`.
     """
-    names = env_spec(env).environment_state_names
-    seeds = stream_seeds("theory", episodes)
-    expert = _run(engine, RolloutJob(env, hold=0), seeds, on_episode)
-    fresh, expert_cost, found = _visited(expert, names), _cost(expert, env.horizon), list[RoundShift]()
+    seeds, scale = stream_seeds("theory", episodes), env_actions(env).scale
+    spec, found = env_spec(env), list[RoundShift]()
+    hand = [spec.environment_state_names.index(name) for name in _HAND]
+    expert, expert_cost, _ = _run(engine, RolloutJob(env, hold=0), seeds, on_episode)
     for one in rounds:
-        learner = _run(engine, RolloutJob(env, PolicyDriver((one.policy,)), hold=0), seeds, on_episode)
-        states, data, cost = _visited(learner, names), _stored(one, names), _cost(learner, env.horizon)
-        on_own = _errors([episode.columns[schema.EXECUTED_ACTION] for episode in learner], learner, env)
+        own, cost, success = _run(engine, RolloutJob(env, PolicyDriver((one.policy,)), hold=0), seeds, on_episode)
+        wrong, policy, data = (
+            _wrong(own[schema.EXECUTED_ACTION], own, scale),
+            LearnedPolicy.load(one.policy),
+            _data(one),
+        )
+        on_expert = None if policy.cameras else float(_wrong(_retraced(policy, expert), expert, scale).mean())
+        mistakes = float(wrong.sum() / episodes)
         found.append(
             RoundShift(
                 round=one.round,
-                success=Proportion.of([episode.success for episode in learner]),
-                on_expert=_errors_on(one.policy, expert, env),
-                on_own=on_own,
-                distance=relative_distance(states.observed, data.observed, fresh.observed),
+                success=success,
+                on_expert=on_expert,
+                on_own=float(wrong.mean()),
+                mistakes=mistakes,
+                distance=relative_distance(*map(_observed, (own, data, expert))),
                 cost=cost,
                 gap=cost - expert_cost,
-                bound=u * on_own.per_episode,
-                data=data.hand,
-                hand=states.hand,
+                bound=u * mistakes,
+                data=data[schema.ENVIRONMENT_STATE][:, hand],
+                hand=own[schema.ENVIRONMENT_STATE][:, hand],
             )
         )
     return Shift(env, expert_cost, u, tuple(found))
 
 
-def _run(engine: Engine, job: RolloutJob, seeds: Sequence[int], on_episode: OnEpisode) -> list[Episode]:
+def _run(
+    engine: Engine, job: RolloutJob, seeds: Sequence[int], on_episode: OnEpisode
+) -> tuple[Columns, float, Proportion]:
+    """Columns of all episodes, in the order of their seeds, their mean cost, and how many succeeded."""
     found = list[Episode]()
     for episode in engine.run(job, seeds):
         found.append(episode.without_pictures())
         on_episode(episode)
-    return sorted(found, key=lambda episode: episode.seed)
+    found.sort(key=lambda episode: episode.seed)
+    table = {key: np.concatenate([one.columns[key] for one in found]) for key in _COLUMNS}
+    table[EPISODE_INDEX] = np.repeat(np.arange(len(found)), [len(one) for one in found])
+    cost = float(np.mean([len(episode) if episode.success else job.env.horizon for episode in found]))
+    return table, cost, Proportion.of([episode.success for episode in found])
 
 
-def _cost(episodes: Sequence[Episode], horizon: int) -> float:
-    return float(np.mean([len(episode) if episode.success else horizon for episode in episodes]))
-
-
-def _visited(episodes: Sequence[Episode], names: Sequence[str]) -> Visited:
-    return _states({key: np.concatenate([one.columns[key] for one in episodes]) for key in _OBSERVED}, names)
-
-
-def _stored(round_: RoundData, names: Sequence[str]) -> Visited:
-    """States of the data that a round's policy was fitted on, but those after success, which rollouts here end at."""
+def _data(round_: RoundData) -> Columns:
+    """What a round's policy was fitted on, but states after success, which rollouts here end at."""
     table = joined_columns(round_.datasets, [*_OBSERVED, schema.SUCCESS])
     rows = np.flatnonzero(~table[schema.SUCCESS].ravel().astype(np.bool_))
     if len(rows) > MOST_STATES:
         rows = np.sort(rng_for(round_.round, "states of the data").choice(rows, MOST_STATES, replace=False))
-    return _states({key: table[key][rows] for key in _OBSERVED}, names)
+    return {key: table[key][rows] for key in _OBSERVED}
 
 
-def _states(columns: Mapping[str, NDArray[Any]], names: Sequence[str]) -> Visited:
-    observed = np.concatenate([columns[key] for key in _OBSERVED], axis=1).astype(np.float64)
-    hand = columns[schema.ENVIRONMENT_STATE][:, [names.index(name) for name in _HAND]].astype(np.float64)
-    return Visited(observed, hand)
+def _observed(table: Columns) -> F64:
+    """What a policy observes, (N, d)."""
+    return np.concatenate([table[key] for key in _OBSERVED], axis=1).astype(np.float64)
+
+
+def _retraced(policy: LearnedPolicy, table: Columns) -> F64:
+    """Actions of a policy in the states of episodes that somebody else drove, (N, n)."""
+    found = np.empty(table[schema.ACTION].shape)
+    for rows, actions in actions_along(policy, table):
+        found[rows] = actions
+    return found
+
+
+def _wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.bool_]:
+    """Whether each of the actions (N, n) is wrong, of those where the expert's label is sound."""
+    off = (np.abs(actions - table[schema.ACTION]) / scale).max(axis=1) > WRONG
+    return off[table[schema.LABEL_VALID].ravel() != 0]
 
 
 def relative_distance(states: F64, data: F64, fresh: F64) -> float:
@@ -214,35 +212,3 @@ def relative_distance(states: F64, data: F64, fresh: F64) -> float:
     scale = np.maximum(data.std(axis=0), 1e-6)
     own, usual = (np.median(cdist(rows / scale, data / scale).min(axis=1)) for rows in (states, fresh))
     return float(own / usual) if usual > 0 else float("inf")
-
-
-def _errors_on(policy: Path, episodes: Sequence[Episode], env: EnvConfig) -> Errors | None:
-    """Errors of a policy's actions in the states of these episodes, which somebody else drove."""
-    learner = LearnedPolicy.load(policy)
-    if learner.cameras:
-        return None
-    actions: list[list[NDArray[Any]]] = [[] for _ in episodes]
-    learner.reset(range(len(episodes)))
-    for t in range(max(map(len, episodes))):
-        running = [i for i, episode in enumerate(episodes) if t < len(episode)]
-        seen = [np.stack([episodes[i].columns[key][t] for i in running]) for key in _OBSERVED]
-        for i, action in zip(running, learner.act(seen[0], seen[1], {}, running), strict=True):
-            actions[i].append(action)
-    return _errors([np.stack(one) for one in actions], episodes, env)
-
-
-def _errors(actions: Sequence[NDArray[Any]], episodes: Sequence[Episode], env: EnvConfig) -> Errors:
-    """Errors of actions (T, n), one array an episode, where the expert's label is sound."""
-    scale, longest = env_actions(env).scale, max(map(len, episodes))
-    sizes = np.full((len(episodes), longest), np.nan)
-    for row, mine, one in zip(sizes, actions, episodes, strict=True):
-        off = (np.abs(mine - one.columns[schema.ACTION]) / scale).max(axis=1)
-        row[: len(one)] = np.where(one.columns[schema.LABEL_VALID].ravel().astype(np.bool_), off, np.nan)
-    known = np.isfinite(sizes)
-    wrong, running = (known & (sizes > WRONG)).sum(axis=0), known.sum(axis=0)
-    shown = int((running >= min(FEWEST, len(episodes))).argmin()) or longest
-    return Errors(
-        tuple((wrong / running.clip(min=1))[:shown].tolist()),
-        float(wrong.sum() / running.sum()),
-        float(wrong.sum() / len(episodes)),
-    )

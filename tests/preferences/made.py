@@ -10,7 +10,7 @@ import numpy as np
 
 from manip_il.data import schema as s
 from manip_il.mdp import Episode
-from manip_il.preferences.pairs import Clips, choose_pairs, open_supply
+from manip_il.preferences.pairs import Clips, choose_pairs
 
 
 def brought(episode: Episode, spec: s.RobotTaskSpec, well: bool) -> Episode:
@@ -25,5 +25,4 @@ def brought(episode: Episode, spec: s.RobotTaskSpec, well: bool) -> Episode:
 
 
 def clips_of(roots: Sequence[Path], count: int, length: int = 10, seed: int = 0) -> Clips:
-    supply = open_supply(list(roots), length)
-    return Clips(choose_pairs(supply, count, seed, np.random.default_rng(seed)), supply.frames)
+    return choose_pairs(list(roots), length, count, seed, np.random.default_rng(seed))

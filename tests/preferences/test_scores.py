@@ -52,9 +52,8 @@ def test_an_episode_is_scored_by_its_last_second(scored):
 
 
 def test_failed_episodes_are_found_and_listed_first(scored):
-    assert scored.auc == scored.true_auc == 1
+    assert scored.auc == 1
     assert not scored.succeeded[scored.worst(8)].any()
-    assert scored.correlation > 0.95
     tree = scored.to_json()
     assert [one["success"] for one in tree["episodes"]] == [True] * 8 + [False] * 8
     assert json.loads(json.dumps(tree)) == tree
@@ -62,7 +61,7 @@ def test_failed_episodes_are_found_and_listed_first(scored):
 
 def test_scores_need_neither_progress_nor_success(scored):
     bare = replace(scored, data=replace(scored.data, progress=None, success=None))
-    assert (bare.auc, bare.true_auc, bare.correlation) == (None, None, None)
+    assert bare.auc is None
     assert "number" in score_report(bare, "manip-il data score", {}, {}).render()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from manip_il.errors import ManipError, UnknownName, UsageError
-from manip_il.preferences.answers import TEACHERS, Answer, Preferences, Teacher, answer_pairs, join_answers
+from manip_il.preferences.answers import Answer, Preferences, Teacher, answer_pairs, join_answers
 from manip_il.preferences.fitting import true_difference
 from manip_il.preferences.pairs import Clips
 
@@ -45,19 +45,6 @@ def test_a_boltzmann_teacher_errs_the_more_the_higher_its_temperature(many):
     assert shares[-1] == pytest.approx(0.5, abs=0.08)
 
 
-def test_a_myopic_teacher_prefers_what_ends_better(many):
-    ends = many.progress[many.rows][:, :, -1]
-    given = np.array(Teacher.parse("myopic:0").answers(many, np.random.default_rng(0)))
-    assert ((given == "left") == (ends[:, 0] > ends[:, 1])).all()
-
-
-def test_a_skipping_teacher_skips_pairs_in_which_nothing_is_done(many):
-    given = np.array(Teacher.parse("skipping:0.5").answers(many, np.random.default_rng(0)))
-    best = many.progress[many.rows].mean(-1).max(axis=1)
-    assert 0 < (given == "skip").sum() < len(given)
-    assert best[given == "skip"].max() < best[given != "skip"].min()
-
-
 def test_clips_that_are_alike_are_answered_equal(many):
     alike = tuple(replace(one, progress=np.full(len(one.states), 0.5)) for one in many.frames)
     assert set(Teacher.parse("perfect").answers(Clips(many.pairs, alike), np.random.default_rng(0))) == {"equal"}
@@ -68,7 +55,7 @@ def test_the_same_seed_answers_the_same(many):
     assert given[0] == given[1]
 
 
-@pytest.mark.parametrize("word", ["mistaken:x", "mistaken:2", "perfect:1", "boltzmann:0", "myopic:nan"])
+@pytest.mark.parametrize("word", ["mistaken:x", "mistaken:2", "perfect:1", "boltzmann:0", "mistaken:nan"])
 def test_a_number_that_a_teacher_does_not_take_is_refused(word):
     with pytest.raises(UsageError, match=f"--teacher is '{word}'"):
         Teacher.parse(word)
@@ -77,7 +64,6 @@ def test_a_number_that_a_teacher_does_not_take_is_refused(word):
 def test_an_unknown_teacher_is_refused_with_the_nearest():
     with pytest.raises(UnknownName, match="did you mean 'mistaken'"):
         Teacher.parse("mistake")
-    assert set(TEACHERS) == {"perfect", "boltzmann", "mistaken", "myopic", "skipping"}
 
 
 def test_contradictions_and_skips_are_counted_and_all_answers_kept(clips):

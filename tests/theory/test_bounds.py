@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from manip_il.theory.bounds import Curve, Loss, clone, constructed, curves, dagger, losses_of
+from manip_il.theory.bounds import clone, curves, dagger, losses_of
 from manip_il.theory.processes import PROCESSES, RIGHT, WRONG, Process
 
 FEW = (10, 40, 160)
@@ -45,28 +45,25 @@ def test_the_gap_is_the_difference_of_returns_over_all_paths():
     one, rng = small(), np.random.default_rng(1)
     policies = rng.random((3, 4, one.states))
     expert = returns(one, np.zeros((4, one.states)))
-    gaps = [loss.gap for loss in losses_of(one, "DAgger", policies)]
+    _, gaps, _ = losses_of(one, "DAgger", policies)
     assert gaps == pytest.approx([expert - returns(one, policy) for policy in policies])
     assert one.visits(policies).sum(axis=2) == pytest.approx(np.ones((3, 4)))
 
 
 def test_trajectories_are_where_the_policy_is_and_the_same_seed_draws_the_same(process):
     policy = np.full((2, 6, process.states), 0.3)
-    seen = [process.seen(policy, 4_000, [np.random.default_rng(5)]) for _ in range(2)]
+    seen = [process.seen(policy, 4_000, [np.random.default_rng(seed) for seed in (5, 6)]) for _ in range(2)]
     assert (seen[0] == seen[1]).all()
-    assert (seen[0][0] == seen[0][1]).all()  # one generator's policies meet the same chances
     assert (seen[0] == (process.visits(policy) > 1e-12)).mean() > 0.999
 
 
 @pytest.mark.slow
 def test_slopes_are_the_theorems_and_nothing_is_above_its_bound(process):
-    found = {(curve.learner, curve.fit): curve for curve in curves(process, FEW, 12)}
-    assert sum(curve.above for curve in found.values()) == 0
-    for learner, slope in zip(("cloning", "DAgger"), process.slopes, strict=True):
-        assert found[learner, "worst"].slope == pytest.approx(slope, abs=0.2)
-        assert found[learner, "constructed"].slope == pytest.approx(slope, abs=0.06)
-        low, high = found[learner, "worst"].interval
-        assert low <= found[learner, "worst"].slope <= high
+    for curve, slope in zip(curves(process, FEW, 12), process.slopes, strict=True):
+        assert curve.above == 0
+        assert curve.slope == pytest.approx(slope, abs=0.2)
+        low, high = curve.interval
+        assert low <= curve.slope <= high
         assert high - low < 0.4
 
 
@@ -76,37 +73,26 @@ def test_any_policy_keeps_to_both_bounds(process):
         wrong = rng.random((20, horizon, process.states)) ** rng.integers(1, 20, (20, 1, 1))
         policies = np.where(process.wrong_costs(horizon) <= 0, 0.0, wrong)
         for learner in ("cloning", "DAgger"):
-            assert not any(loss.above for loss in losses_of(process, learner, policies))
+            _, gaps, bounds = losses_of(process, learner, policies)
+            assert (gaps <= bounds + 1e-9).all()
 
 
 def test_u_is_what_one_wrong_step_costs():
     assert [one.recoverability(50) for one in PROCESSES] == pytest.approx([2, 50, 1])
 
 
-def test_a_clone_does_as_the_expert_where_it_has_data_and_errs_as_often_as_said_elsewhere(process):
-    horizon = 6
-    seen = np.random.default_rng(0).random((horizon, process.states)) < 0.5
-    costly = process.wrong_costs(horizon) > 0
-    for ties in (1.0, 0.5):
-        assert (clone(process, seen, ties) == np.where(costly & ~seen, ties, 0.0)).all()
-    assert (constructed(process, horizon, 0.01, off_data=False) == np.where(costly, 0.01, 0.0)).all()
+def test_a_clone_does_as_the_expert_where_it_has_data_and_the_worst_elsewhere(process):
+    seen = np.random.default_rng(0).random((6, process.states)) < 0.5
+    costly = process.wrong_costs(6) > 0
+    assert (clone(process, seen) == (costly & ~seen)).all()
 
 
 def test_all_data_leave_no_error_and_dagger_finds_what_the_expert_never_shows():
     walk, horizon = PROCESSES[0], 12
     everywhere = np.ones((1, horizon, walk.states), np.bool_)
-    assert losses_of(walk, "cloning", clone(walk, everywhere, 1.0))[0].gap == 0
+    assert losses_of(walk, "cloning", clone(walk, everywhere))[1] == 0
     shown = walk.expert_visits(horizon)[None] > 0
     shown[..., :20] = False  # a fifth of the places is not in the demonstrations
-    [before] = losses_of(walk, "DAgger", clone(walk, shown, 1.0))
-    [after] = losses_of(walk, "DAgger", dagger(walk, shown, 1.0, 300, [np.random.default_rng(0)]))
-    assert after.gap < 0.05 * before.gap
-
-
-def test_a_horizon_at_which_no_policy_errs_has_no_ratio():
-    none, some = Loss(0.0, 0.0, 0.0), Loss(0.1, 0.2, 1.0)
-    curve = Curve("walk", "cloning", "worst", (10, 20), ((none, none), (none, some)))
-    assert np.isnan([curve.ratios[0], curve.slope, *curve.interval]).all()
-    known = Curve("walk", "cloning", "worst", (10, 20), ((none, some), (some, some)))
-    assert known.slope == pytest.approx(0.0, abs=1e-9)
-    assert known.interval == pytest.approx((0.0, 0.0), abs=1e-9)
+    _, [before], _ = losses_of(walk, "DAgger", clone(walk, shown))
+    _, [after], _ = losses_of(walk, "DAgger", dagger(walk, shown, 300, [np.random.default_rng(0)]))
+    assert after < 0.05 * before

@@ -5,7 +5,7 @@ from manip_il.theory.linear import GUST, drifts
 
 def test_clones_drift_with_the_open_loop_and_noise_mends_it():
     for drift in drifts():
-        pole, end = drift.system.pole, drift.apart[-1]
+        pole, end = drift.pole, drift.apart[-1]
         assert drift.error < 2 * GUST  # all of them do well in the expert's states
         if drift.noise:
             assert end < 1e-9
