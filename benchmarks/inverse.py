@@ -28,12 +28,12 @@ from manip_il.cli.main import main as manip_il
 from manip_il.rewards.methods import METHODS, learn
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.seeding import rng_for, stream_base, stream_seeds
+from manip_il.tasks.carry.grid import Grid
+from manip_il.tasks.carry.reward import TASTES
+from manip_il.tasks.carry.things import layout_of, space_of
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
-from manip_il.tasks.furnishing import layout_of, space_of
-from manip_il.tasks.grid import Grid
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.tasks.reward import TASTES
 
 F64 = NDArray[np.float64]
 ABOVE = {"max_margin": 0.10, "bayesian": 0.03, "max_entropy": 0.03}
@@ -80,7 +80,7 @@ def _learn(robot: str, taste: str, count: int, seed: int) -> dict[str, tuple[F64
     """Weights and seconds of every method."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / taste
-        words = [f"--robot.type={robot}", f"--task.type={CARRY}", f"--task.reward={taste}", f"--dataset.root={root}"]
+        words = [f"--robot.type={robot}", f"--task.type={CARRY}:{taste}", f"--dataset.root={root}"]
         more = [f"--dataset.repo_id=benchmark/{taste}", f"--dataset.num_episodes={count}", f"--seed={seed}"]
         if manip_il(["record", *words, *more, "--quiet"]):
             raise SystemExit("recording failed")

@@ -36,12 +36,12 @@ from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.mdp import Episode
 from manip_il.rewards.methods import METHODS, learn
 from manip_il.seeding import rng_for, stream_base, stream_seeds
+from manip_il.tasks.carry.layout import THINGS, path_features
+from manip_il.tasks.carry.reward import TASTES, Reward
+from manip_il.tasks.carry.things import EDGE, observed_layout
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, scene_of
-from manip_il.tasks.furnishing import EDGE, observed_layout
-from manip_il.tasks.layout import THINGS, path_features
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.tasks.reward import TASTES, Reward
 
 FEW = 2  # things of a layout that is demonstrated, at most
 ARMS = ("panda", "fetch", "so101")
@@ -94,7 +94,7 @@ def main() -> int:
 def demonstrate(folder: Path, taste: str, count: int) -> Path:
     """Record `count` episodes on layouts with few things; return their dataset."""
     root, kept = folder / "all", folder / "few.journals"
-    words = [f"--task.type={CARRY}", f"--task.reward={taste}", f"--dataset.root={root}", "--quiet"]
+    words = [f"--task.type={CARRY}:{taste}", f"--dataset.root={root}", "--quiet"]
     if manip_il(["record", *words, "--dataset.repo_id=benchmark/all", f"--dataset.num_episodes={3 * count}"]):
         raise SystemExit("recording failed")
     names = Dataset.open(root).spec.environment_state_names
@@ -157,7 +157,7 @@ def _cost(env: EnvConfig, episode: Episode, names: Sequence[str], truth: Reward)
 
 
 def _env(robot: str, reward: Reward) -> EnvConfig:
-    return make_config(robot, CARRY, reward=reward.numbers)
+    return make_config(robot, f"{CARRY}:{reward.numbers}")
 
 
 def _print(arm: str, name: str, found: list[Driven], own: list[Driven]) -> bool:

@@ -29,6 +29,7 @@ MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
+_NUMBERS = re.compile(r"\w+=[0-9.e+-]+(,\w+=[0-9.e+-]+)*", re.ASCII)
 _LONGEST_MESSAGE = 1_000  # [characters]
 _REFUSED = 3  # exit code of a child process
 
@@ -49,6 +50,15 @@ def name(what: str, value: object) -> str:
             f"{LONGEST_NAME} characters)"
         )
     return value
+
+
+def task_name(value: object) -> str:
+    """Return a task's name, as `name` has it; one of several has numbers behind a colon, `NAME:A=NUMBER,B=NUMBER`."""
+    base, colon, numbers = text("task", value).partition(":")
+    if colon and not _NUMBERS.fullmatch(numbers):
+        raise ManipError(f"task is {shorten(value)}; expected NAME=NUMBER,... behind the colon")
+    name("task", base)
+    return f"{base}{colon}{numbers}"
 
 
 def repo_id(what: str, value: object) -> str:

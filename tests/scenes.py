@@ -49,7 +49,7 @@ def bits(env: ManipEnv) -> bytes:
 
 def cube(env: ManipEnv) -> np.ndarray:
     """Position of what is grasped [m]."""
-    return env.data.joint(TASKS[env.task].grasped[0]).qpos[:3].copy()
+    return env.data.joint(env.scene.task.grasped[0]).qpos[:3].copy()
 
 
 def half_height(world: World, name: str) -> float:
@@ -71,7 +71,7 @@ def drive(env: ManipEnv, steps: int) -> None:
 
 def drive_until(env: ManipEnv, phase: str) -> None:
     """Let the expert drive until its label is of a phase."""
-    expert, names = Expert(env.scene), phases(TASKS[env.task])
+    expert, names = Expert(env.scene), phases(env.scene.task)
     for _ in range(60):
         label = expert.label(env.get_state())
         if names[label.phase] == phase:

@@ -169,7 +169,7 @@ class ImitationRun(Run):
         made = [one.dataset for one in self._made.values() if one.dataset is not None]
         if made and not (root.is_dir() and _episodes(root) == sum(map(_episodes, made))):
             shutil.rmtree(root, ignore_errors=True)
-            name = f"local/{self.config.env.robot}_{self.config.env.task}_dagger"
+            name = f"local/{self.config.env.name}_dagger"
             merge_datasets(made, root, repo_id=name, provenance={"best_round": best.number})
 
     def _folder(self, round_: int) -> Path:

@@ -25,13 +25,13 @@ from manip_il.evaluation.tables import Table
 from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
 from manip_il.rewards.paths import Demonstration, cheapest_path, plan
 from manip_il.robots.table import get_robot
+from manip_il.tasks.carry.grid import Grid
+from manip_il.tasks.carry.layout import THINGS
+from manip_il.tasks.carry.reward import FEATURES
+from manip_il.tasks.carry.things import EDGE, observed_layout, space_of
 from manip_il.tasks.envs import scene_of
-from manip_il.tasks.furnishing import EDGE, observed_layout, space_of
-from manip_il.tasks.grid import Grid
 from manip_il.tasks.ladder import AT_GOAL
-from manip_il.tasks.layout import THINGS
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.tasks.reward import FEATURES
 
 F64 = NDArray[np.float64]
 CARRY = "carry"

@@ -137,7 +137,9 @@ def _require_suite(suite: str) -> None:
 def own_names(robot: str, task: str) -> str:
     """Return the options, after a space, that a next command needs for a robot and a task that do not ship."""
     given = [] if robot in (*ROBOTS, stock.ROBOT) else [f"--robot.type={_arm(robot)}"]
-    given += [] if task in (*NAMES, *stock.STOCK, "unknown") else [f"--task.type={_file(task, '.py')}"]
+    ships = task.partition(":")[0] in (*NAMES, *stock.STOCK, "unknown")
+    given += [] if ships else [f"--task.type={_file(task, '.py')}"]
+
     return "".join(f" {one}" for one in given)
 
 

@@ -31,6 +31,7 @@ from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
+MOVED = {"task.reward": "--task.type=carry:"}  # where an option's value stands now; files may still hold it empty
 _FEW = 3
 type Known = Mapping[str, Option]
 
@@ -110,6 +111,8 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
             option = places[0] if places[0].is_list else places.pop(0)
             before = said[option.name].value if option.is_list and option.name in said else []
             said[option.name] = _Said([*before, word] if option.is_list else word, option.label)
+        elif name in MOVED:
+            raise UsageError(f"--{name} has a new name: {MOVED[name]}{value or 'REWARD'}")
         elif name == CONFIG_PATH:
             config_paths.append(value if equals else _next_value(name, "a path", rest))
         elif group:
@@ -155,7 +158,10 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
     said: dict[str, _Said] = {}
     for key, value in typing.cast(dict[Any, Any], tree or {}).items():
         name = f"{prefix}{key}"
-        if (name in known and not known[name].is_open) or _open_group(name, known):
+        if name in MOVED:
+            if value:
+                raise UsageError(f"{origin}: {name} has a new name: {MOVED[name]}{value}")
+        elif (name in known and not known[name].is_open) or _open_group(name, known):
             said[name] = _Said(value, f"{origin}: {name}")
         elif name in known or any(option.startswith(f"{name}.") for option in known):
             said |= _read_tree(value, known, origin, f"{name}.")

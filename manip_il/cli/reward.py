@@ -25,7 +25,7 @@ def _seed(what: str) -> Any:
 class IrlOptions:
     """Learn what the demonstrations of a dataset of carry care about: the weights of a reward.
 
-    Writes reward.json, which --task.reward takes, and report.html: the weights, and the cost over the table.
+    Writes reward.json, which --task.type=carry:FILE takes, and report.html: the weights, and the cost over the table.
     """
 
     example: ClassVar[str] = "manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl"
@@ -65,7 +65,7 @@ class IrlOptions:
             warn(line)
         say(f"report: {folder / REPORT_FILE}")
         robot = "" if dataset.spec.robot == "panda" else f"--robot.type={dataset.spec.robot} "
-        say(f"next: manip-il eval --policy.type=expert {robot}--task.type=carry --task.reward={folder / FILE_NAME}")
+        say(f"next: manip-il eval --policy.type=expert {robot}--task.type=carry:{folder / FILE_NAME}")
 
 
 @dataclass

@@ -109,11 +109,12 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
 @cache
 def _fingerprint(config: EnvConfig) -> dict[str, str]:
     settings, own = asdict(config), dict[str, str]()
-    if config.robot != STOCK and config.task not in TASKS:
-        task = get_task(config.task, config.object, config.reward)
-        settings["task"], own = task.name, {"task_sha256": source_hash(task)}
-    for name in ("object", "reward"):  # as before there were any
-        if not settings[name]:
-            del settings[name]
+    if config.robot != STOCK:
+        task = get_task(config.task, config.object)
+        settings["task"], _, argument = task.name.partition(":")
+        settings |= {"reward": argument} if argument else {}  # as it was called when carry alone had one
+        own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
+    if not config.object:  # as before there was any
+        del settings["object"]
     model = described_stock(config.task).model_bytes if config.robot == STOCK else config_scene(config).model_bytes()
     return environment_fingerprint(model, settings) | own

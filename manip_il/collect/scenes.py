@@ -20,11 +20,11 @@ from manip_il.mdp import Actor, Label, State, Transition
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import PICTURED, Condition, draw
 from manip_il.sim.config import CameraConfig
+from manip_il.sim.task import TakesArgument
 from manip_il.sim.variation import completed, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import env_of
-from manip_il.tasks.table import TakesReward
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time
@@ -117,7 +117,7 @@ class SceneDrawer:
         world.restore(visited.physics, visited.variation)
         free = self._untouched(world)
         poses = self._task.draw(rng, world).poses
-        kept = self._task.taste if isinstance(self._task, TakesReward) else ()
+        kept = self._task.argument_bodies if isinstance(self._task, TakesArgument) else ()
         new_goals, moved = rng.uniform() < GOALS, list[int]()
         for name, (at, turn) in poses.items():
             body = world.scene.model.body(name).id

@@ -68,7 +68,7 @@ class RobotTaskSpec:
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
-        checks.name("task", self.task)
+        checks.task_name(self.task)
         checks.whole("fps", self.fps, 1, MOST_FPS)
         for size in (self.sim_state_size, *self.image_size):
             checks.whole("a size", size, 0, _LARGEST_SIZE)

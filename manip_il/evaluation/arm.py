@@ -196,7 +196,9 @@ def _run_options(folder: Path) -> tuple[int, EnvConfig] | None:
     tree = checks.mapping(str(path), checks.read_yaml(path, "the options of a run"))
     groups: dict[str, Mapping[str, Any]] = {name: tree.get(name) or {} for name in ("robot", "task", "env")}
     own = {"robot": groups["robot"].get("type"), "task": groups["task"].get("type"), **groups["env"]}
-    own |= {name: groups["task"].get(name) for name in ("object", "reward")}
+    own["object"] = groups["task"].get("object")
+    if reward := groups["task"].get("reward"):  # of carry, before it was part of the name
+        own["task"] = f"{own['task']}:{reward}"
     known = {field.name for field in fields(EnvConfig)}
     env = make_config(**{name: value for name, value in own.items() if name in known and value is not None})
     return checks.whole(f"{path}: seed", tree.get("seed", 0), 0, checks.LARGEST_SEED), env

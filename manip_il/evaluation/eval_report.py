@@ -135,9 +135,8 @@ def phase_table(policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: s
 
 def phase_meanings(task: str) -> dict[str, str]:
     """Return phase -> meaning, from the first to the last; empty for a task that is not known here."""
-    if task not in TASKS:
-        return {}
-    return {rung.name: rung.words for rung in reversed(TASKS[task].rungs)} | {NO_PHASE: _NO_PHASE}
+    known = TASKS.get(task.partition(":")[0])
+    return {rung.name: rung.words for rung in reversed(known.rungs)} | {NO_PHASE: _NO_PHASE} if known else {}
 
 
 def evaluation_verdict(result: EvalResult) -> str:

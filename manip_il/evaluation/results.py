@@ -80,8 +80,7 @@ class EvalSettings:
 
     horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
     of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
-    if it goes on to the horizon. object: shape and size of what is grasped, reward: of `carry`, empty for the task's
-    own.
+    if it goes on to the horizon. object: shape and size of what is grasped, empty for the task's own.
     """
 
     horizon: int
@@ -92,19 +91,18 @@ class EvalSettings:
     conditions: tuple[Condition, ...] = (NOMINAL,)
     hold: int | None = None
     object: str = ""
-    reward: str = ""
 
     @classmethod
     def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
         """Return those of a job whose conditions are called `suite`."""
         env, conditions = job.env, job.conditions or (NOMINAL,)
         steps, hz = env.success_steps, env.control_hz
-        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, env.object, env.reward)
+        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, env.object)
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """Return the environment that was evaluated in."""
         limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.horizon}
-        return make_config(robot, task, self.control_hz, **limits, object=self.object, reward=self.reward)
+        return make_config(robot, task, self.control_hz, **limits, object=self.object)
 
     @property
     def disturbance(self) -> str:
@@ -115,7 +113,7 @@ class EvalSettings:
         """Return plain JSON values."""
         plain = ("horizon", "tolerance", "control_hz", "success_steps", "hold", "suite")
         conditions = [condition.to_json() for condition in self.conditions]
-        own = {key: getattr(self, key) for key in ("object", "reward") if getattr(self, key)}
+        own = {"object": self.object} if self.object else {}
         return {key: getattr(self, key) for key in plain} | {"conditions": conditions} | own
 
     @classmethod
@@ -215,9 +213,9 @@ class EvalResult:
         """
         return cls(
             policy=data["policy"],
-            # names, not paths: a task's path would be code to run
+            # Names, not paths: a task's path would be code to run. A reward was a setting of its own once.
             robot=checks.name("robot", data["robot"]),
-            task=checks.name("task", data["task"]),
+            task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
             settings=EvalSettings.from_json(data["settings"]),

@@ -66,8 +66,8 @@ class Origin:
     object: str = ""  # see `RobotTaskSpec`
 
     def __post_init__(self) -> None:
-        for name in ("robot", "task"):  # which may become parts of paths
-            checks.name(name, getattr(self, name))
+        checks.name("robot", self.robot)
+        checks.task_name(self.task)
         for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 

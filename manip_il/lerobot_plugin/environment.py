@@ -43,7 +43,7 @@ class ManipILEnv(EnvConfig):
     robot: for a task of any robot (`PickPlace-v0`, a file), by name or a YAML; panda if none is named.
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
     with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
-    tolerance, success_steps, object, reward: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
+    tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
     render_mode: `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
@@ -60,7 +60,7 @@ class ManipILEnv(EnvConfig):
     tolerance: float = option_of(SimConfig, "tolerance")
     success_steps: int = option_of(SimConfig, "success_steps")
     object: str = option_of(SimConfig, "object")
-    reward: str = option_of(SimConfig, "reward")
+    reward: str = ""  # of carry; only in files of earlier versions
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -72,6 +72,8 @@ class ManipILEnv(EnvConfig):
         ):
             if name not in known:
                 raise UnknownName(kind, name, known)
+        if self.reward:
+            raise UsageError(f"--env.reward has a new name: --env.task={self.task}:{self.reward}")
         self.fps = self._simulation().control_hz
         self.features = self._features()
         self.features_map = {key: _RENAMED.get(key, key) for key in self.features}
@@ -100,15 +102,16 @@ class ManipILEnv(EnvConfig):
 
     def _simulation(self) -> SimConfig:
         name, robot = self.task or "", self.robot or SimConfig.robot
-        if name not in TASKS and name not in ANY_ROBOTS and not name.endswith(SUFFIX):
+        base, colon, argument = (name, "", "") if name.endswith(SUFFIX) else name.partition(":")
+        if base not in TASKS and base not in ANY_ROBOTS and not name.endswith(SUFFIX):
             raise UnknownName("--env.task", name, {**TASKS, **ANY_ROBOTS})
-        robot, task = TASKS.get(name) or (robot, ANY_ROBOTS.get(name, name))
+        robot, task = TASKS.get(base) or (robot, ANY_ROBOTS.get(base, base))
         if self.robot and self.robot != robot:
             raise UsageError(
                 f"--env.robot is {self.robot!r}, and --env.task={name} is {robot}'s; leave one of them out"
             )
         limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.episode_length}
-        return make_config(robot, task, self.fps, **limits, object=self.object, reward=self.reward)
+        return make_config(robot, task + colon + argument, self.fps, **limits, object=self.object)
 
     def _cameras(self) -> CameraConfig | None:
         if self.observation == "state":
@@ -137,7 +140,7 @@ class FilmedEnv(ManipEnv):
     """The environment; without `film` small black pictures where lerobot-eval films, which it cannot be told not to."""
 
     def __init__(self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any):
-        task = get_task(config.task, config.object, config.reward)
+        task = get_task(config.task, config.object)
         super().__init__(get_robot(config.robot), task, config, cameras=cameras, render_mode="rgb_array", **gymnasiums)
         self._film = film
 

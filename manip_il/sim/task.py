@@ -188,6 +188,20 @@ class TakesShape(Protocol):
 
 
 @runtime_checkable
+class TakesArgument(Protocol):
+    """A task of which there are several, called `NAME:ARGUMENT`; which one an episode is of lives in the state."""
+
+    def with_argument(self, text: str) -> Task:
+        """Return the one that a text means, named by its numbers: `NAME`, or `NAME:A=NUMBER,B=NUMBER`."""
+        ...
+
+    @property
+    def argument_bodies(self) -> tuple[str, ...]:
+        """Mocap bodies whose places hold which one it is; scenes that are drawn anew keep them."""
+        ...
+
+
+@runtime_checkable
 class Fitting(Protocol):
     """A task whose fixed parts are of a size for the arm."""
 

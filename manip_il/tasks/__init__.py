@@ -14,3 +14,4 @@ NAMES = (
     "sort",
     "carry",
 )
+SEVERAL = ("carry:REWARD",)  # tasks of which there are several, by what stands behind the colon

@@ -11,8 +11,7 @@ from manip_il.option import option
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
-from manip_il.tasks import NAMES
-from manip_il.tasks.reward import DEFAULT, REWARD_HELP, TASTES, Reward
+from manip_il.tasks import NAMES, SEVERAL
 from manip_il.tasks.stock import table as stock
 
 LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
@@ -21,7 +20,8 @@ ROBOT_HELP = (
     "gymnasium-robotics' own Fetch environments, unmodified"
 )
 TASK_HELP = (
-    f"{', '.join(NAMES)}; the path of a Python file with a task of your own; of {stock.ROBOT} {', '.join(stock.STOCK)}"
+    f"{', '.join((*NAMES, *SEVERAL))}; the path of a Python file with a task of your own; of {stock.ROBOT} "
+    f"{', '.join(stock.STOCK)}"
 )
 
 
@@ -29,14 +29,12 @@ TASK_HELP = (
 class EnvConfig(Episodes):
     """Settings of one environment; every field is part of the fingerprint. `make_config` checks and completes them.
 
-    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own. reward: of `carry`,
-    as `Reward.parse` reads it, kept as its numbers wherever it came from; empty for the task's own.
+    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own.
     """
 
     robot: str = option("panda", ROBOT_HELP, flag="robot.type")
     task: str = option("pick_place", TASK_HELP, flag="task.type")
     object: str = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
-    reward: str = option("", f"{REWARD_HELP}; by default {DEFAULT}", flag="task.reward")
 
     @property
     def name(self) -> str:
@@ -45,8 +43,8 @@ class EnvConfig(Episodes):
 
 
 def scene_name(robot: str, task: str) -> str:
-    """Return robot and task as one word, those of a file by its name."""
-    return f"{Path(robot).stem}_{Path(task).stem}"
+    """Return robot and task as one word, those of a file by its name, a task without its argument."""
+    return f"{Path(robot).stem}_{Path(task).stem.partition(':')[0]}"
 
 
 def make_config(
@@ -78,19 +76,18 @@ def complete(config: EnvConfig) -> EnvConfig:
 
 
 def _with_task(config: EnvConfig) -> EnvConfig:
-    """Object and reward as short as can be, those that are the default not at all; the robot's rate."""
+    """The object as short as can be, the default not at all; a task's argument as numbers; the robot's rate."""
     from manip_il.robots.table import get_robot  # here, as help needs no robot and no simulator
+    from manip_il.sim.task import TakesArgument
     from manip_il.tasks.table import get_task
 
-    get_task(config.task)
+    task = get_task(config.task)
+    if isinstance(task, TakesArgument):
+        config = replace(config, task=task.name)
     if config.object:
         shape = Shape.parse(config.object)
         get_task(config.task, config.object)
         config = replace(config, object="" if shape == CUBE else str(shape))
-    if config.reward:
-        reward = Reward.parse(config.reward)
-        get_task(config.task, reward=reward.numbers)
-        config = replace(config, reward="" if reward == TASTES[DEFAULT] else reward.numbers)
     return replace(config, control_hz=config.control_hz or get_robot(config.robot).fps)
 
 
@@ -111,8 +108,6 @@ def _of_stock(config: EnvConfig) -> EnvConfig:
     stock.get_stock(config.task)
     if config.object:
         raise UsageError(f"object is {config.object}; {stock.ROBOT} is unmodified, leave --task.object out")
-    if config.reward:
-        raise UsageError(f"reward is {config.reward}; {stock.ROBOT} is unmodified, leave --task.reward out")
     own = {
         "control_hz": stock.CONTROL_HZ,
         "tolerance": stock.TOLERANCE,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import DT_SIM, CameraConfig, Look
@@ -25,12 +26,12 @@ def scene_of(robot: str, task: str, shape: str = "", step: float = DT_SIM) -> Sc
 
 def config_scene(config: EnvConfig) -> Scene:
     """Return the compiled scene of an environment."""
-    return build_scene(get_robot(config.robot), _task(config), config.physics_step)
+    return build_scene(*_parts(config), config.physics_step)
 
 
 def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> ManipEnv:
     """Make an environment of configurations."""
-    return ManipEnv(get_robot(config.robot), _task(config), config, cameras=cameras, conditions=conditions)
+    return ManipEnv(*_parts(config), config, cameras=cameras, conditions=conditions)
 
 
 def make_env(
@@ -51,9 +52,8 @@ def make_env(
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
-    parts = get_robot(config.robot), _task(config), config
-    return ManipEnv(*parts, cameras=seen, look=look, render_mode=render_mode, conditions=conditions)
+    return ManipEnv(*_parts(config), config, cameras=seen, look=look, render_mode=render_mode, conditions=conditions)
 
 
-def _task(config: EnvConfig) -> Task:
-    return get_task(config.task, config.object, config.reward)
+def _parts(config: EnvConfig) -> tuple[Robot, Task]:
+    return get_robot(config.robot), get_task(config.task, config.object)

@@ -9,7 +9,7 @@ from manip_il.cli.main import main
 from manip_il.cli.options import choices, options_of
 from manip_il.cli.reward import IrlOptions
 from manip_il.rewards import methods
-from manip_il.tasks.reward import FEATURES, Reward
+from manip_il.tasks.carry.reward import FEATURES, Reward
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 
@@ -49,5 +49,5 @@ def test_a_reward_is_learnt_from_demonstrations_and_taken_by_the_task(tmp_path, 
         assert name in err
     reward = Reward.parse(str(folder / "reward.json"))
     assert reward.weights[0] == 1
-    assert f"--policy.type=expert --task.type=carry --task.reward={folder / 'reward.json'}" in out
+    assert f"--policy.type=expert --task.type=carry:{folder / 'reward.json'}" in out
     assert "data:image/svg+xml;base64," in (folder / "report.html").read_text()

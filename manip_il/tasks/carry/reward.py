@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from manip_il import checks
 from manip_il.errors import ManipError, UsageError, nearest, shorten
@@ -23,10 +22,7 @@ FEATURES = (
     "near_edge",  # 1 at the edge of the table or beyond it, 0.6 at 5 cm
 )
 MOST = 1e6  # of a weight
-_FILES = (".yaml", ".yml", ".json")
 _LARGEST = 1 << 20  # of a file [bytes]
-_WHAT = "a reward: names and weights"
-_FORMS = "a file of .yaml or .json, or NAME=NUMBER,..."
 
 
 @dataclass(frozen=True)
@@ -40,10 +36,6 @@ class Reward:
     weights: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if len(self.weights) != len(FEATURES):
-            raise UsageError(
-                f"a reward of {len(self.weights)} weights; expected {len(FEATURES)}: {', '.join(FEATURES)}"
-            )
         for name, weight in zip(FEATURES, self.weights, strict=True):
             if not (math.isfinite(weight) and 0 <= weight <= MOST):
                 raise UsageError(f"weight of {name} is {weight:g}; expected a finite number from 0 to {MOST:g}")
@@ -60,80 +52,49 @@ class Reward:
             if name not in FEATURES:
                 known = ", ".join(FEATURES)
                 raise UsageError(f"unknown feature {shorten(name)}{nearest(name, FEATURES)}; known: {known}")
-        if "length" not in weights:
-            raise UsageError("a reward without a weight of length; expected one above 0")
         try:
             return cls(tuple(checks.number(f"weight of {name}", weights.get(name, 0.0)) for name in FEATURES))
-        except UsageError:
-            raise
         except ManipError as error:
             raise UsageError(str(error)) from None
 
     @classmethod
     def parse(cls, text: str) -> Reward:
-        """Return the reward that a text means: a shipped one's name, a file, or `NAME=NUMBER,...`.
+        """Return the reward that a text means: a shipped one's name, a `reward.json`, or `NAME=NUMBER,...`.
 
         Raises `UsageError` for any other text, and for a file that cannot be read or is no reward.
         """
         if text in TASTES:
             return TASTES[text]
-        if Path(text).suffix in _FILES:
+        if text.endswith(".json"):
             return cls._read(Path(text))
         if "=" not in text:
-            raise UsageError(
-                f"unknown reward {shorten(text)}{nearest(text, TASTES)}; expected {', '.join(TASTES)}, {_FORMS}"
-            )
-        return cls.of(_named(text))
+            known = ", ".join(TASTES)
+            near = nearest(text, TASTES)
+            raise UsageError(f"unknown reward {shorten(text)}{near}; expected {known}, reward.json, or NAME=NUMBER,...")
+        weights = dict[str, object]()
+        for word in text.split(","):
+            name, _, value = (part.strip() for part in word.partition("="))
+            try:
+                weights[name] = float(value)
+            except ValueError:
+                raise UsageError(f"weight of {name} is {shorten(value)}; expected a number") from None
+        return cls.of(weights)
 
     @classmethod
     def _read(cls, path: Path) -> Reward:
-        """Read YAML of names and weights, or JSON with the lists `names` and `weights` and whatever else."""
+        """Read the lists `names` and `weights` of a `reward.json`, which has whatever else."""
         try:
-            if path.suffix == ".json":
-                tree: Any = checks.parse_json(str(path), checks.read_bytes(path, _WHAT, _LARGEST, UsageError))
-            else:
-                tree = checks.read_yaml(path, _WHAT)
-            tree = checks.mapping(str(path), tree)
-            return cls.of(_listed(path, tree) if "names" in tree else tree)
-        except ManipError as error:
+            tree = checks.mapping(str(path), checks.read_json(path, "a reward: names and weights", _LARGEST))
+            names, weights = (checks.array(f"{path}: {key}", tree.get(key)) for key in ("names", "weights"))
+            return cls.of(dict(zip(map(str, names), weights, strict=True)))
+        except (ManipError, ValueError) as error:
             raise UsageError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-
-    @property
-    def text(self) -> str:
-        """Name of a shipped reward, else `NAME=NUMBER,...` of the weights that are not 0."""
-        for name, one in TASTES.items():
-            if one == self:
-                return name
-        return self.numbers
 
     @property
     def numbers(self) -> str:
         """`NAME=NUMBER,...` of the weights that are not 0, exactly."""
         pairs = zip(FEATURES, self.weights, strict=True)
         return ",".join(f"{name}={_short(weight)}" for name, weight in pairs if weight)
-
-
-def _named(text: str) -> dict[str, object]:
-    found = dict[str, object]()
-    for word in text.split(","):
-        name, equals, value = (part.strip() for part in word.partition("="))
-        if not equals:
-            raise UsageError(f"{shorten(word)} in a reward; expected NAME=NUMBER")
-        if name in found:
-            raise UsageError(f"{name} stands twice in a reward; expected every feature once")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            raise UsageError(f"weight of {name} is {shorten(value)}; expected a number") from None
-    return found
-
-
-def _listed(path: Path, tree: Mapping[str, Any]) -> dict[str, object]:
-    names = [checks.text(f"{path}: a name", name) for name in checks.array(f"{path}: names", tree["names"])]
-    weights = checks.array(f"{path}: weights", tree.get("weights"))
-    if len(names) != len(weights) or len(set(names)) != len(names):
-        raise UsageError(f"{path}: {len(names)} names, {len(set(names))} of them different, and {len(weights)} weights")
-    return dict(zip(names, weights, strict=True))
 
 
 def _short(weight: float) -> str:
@@ -147,4 +108,3 @@ TASTES: dict[str, Reward] = {
     "hasty": Reward((1.0, 0.2, 0.5, 0.0, 1.0, 0.2, 0.0, 0.5, 0.2)),
 }
 DEFAULT = "careful"
-REWARD_HELP = f"{', '.join(TASTES)}, {_FORMS}; what carry minimises"

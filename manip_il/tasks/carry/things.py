@@ -14,11 +14,11 @@ from manip_il.errors import MismatchError
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.grid import Space
-from manip_il.tasks.hand import hand_of
-from manip_il.tasks.layout import FULL, THINGS, Edge, Layout, Part
+from manip_il.tasks.carry.grid import Space
+from manip_il.tasks.carry.hand import hand_of
+from manip_il.tasks.carry.layout import FULL, THINGS, Edge, Layout, Part
+from manip_il.tasks.carry.reward import DEFAULT, FEATURES, TASTES, Reward
 from manip_il.tasks.objects import add_furniture, add_part
-from manip_il.tasks.reward import DEFAULT, FEATURES, TASTES, Reward
 
 F64 = NDArray[np.float64]
 Pose = tuple[F64, F64]  # position (3,) [m], quaternion wxyz (4,)

@@ -15,12 +15,12 @@ from manip_il.errors import ManipError, UnknownName
 from manip_il.rewards.paths import cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
-from manip_il.tasks.furnishing import space_of
-from manip_il.tasks.grid import Grid, descent
-from manip_il.tasks.layout import THINGS, Edge, Layout, Part, path_features
-from manip_il.tasks.reward import FEATURES, TASTES, Reward
+from manip_il.tasks.carry.grid import Grid, descent
+from manip_il.tasks.carry.layout import THINGS, Edge, Layout, Part, path_features
+from manip_il.tasks.carry.reward import FEATURES, TASTES, Reward
+from manip_il.tasks.carry.things import space_of
 
-from ..tables import every_robot
+from ...tables import every_robot
 
 PARTS = (Part(-0.025, 0.036), Part(-0.018, 0.072), Part(0.07, 0.105), Part(0.19, 0.139))
 LAYOUT = Layout(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, UnknownName
-from manip_il.tasks.reward import FEATURES
+from manip_il.tasks.carry.reward import FEATURES
 
 F64 = NDArray[np.float64]
 

@@ -17,17 +17,17 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry import OBJECT, descent_of
+from manip_il.tasks.carry.layout import THINGS, path_features
+from manip_il.tasks.carry.reward import TASTES
+from manip_il.tasks.carry.task import OBJECT, descent_of
+from manip_il.tasks.carry.things import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of, make_env
-from manip_il.tasks.furnishing import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
-from manip_il.tasks.layout import THINGS, path_features
-from manip_il.tasks.reward import TASTES
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
 
-from ..scenes import SEED, drive_until, started
-from ..tables import every_robot
+from ...scenes import SEED, drive_until, started
+from ...tables import every_robot
 
 STARTS = range(SEED, SEED + 6)
 PHASES = phases(TASKS["carry"])
@@ -57,7 +57,7 @@ def carried(env: ManipEnv) -> np.ndarray:
 @every_robot
 def test_the_expert_touches_nothing_on_its_way(robot: str, taste: str):
     for seed in STARTS:
-        assert len(carried(started(robot, "carry", seed, reward=taste))) > 3
+        assert len(carried(started(robot, f"carry:{taste}", seed))) > 3
 
 
 @pytest.mark.parametrize("shape", ["cylinder:0.04x0.08", "sphere:0.05", "box:0.08x0.03x0.04"])
@@ -70,7 +70,7 @@ def test_a_tastes_own_way_costs_it_less_than_anothers():
     costs = {taste: {other: 0.0 for other in TASTES} for taste in TASTES}
     for seed in range(SEED, SEED + 12):
         for taste in TASTES:
-            env = started("panda", "carry", seed, reward=taste)
+            env = started("panda", f"carry:{taste}", seed)
             features = path_features(layout_of(env.world, OBJECT), carried(env))
             for other in TASTES:
                 costs[taste][other] += features @ np.array(TASTES[other].weights)
@@ -79,7 +79,7 @@ def test_a_tastes_own_way_costs_it_less_than_anothers():
 
 
 def test_the_reward_is_the_states_and_not_observed():
-    careful, low = (started("panda", "carry", reward=taste) for taste in ("careful", "low"))
+    careful, low = (started("panda", f"carry:{taste}") for taste in ("careful", "low"))
     assert (reward_in(careful.world), reward_in(low.world)) == (TASTES["careful"], TASTES["low"])
     np.testing.assert_array_equal(environment_state(careful.world), environment_state(low.world))
     for env in (careful, low):
@@ -191,7 +191,7 @@ def test_an_object_beside_a_low_thing_is_grasped_where_the_hand_fits():
 
 
 def test_scenes_that_are_drawn_anew_keep_the_taste():
-    low = started("panda", "carry", reward="low")
+    low = started("panda", "carry:low")
     visited, seen = low.get_state(), set()
     scenes = Scenes(CameraConfig(("front",)), frames=12)
     drawer, rng = SceneDrawer(make_config("panda", "carry"), scenes), np.random.default_rng(0)
@@ -207,13 +207,13 @@ def test_scenes_that_are_drawn_anew_keep_the_taste():
 def test_a_reward_of_a_file_drives_an_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     reward = {"names": ["length", "height"], "weights": [1.0, 3.0], "method": "max_entropy"}
     (tmp_path / "reward.json").write_text(json.dumps(reward))
-    words = ["eval", "--policy.type=expert", "--task.type=carry", "--eval.n_episodes=2", "--workers=1"]
-    assert main([*words, f"--task.reward={tmp_path}/reward.json", f"--output_dir={tmp_path}/out"]) == 0
+    words = ["eval", "--policy.type=expert", "--eval.n_episodes=2", "--workers=1"]
+    assert main([*words, f"--task.type=carry:{tmp_path}/reward.json", f"--output_dir={tmp_path}/out"]) == 0
     result = json.loads((tmp_path / "out" / "eval.json").read_text())
     assert result["success_rate"] == 1.0
-    assert result["settings"]["reward"] == "length=1,height=3"
+    assert result["task"] == "carry:length=1,height=3"
     (tmp_path / "reward.json").write_text(json.dumps(reward | {"names": ["length", "hight"]}))
-    assert main([*words, f"--task.reward={tmp_path}/reward.json", f"--output_dir={tmp_path}/other"]) == 2
+    assert main([*words, f"--task.type=carry:{tmp_path}/reward.json", f"--output_dir={tmp_path}/other"]) == 2
     assert "unknown feature 'hight' (did you mean 'height'?)" in capsys.readouterr().err
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
-from manip_il.tasks.layout import Layout
-from manip_il.tasks.reward import Reward
+from manip_il.tasks.carry.layout import Layout
+from manip_il.tasks.carry.reward import Reward
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 CELL = 0.02  # of the grid, at full scale [m]

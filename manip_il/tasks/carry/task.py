@@ -20,8 +20,12 @@ from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry_starts import draw_names, draw_things
-from manip_il.tasks.furnishing import (
+from manip_il.tasks.carry.grid import Descent, descent
+from manip_il.tasks.carry.hand import fits, hand_of
+from manip_il.tasks.carry.layout import ABOVE, ASIDE, FULL, THINGS
+from manip_il.tasks.carry.reward import DEFAULT, TASTES, Reward
+from manip_il.tasks.carry.starts import draw_names, draw_things
+from manip_il.tasks.carry.things import (
     TASTE_BODIES,
     add_things,
     layout_of,
@@ -31,8 +35,6 @@ from manip_il.tasks.furnishing import (
     space_of,
 )
 from manip_il.tasks.grasp import grasp_of
-from manip_il.tasks.grid import Descent, descent
-from manip_il.tasks.hand import fits, hand_of
 from manip_il.tasks.ladder import (
     AT_GOAL,
     CLOSED,
@@ -42,13 +44,12 @@ from manip_il.tasks.ladder import (
     held,
     nearness,
 )
-from manip_il.tasks.layout import ABOVE, ASIDE, FULL, THINGS
 from manip_il.tasks.pick_place import OBJECT, PickPlace, observe_cube
-from manip_il.tasks.reward import DEFAULT, TASTES, Reward
 from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying
 
 F64 = NDArray[np.float64]
 
+NAME = "carry"
 APART = 0.22  # of the goal from the object at the start, sideways, at full scale [m]
 HIGHEST = 0.2  # of a goal over where the object rests, at full scale [m]
 STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
@@ -136,7 +137,7 @@ class Carry(PickPlace):
     reward: what starts are about; the expert reads it from the state.
     """
 
-    name: str = "carry"
+    name: str = NAME
     instruction: str = "Carry the cube past what stands on the table to the green goal."
     limits: Limits = Limits(horizon=200)
     rungs: tuple[Rung, ...] = _RUNGS
@@ -147,9 +148,10 @@ class Carry(PickPlace):
         """Return the task with another object."""
         return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
 
-    def with_reward(self, reward: Reward) -> Self:
-        """Return the task with starts that are about another reward."""
-        return replace(self, reward=reward)
+    def with_argument(self, text: str) -> Self:
+        """Return the task with starts that are about the reward that a text means, whose numbers are in its name."""
+        reward = Reward.parse(text)
+        return replace(self, name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}", reward=reward)
 
     def fitted(self, robot: Robot) -> Self:
         """Return the task with things of a size for a robot's workspace."""
@@ -196,7 +198,7 @@ class Carry(PickPlace):
         return "" if leads else "no free path to the goal"
 
     @property
-    def taste(self) -> tuple[str, ...]:
+    def argument_bodies(self) -> tuple[str, ...]:
         """Bodies that hold the reward."""
         return TASTE_BODIES
 

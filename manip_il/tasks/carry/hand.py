@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from manip_il.robots.geometry import outline
 from manip_il.sim.world import Scene
-from manip_il.tasks.layout import Layout, Part
+from manip_il.tasks.carry.layout import Layout, Part
 
 F64 = NDArray[np.float64]
 LEANING = 0.01  # how much farther a hand that leans reaches to all sides [m]

@@ -1,0 +1,94 @@
+"""Rewards of `carry`: read from a name, a file or a text, refused in one line, and kept as numbers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il.checks import task_name
+from manip_il.cli.evaluate import EvalOptions
+from manip_il.cli.parsing import from_yaml, parse
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.errors import ManipError, UsageError
+from manip_il.tasks.carry.reward import FEATURES, Reward
+from manip_il.tasks.config import make_config
+
+numbers = st.floats(0, 1e6, allow_subnormal=False)
+
+
+@given(st.lists(numbers, min_size=len(FEATURES), max_size=len(FEATURES)))
+def test_a_reward_is_read_back_exactly_from_its_numbers(weights: list[float]):
+    reward = Reward((max(weights[0], 0.1), *weights[1:]))
+    assert Reward.parse(reward.numbers) == reward
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("carful", "unknown reward 'carful' .did you mean 'careful'.*expected careful, low, hasty, reward.json"),
+        ("length=1,near_vose=2", "unknown feature 'near_vose' .did you mean 'near_vase'"),
+        ("height=1", "weight of length is 0; expected more than 0"),
+        ("length=1,height=-2", "weight of height is -2; expected a finite number from 0"),
+        ("length=1,height=nan", "weight of height is nan; expected a finite number"),
+        ("length=1,height=much", "weight of height is 'much'; expected a number"),
+        ("/nowhere/reward.json", "cannot read /nowhere/reward.json"),
+    ],
+)
+def test_what_is_no_reward_is_refused_in_one_line(text: str, message: str):
+    with pytest.raises(UsageError, match=message) as caught:
+        Reward.parse(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"names": ["length", "neer_vase"], "weights": [1, 2]}', "unknown feature 'neer_vase'"),
+        ('{"names": ["length"]}', "weights is None"),
+        ('{"names": ["length"], "weights": ["1"]}', "weight of length is '1'"),
+        ("{", "not valid JSON"),
+    ],
+)
+def test_a_broken_file_is_refused_in_one_line_that_names_it(tmp_path: Path, content: str, message: str):
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(UsageError, match=message) as caught:
+        Reward.parse(str(tmp_path / "a.json"))
+    assert str(tmp_path / "a.json") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_environment_keeps_what_is_in_a_file_and_not_where_it_is(tmp_path: Path):
+    content = {"names": ["height", "length"], "weights": [3.0, 1], "method": "any"}
+    for name in ("one.json", "two.json"):
+        (tmp_path / name).write_text(json.dumps(content))
+    one, two = (make_config(task=f"carry:{tmp_path / name}") for name in ("one.json", "two.json"))
+    assert one == two == make_config(task="carry:length=1, height=3")
+    assert (one.task, one.name) == ("carry:length=1,height=3", "panda_carry")
+    assert env_spec(one).task == one.task
+    assert make_config(task="carry:careful") == make_config(task="carry")
+
+
+@pytest.mark.parametrize(("task", "sha256"), [("carry", "d165c820ba2f39ca"), ("carry:low", "9f48c3c88734fc0d")])
+def test_a_reward_in_the_name_has_the_fingerprint_that_it_had_as_a_setting(task: str, sha256: str):
+    assert env_fingerprint(make_config(task=task))["config_sha256"].startswith(sha256)
+
+
+def test_a_task_of_which_there_is_one_takes_nothing_behind_a_colon():
+    with pytest.raises(UsageError, match=r"task is 'lift:low', but lift takes no colon; carry does"):
+        make_config(task="lift:low")
+    with pytest.raises(ManipError, match=r"task is 'carry:own.json'; expected NAME=NUMBER"):
+        task_name("carry:own.json")
+
+
+def test_the_old_option_names_the_new_one_and_old_files_may_hold_it_empty(tmp_path: Path):
+    (tmp_path / "old.yaml").write_text("task: {type: lift, reward: ''}")
+    assert from_yaml(tmp_path / "old.yaml", EvalOptions).env == {"task": "lift"}
+    (tmp_path / "old.yaml").write_text("task: {type: carry, reward: low}")
+    with pytest.raises(UsageError, match=r"reward has a new name: --task.type=carry:low"):
+        from_yaml(tmp_path / "old.yaml", EvalOptions)
+    with pytest.raises(UsageError, match=r"--task.reward has a new name: --task.type=carry:low"):
+        parse(EvalOptions, ["--task.reward=low"])
