@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import MISSING, dataclass, field
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policies
@@ -18,12 +18,13 @@ from manip_il.option import option
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
-    from manip_il.evaluation.arm import Member
-    from manip_il.evaluation.runner import Trial
+    from manip_il.evaluation.arm import Arm
+    from manip_il.evaluation.comparison import Study
+    from manip_il.tasks.config import EnvConfig
 
 AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; seconds "
-    "of collecting and fitting), or an amount, as in labels:5000"
+    "of collecting and fitting)"
 )
 _YAML = (".yaml", ".yml")
 
@@ -44,8 +45,7 @@ class CompareOptions:
 
     One YAML in place of two sides is a study: every arm is run with several training seeds, all are tested on the same
     unseen seeds, and compared. It holds `common` and `arms` (options of manip-il dagger), training_seeds, eval,
-    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json and report.html the
-    results.
+    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
@@ -54,7 +54,7 @@ class CompareOptions:
         MISSING, "two sides, or the YAML of a study", positional=True, check=_require_side, free=True
     )
     checkpoint: Literal["best", "last"] = option("best", "of a run: best on validation, or the last round")
-    at: str = option("end", AT_HELP)
+    at: Literal["end", "labels", "episodes", "steps", "seconds"] = option("end", AT_HELP)
     eval: common.TrialGroup = field(default_factory=common.TrialGroup)
     suite: str = common.suite_option()
     env: Given = common.env_given(of_policy=True)
@@ -84,63 +84,82 @@ class CompareOptions:
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
         if self._is_study:
-            from manip_il.cli.study import Study
-
-            Study(self.sides[0], self.engine, self.output, trust=self.trust).run(self, self.training_seeds)
+            self._run_study(self.sides[0])
         else:
             self._compare(*self.sides)
 
+    def _run_study(self, path: Path) -> None:
+        from manip_il.cli.study import expert_trials, learn, read_plan, tested
+
+        plan = read_plan(path, self.training_seeds, self.trust)
+        experts = expert_trials(plan)
+        with self.output.open(plan.file) as folder:
+            learn(plan, folder, self.engine)
+            study = tested(plan, experts, folder, self.engine, self.trust)
+            result = study.arms[0].members[0].test
+            what = f"{result.robot} {result.task}" if plan.baseline else result.robot
+            self._answer(study, folder, f"Study: {what}, {path.stem}", to_plain(plan.file))
+
     def _compare(self, left: Path, right: Path) -> None:
         from manip_il.evaluation.arm import read_arm, require_pair
-        from manip_il.evaluation.compare_report import compare_report, comparison_table
-        from manip_il.evaluation.comparison import FILE_NAME, Comparison, seeds_facts
-        from manip_il.evaluation.results import write_json
+        from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
-        from manip_il.evaluation.tables import print_table
 
-        rule = Rule.parse(self.checkpoint, self.at)
-        both = [read_arm(left), read_arm(right)]
+        both = (read_arm(left), read_arm(right))
         require_pair(*both)
         members = [member for arm in both for member in arm.members]
-        warn(
-            *(f"{one.name} is not finished: its {len(one.history)} rounds count" for one in members if not one.finished)
-        )
-        limit = rule.limit({member.name: member.history for member in members})
-        arms = [arm.map(lambda member: member.select(rule, limit)) for arm in both]
-        trial = self._trial([member for arm in arms for member in arm.members])
-        with self.output.open(self) as folder:
-            kept = f"every finished evaluation, in {folder}"
-            with Stages(kept) as stages, self.engine.open() as engine:
-                last = (trial, folder, engine, stages)
-                arms = [arm.map(lambda one: one.measure(*last)) for arm in arms]
-            comparison = Comparison(*arms)
-            write_json(folder / FILE_NAME, comparison.file_json() | {"rule": rule.to_json(limit)})
-            chosen = any(member.chosen for arm in arms for member in arm.members)
-            facts = [*([rule.fact(limit)] if chosen else []), *seeds_facts(len(comparison.pairs))]
-            report = compare_report(comparison, command_line("compare", self), facts, to_plain(self))
-            report.write(folder / REPORT_FILE)
-        print_table(comparison_table(comparison))
-        say(*facts, comparison.verdict, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+        rule = Rule(self.checkpoint, self.at).limited({one.name: one.history for one in members})
+        both = tuple(arm.map(lambda one: one.select(rule)) for arm in both)
+        trial = None
+        if members[0].result is None:
+            from manip_il.evaluation.runner import Trial
 
-    def _trial(self, members: Sequence[Member]) -> Trial | None:
-        """Return the test to run, checked; None if all is evaluated already."""
-        from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.evaluation.arm import common_env
-        from manip_il.evaluation.comparison import require_same_episodes
-        from manip_il.evaluation.results import compare_results
-        from manip_il.evaluation.runner import Trial
+            policies = {one.name: one.policy for arm in both for one in arm.members if one.policy is not None}
+            seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
+            trial = Trial.of(self._env(both, policies), seeds, self.suite, policies.values(), self.trust)
+            check_policies(policies, trial)
+        else:
+            _warn_of_fingerprints(Study(both, both[0].name, rule))
+        with self.output.open(self) as folder:
+            if trial is not None:
+                with Stages(f"every finished episode, in {folder}") as stages, self.engine.open() as engine:
+                    last = (trial, folder, engine, stages)
+                    both = tuple(arm.map(lambda one: one.measure(*last)) for arm in both)
+            study = Study(both, both[0].name, rule)
+            test = both[0].members[0].test
+            self._answer(study, folder, f"{left} against {right}: {test.robot} {test.task}", to_plain(self))
+
+    def _env(self, arms: tuple[Arm, ...], policies: Mapping[str, Path]) -> EnvConfig:
+        """Return the environment that all are tested in: the runs' own, else that of the policies."""
+        from manip_il.evaluation.arm import require_same_env
         from manip_il.learn.checkpoint import Checkpoint
 
-        if members[0].result is not None:
-            first = members[0]
-            for other in members[1:]:
-                compare_results(first.test, other.test, (first.name, other.name))
-                require_same_episodes(first.name, first.test, other.name, other.test)
-                warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
-            return None
-        policies = {member.name: member.policy for member in members if member.policy is not None}
-        seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
-        env = common_env(members, lambda policy: common.env_config(self.env, Checkpoint.open(policy).origin))
-        trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)
-        check_policies(policies, trial)
-        return trial
+        given = {name: value for name, value in self.env.items() if value is not None}
+        runs = [member for arm in arms for member in arm.members if member.history]
+        if runs:
+            return require_same_env({run.name: replace(run.env(given.get("task")), **given) for run in runs})
+        origins = {name: Checkpoint.open(policy).origin for name, policy in policies.items()}
+        return require_same_env({name: common.env_config(given, origin) for name, origin in origins.items()})
+
+    def _answer(self, study: Study, folder: Path, title: str, config: Mapping[str, Any]) -> None:
+        """Write the result and the page, print the tables and the verdict."""
+        from manip_il.evaluation.compare_report import compare_report
+        from manip_il.evaluation.comparison import FILE_NAME
+        from manip_il.evaluation.results import write_json
+        from manip_il.evaluation.tables import print_table
+
+        write_json(folder / FILE_NAME, study.to_json())
+        compare_report(study, title, command_line("compare", self), config).write(folder / REPORT_FILE)
+        for table in (*study.result_tables(), *study.cost_tables()):
+            print_table(table)
+        say(study.verdict, *study.facts, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+
+
+def _warn_of_fingerprints(study: Study) -> None:
+    """Compare what is evaluated already; warn of other versions or models."""
+    from manip_il.data.fingerprint import compare_fingerprints
+
+    assert study.comparisons
+    first, *others = (member for arm in study.arms for member in arm.members)
+    for other in others:
+        warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))

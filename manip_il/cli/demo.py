@@ -149,8 +149,7 @@ class _Demo:
             )
             last = (self.engine, self.stages)
             measured[folder] = {
-                one.key: trial.measure(one.policy, one.name, place / folder / f"{one.key}.json", *last, complete=False)
-                for one in some
+                one.key: trial.measure(one.policy, one.name, place / folder / one.key, *last) for one in some
             }
         return measured
 
@@ -191,9 +190,7 @@ class _Demo:
             for one in (cloned, more)
         ]
         success = measured["validation"][more.key].success
-        beside = Curve(
-            "cloning", ((Round(0, more.labels or 0, 0, 0, 0, 0.0, 0.0, success),),), more.colour, ("labels",)
-        )
+        beside = Curve("cloning", ((Round(0, more.labels or 0, 0, 0, 0.0, success),),), more.colour, ("labels",))
         return run_report(
             rows,
             *films,

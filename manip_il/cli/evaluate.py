@@ -110,14 +110,15 @@ class EvalOptions:
         elif self.evaluation:
             merged = eval_files.merge(self.evaluation)
             with self.output.open(self) as folder:
-                self._keep(merged, folder)
+                merged.write(folder / "eval.json")
+                self._print(merged)
                 self._report(merged, folder)
         else:
             self._evaluate()
 
     def _evaluate(self) -> None:
         from manip_il.evaluation.film import film_outcomes
-        from manip_il.evaluation.runner import EpisodeJournal, evaluate
+        from manip_il.evaluation.runner import finished_episodes, measure
         from manip_il.seeding import stream_seeds
 
         most = EPISODES if self.until_width is None else MOST_EPISODES
@@ -126,16 +127,12 @@ class EvalOptions:
         name, engine = str(self.policy.type or self.policy.path), self.engine.open()
         if len(seeds) > 1:
             engine.warm_up(learned=self.policy.path is not None)  # while the policy is checked here
-        job = self._job()
+        job, suite, width = self._job(), self.suite, self.until_width
         with self.output.open(self) as folder:
-            journal = EpisodeJournal.open(folder, job, self.suite)
+            finished_episodes(folder, job, suite)  # refuses another policy before anything runs
             with Stages(f"finished episodes, in {folder}") as stages, engine:
-                stages.start(f"evaluate {name}", len(set(seeds) - set(journal.done)))
-                keep = journal.keep(stages.episode)
-                done, width = journal.done, self.until_width
-                result = evaluate(engine, job, seeds, name, keep, suite=self.suite, done=done, until_width=width)
-                stages.close()
-                self._keep(result, folder)
+                result = measure(engine, job, seeds, name, folder, stages, suite=suite, until_width=width)
+                self._print(result)
                 films = film_outcomes(engine, job, result, self.eval.films, folder / FILMS, stages)
             self._report(result, folder, *films)
         failed = [episode.seed for episode in result.episodes if not episode.success]
@@ -154,12 +151,9 @@ class EvalOptions:
         hold, batch = episode_hold(env, self.eval.hold), self.eval.batch_size
         return RolloutJob(env, driver, hold, label="last", conditions=conditions, batch=batch)
 
-    def _keep(self, result: EvalResult, folder: Path) -> None:
-        """Write the result and print its tables."""
-        from manip_il.evaluation.results import FILE_NAME
+    def _print(self, result: EvalResult) -> None:
         from manip_il.evaluation.tables import evaluation_table, print_table
 
-        result.write(folder / FILE_NAME)
         print_table(evaluation_table(result))
         if result.failures:
             phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
@@ -176,8 +170,7 @@ class EvalOptions:
         self, result: EvalResult, folder: Path, films: Mapping[bool, Sequence[Film]] | None = None, no_films: str = ""
     ) -> None:
         from manip_il.evaluation.eval_report import eval_report
-        from manip_il.evaluation.results import FILE_NAME
 
         page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films)
         page.write(folder / REPORT_FILE)
-        say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+        say(f"result: {folder / 'eval.json'}", f"report: {folder / REPORT_FILE}")

@@ -1,141 +1,174 @@
-"""A study of `manip-il compare`: the same runs for several arms and training seeds, tested and compared."""
+"""A study of `manip-il compare`: the same runs for several arms and training seeds, tested.
+
+An arm is `manip-il dagger`, or an algorithm that begins with what round 0 of such an arm made.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
-from manip_il.cli.common_options import EngineOptions
+from manip_il import checks
+from manip_il.cli.common_options import EngineOptions, TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.inputs import check_policies
-from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.learning import AirlOptions, GailOptions, GivenGroup, PpoOptions
+from manip_il.cli.options import Open
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
+from manip_il.cli.parsing import check_values, from_layers, from_yaml
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.study_file import (
-    ArmOptions,
-    ExpertTest,
-    Plan,
-    keep_file,
-    read_plan,
-    with_start_cost,
-    with_start_policy,
-)
-from manip_il.errors import NoEffect
-from manip_il.seeding import stream_seeds
+from manip_il.data.json_lines import read_lines
+from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
+from manip_il.evaluation.arm import Arm, Member, require_same_env, run_member
+from manip_il.evaluation.comparison import TARGET, Study
+from manip_il.evaluation.rounds import COSTS, METRICS_FILE, At, Cost, Rule, history
+from manip_il.evaluation.runner import FOLDER, Trial
+from manip_il.evaluation.suites import varied
+from manip_il.option import option
+from manip_il.robots.table import get_robot
+from manip_il.seeding import MAX_SEED, stream_seeds
+from manip_il.tasks.config import EnvConfig
 
-if TYPE_CHECKING:
-    from manip_il.evaluation.arm import Member
-    from manip_il.evaluation.runner import Trial
-    from manip_il.evaluation.study import Study as Tested
-    from manip_il.tasks.config import EnvConfig
+ROUND_0 = "round_000"
+ALGORITHM = "algorithm"  # the key of an arm that names one of these
+LearningOptions = GailOptions | PpoOptions  # an AirlOptions is a GailOptions
+ArmOptions = DaggerOptions | LearningOptions
+ALGORITHMS: Mapping[str, type[LearningOptions]] = {"gail": GailOptions, "airl": AirlOptions, "ppo": PpoOptions}
+OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study itself sets
 
 
-class Study:
-    """One study: its runs, their tests, and what comes of them."""
+@dataclass
+class ExpertTest:
+    """One test of the expert in every arm's task, by default on the arm's robot.
 
-    def __init__(self, file: Path, engine: EngineOptions, output: ResumableOutput, *, trust: bool) -> None:
-        self._file, self._engine, self._output, self._trust = file, engine, output, trust
-        self._root = output.output_dir
+    suite: as of `manip-il eval`. vary: as of `manip-il dagger`, in place of a suite.
+    """
 
-    def run(self, options: Any, training_seeds: int | None) -> None:
-        """Run what is not there yet, test it, print and write the answer. Raises `UsageError` for its file.
+    robot: str | None = None
+    suite: str = "nominal"
+    vary: list[str] = field(default_factory=list[str])
+    n_episodes: int = option(500, "test episodes", at_least=1)
 
-        options: of the command, to be kept. training_seeds: in place of the file's.
-        """
-        from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.study import FILE_NAME
-        from manip_il.evaluation.tables import print_table
 
-        plan = read_plan(self._file, training_seeds, self._trust)
-        experts = expert_trials(plan)
-        with self._output.open(options) as folder:
-            keep_file(folder, plan.file)
-            self._learn(plan)
-            study = self._test(plan, experts)
-            write_json(folder / FILE_NAME, study.to_json())
-            self._report(plan, study, options)
-        for table in study.tables():
-            print_table(table)
-        say(study.verdict, *study.facts, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+@dataclass
+class StudyFile:
+    """Content of a study's YAML file.
 
-    def _learn(self, plan: Plan) -> None:
-        """Run one after the other, seed by seed, so that a study that is stopped early has all arms.
+    common: options of `manip-il dagger` that all its arms share. arms: name -> options in which an arm differs; with
+    `algorithm: gail`, `airl` or `ppo` those of that command, where `dataset.root` and `init` name another arm. Where
+    the task differs, nothing is compared, and expert (name -> `ExpertTest`) adds what the expert solves of each.
+    """
 
-        Raises `UsageError` once a run has no round that the study's rule selects, and not when all have run.
-        """
-        from manip_il.evaluation.arm import run_finished
+    common: Open = field(default_factory=dict[str, Any])
+    arms: Open = field(default_factory=dict[str, Any])
+    expert: Open = field(default_factory=dict[str, Any])
+    training_seeds: int = option(3, "runs of every arm", at_least=1, at_most=MAX_SEED, grows=True)
+    eval: TrialGroup = field(default_factory=TrialGroup)
+    checkpoint: Literal["best", "last"] = "best"
+    at: At = "end"
+    baseline: str | None = option(None, "the arm that others are compared with; by default the first")
+    target: float = option(TARGET, "validation success whose cost is reported", at_least=0.0, at_most=1.0)
+    within: list[str] = option(list, "costs up to which the best validation success is reported: steps:20000")
 
-        runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
-        for number, (name, seed) in enumerate(runs, start=1):
-            folder = self._folder(name, seed)
-            # the report is what a run writes last
-            if not ((folder / REPORT_FILE).is_file() and run_finished(folder)):
-                say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
-                self._options(plan, name, seed).run()
-            member = self._member(plan, name, seed)
-            member.select(plan.rule, plan.rule.limit({member.name: member.history}))
 
-    def _options(self, plan: Plan, name: str, seed: int) -> ArmOptions:
-        own = with_start_policy(plan.arms[name], lambda arm: self._folder(arm, seed))
-        output = ResumableOutput(self._folder(name, seed), resume=True)
-        own = replace(own, settings=own.settings | {"seed": seed}, output=output)
-        engine = self._engine
-        if isinstance(own, DaggerOptions):
-            return replace(own, engine=engine)
-        return replace(own, workers=engine.workers)
+@dataclass(frozen=True)
+class Plan:
+    """A checked file: the options of every arm are valid.
 
-    def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Tested:
-        from manip_il.evaluation.arm import Arm
-        from manip_il.evaluation.study import Study as Tested
+    starts: arm -> the arm whose round 0 it begins with, itself for its own. envs: arm -> its environment, the same for
+    all where there is a baseline. experts: name -> test.
+    """
 
-        seeds = range(plan.file.training_seeds)
-        runs = {name: [self._member(plan, name, seed) for seed in seeds] for name in plan.arms}
-        limit = plan.rule.limit({member.name: member.history for arm in runs.values() for member in arm})
-        chosen = {name: [member.select(plan.rule, limit) for member in arm] for name, arm in runs.items()}
-        trials = {name: self._trial(plan, name, arm) for name, arm in chosen.items()}
-        kept = f"every finished run and evaluation, in {self._root}"
-        with Stages(kept) as stages, self._engine.open() as engine:
-            last = (self._root, engine, stages)
-            arms = [Arm(name, tuple(one.measure(trials[name], *last) for one in arm)) for name, arm in chosen.items()]
-            solved = {
-                name: {
-                    test: trial.measure(None, f"expert, {name}, {test}", trial.file(self._root, None), engine, stages)
-                    for test, trial in tests.items()
-                }
-                for name, tests in experts.items()
-            }
-        return Tested(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved, plan.within)
+    file: StudyFile
+    arms: Mapping[str, ArmOptions]
+    starts: Mapping[str, str]
+    within: tuple[tuple[Cost, float], ...]
+    baseline: str | None
+    envs: Mapping[str, EnvConfig]
+    experts: Mapping[str, ExpertTest]
 
-    def _trial(self, plan: Plan, name: str, members: Iterable[Member]) -> Trial:
-        """The test of an arm's policies, which are checked before any episode runs."""
-        from manip_il.evaluation.runner import Trial
 
-        policies = {member.name: member.policy for member in members if member.policy is not None}
-        seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
-        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, policies.values(), self._trust)
-        check_policies(policies, trial)
-        return trial
+def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
+    """Return the study in `path`; training_seeds: in place of the file's. trust: of its runs.
 
-    def _member(self, plan: Plan, name: str, seed: int) -> Member:
-        from manip_il.evaluation.arm import run_member
+    Raises `UsageError` in one line for what is not sound.
+    """
+    file = from_yaml(path, StudyFile)
+    if training_seeds is not None:
+        file = replace(file, training_seeds=training_seeds)
+    check_values(file, "")
+    if not file.arms:
+        raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
+    arms, starts, envs = dict[str, ArmOptions](), dict[str, str](), dict[str, EnvConfig]()
+    for name in file.arms:
+        try:
+            checks.name("its name, which becomes a folder,", name)
+            options = read_arm(file.common, file.arms[name])
+            if isinstance(options, DaggerOptions):
+                options = replace(options, trust=trust)
+                envs[name] = options.config().env
+                starts[name] = name
+            else:
+                starts[name] = _first_arm(options, arms)
+                envs[name] = envs[starts[name]]
+        except ManipError as error:
+            raise UsageError(f"{path}: arm {name!r}: {error}") from error
+        arms[name] = options
+    experts = {name: from_layers(ExpertTest, [(f"{path}: expert.{name}", file.expert[name])]) for name in file.expert}
+    return Plan(file, arms, starts, tuple(map(_cost, file.within)), _baseline(file, envs), envs, experts)
 
-        start, run = self._folder(plan.starts[name] or name, seed), run_member(self._folder(name, seed), seed)
-        return replace(run, history=with_start_cost(plan.arms[name], run.history, start))
 
-    def _folder(self, name: str, seed: int) -> Path:
-        return self._root / name / f"seed_{seed}"
+def read_arm(common: Mapping[str, Any], own: Any) -> ArmOptions:
+    """Return an arm's options. common: of `manip-il dagger` alone.
 
-    def _report(self, plan: Plan, study: Tested, options: Any) -> None:
-        from manip_il.evaluation.compare_report import study_report
+    Raises `UsageError` for an option that is none, or that the study sets; `UnknownName` for an algorithm.
+    """
+    layers = [("common", common), ("its options", own)]
+    if set_here := next((name for name in OWN for _, tree in layers if isinstance(tree, dict) and name in tree), None):
+        raise UsageError(f"{set_here} is set by the study itself, for every run; take it out")
+    if not isinstance(own, dict) or ALGORITHM not in own:
+        return from_layers(DaggerOptions, layers)
+    name = str(own[ALGORITHM])
+    if name not in ALGORITHMS:
+        raise UnknownName("algorithm", name, ALGORITHMS)
+    return from_layers(ALGORITHMS[name], [("its options", {key: own[key] for key in own if key != ALGORITHM})])
 
-        result = study.arms[0].members[0].test
-        what = f"{result.robot} {result.task}" if plan.baseline else result.robot
-        command = command_line("compare", options)
-        page = study_report(study, f"Study: {what}, {self._file.stem}", command, to_plain(plan.file))
-        page.write(self._root / REPORT_FILE)
+
+def _first_arm(options: LearningOptions, arms: Mapping[str, ArmOptions]) -> str:
+    """Return the arm that a learning one begins with, which `dataset.root` and `init` name in place of a path.
+
+    arms: those before it. Raises `UsageError` for another.
+    """
+    roots = options.dataset.root if isinstance(options, GailOptions) else []
+    named = {str(path) for path in (*roots, options.init) if path is not None}
+    known = [name for name, other in arms.items() if isinstance(other, DaggerOptions)]
+    if len(named) != 1 or not named <= {*known}:
+        raise UsageError(
+            f"dataset.root and init are {', '.join(sorted(named)) or 'not given'}; expected the name of one arm of "
+            f"manip-il dagger before it, whose demonstrations and policy it begins with: {', '.join(known) or 'none'}"
+        )
+    return named.pop()
+
+
+def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
+    """The arm that others are compared with; None if tasks differ and none is named."""
+    if file.baseline is None and len({env.task for env in envs.values()}) > 1:
+        return None
+    require_same_env(envs)
+    if file.baseline is not None and file.baseline not in envs:
+        raise UnknownName("arm as a baseline", file.baseline, envs)
+    return file.baseline or next(iter(envs))
+
+
+def _cost(text: str) -> tuple[Cost, float]:
+    cost, _, amount = text.partition(":")
+    try:
+        return next(one for one in COSTS if one == cost), float(amount)
+    except (StopIteration, ValueError):
+        raise UsageError(f"within has {text!r}; expected a cost with an amount, such as steps:20000") from None
 
 
 def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
@@ -144,20 +177,88 @@ def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
     Without those that change nothing there, such as another object if there is none. Raises `ManipError` for names.
     """
     found: dict[str, dict[str, Trial]] = {name: {} for name in plan.envs}
-    for name, env in plan.envs.items():
+    for name, arms_env in plan.envs.items():
         for test, one in plan.experts.items():
+            env, seeds = replace(arms_env, robot=one.robot or arms_env.robot), stream_seeds("test", one.n_episodes, 0)
+            get_robot(env.robot)
             with contextlib.suppress(NoEffect):
-                found[name][test] = _expert_trial(replace(env, robot=one.robot or env.robot), one)
+                if one.vary:
+                    found[name][test] = Trial(env, seeds, "+".join(one.vary), varied(one.vary, env, sees=False))
+                else:
+                    found[name][test] = Trial.of(env, seeds, one.suite)
     return found
 
 
-def _expert_trial(env: EnvConfig, test: ExpertTest) -> Trial:
-    from manip_il.evaluation.runner import Trial
-    from manip_il.evaluation.suites import varied
-    from manip_il.robots.table import get_robot  # here, as help needs no simulator
+def learn(plan: Plan, root: Path, engine: EngineOptions) -> None:
+    """Run what is not there yet, seed by seed, so that a study that is stopped early has all arms."""
+    runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
+    for number, (name, seed) in enumerate(runs, start=1):
+        folder = _folder(root, name, seed)
+        if not (folder / REPORT_FILE).is_file():  # which is what a run writes last
+            say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
+            options = with_start_policy(plan.arms[name], _folder(root, plan.starts[name], seed) / ROUND_0)
+            settings, output = options.settings | {"seed": seed}, ResumableOutput(folder, resume=True)
+            if isinstance(options, DaggerOptions):
+                replace(options, settings=settings, output=output, engine=engine).run()
+            else:
+                replace(options, settings=settings, output=output, workers=engine.workers).run()
 
-    get_robot(env.robot)
-    seeds = stream_seeds("test", test.n_episodes, 0)
-    if test.vary:
-        return Trial(env, seeds, "+".join(test.vary), varied(test.vary, env, sees=False))
-    return Trial.of(env, seeds, test.suite)
+
+def tested(
+    plan: Plan, experts: Mapping[str, Mapping[str, Trial]], root: Path, engine_options: EngineOptions, trust: bool
+) -> Study:
+    """Return all runs, with the tests of their policies and of the expert."""
+    seeds = range(plan.file.training_seeds)
+    arms = [Arm(name, tuple(_member(plan, root, name, seed) for seed in seeds)) for name in plan.arms]
+    rule = Rule(plan.file.checkpoint, plan.file.at)
+    rule = rule.limited({member.name: member.history for arm in arms for member in arm.members})
+    arms = [arm.map(lambda one: one.select(rule)) for arm in arms]
+    trials: dict[str, Trial] = {}
+    for arm in arms:
+        policies = {one.name: one.policy for one in arm.members if one.policy is not None}
+        test_seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
+        trials[arm.name] = Trial.of(plan.envs[arm.name], test_seeds, "nominal", policies.values(), trust)
+        check_policies(policies, trials[arm.name])
+    with Stages(f"every finished run and episode, in {root}") as stages, engine_options.open() as engine:
+        arms = [
+            Arm(arm.name, tuple(one.measure(trials[arm.name], root, engine, stages) for one in arm.members))
+            for arm in arms
+        ]
+        solved = {
+            name: {
+                test: trial.measure(None, f"expert, {name}, {test}", root / FOLDER / f"{name} {test}", engine, stages)
+                for test, trial in tests.items()
+            }
+            for name, tests in experts.items()
+        }
+    return Study(tuple(arms), plan.baseline, rule, plan.file.target, solved, plan.within)
+
+
+def with_start_policy(options: ArmOptions, start: Path) -> ArmOptions:
+    """Return a learning arm's options with the demonstrations and policy of round 0, `start`, for its arm's name."""
+    if isinstance(options, DaggerOptions):
+        return options
+    if options.init is not None:
+        options = replace(options, init=start / "policy")
+    if isinstance(options, GailOptions):
+        options = replace(options, dataset=GivenGroup([start / "dataset"]))
+    return options
+
+
+def with_start_cost(options: ArmOptions, own: Member, run: Path) -> Member:
+    """Return a learning arm's member with the costs of what it begins with: round 0 in `run`, its fit with `init`."""
+    if isinstance(options, DaggerOptions):
+        return own
+    records = read_lines(run / METRICS_FILE)
+    start = history(records, str(run))[0]
+    fitted = start.seconds if options.init is not None else float(records[0]["seconds"]["collect"])
+    return replace(own, history=tuple(one.after(start, fitted=fitted) for one in own.history))
+
+
+def _member(plan: Plan, root: Path, name: str, seed: int) -> Member:
+    run = run_member(_folder(root, name, seed), seed)
+    return with_start_cost(plan.arms[name], run, _folder(root, plan.starts[name], seed))
+
+
+def _folder(root: Path, name: str, seed: int) -> Path:
+    return root / name / f"seed_{seed}"

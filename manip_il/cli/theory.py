@@ -67,12 +67,12 @@ class TheoryOptions:
 
     def _shift(self, run: Path) -> Shift:
         from manip_il.collect.workers import Engine
-        from manip_il.evaluation.arm import common_env, read_arm
+        from manip_il.evaluation.arm import read_arm
         from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.theory.shift import find_rounds, measure_shift
 
         rounds = find_rounds(run)
-        env = common_env(read_arm(run).members, lambda _: common.env_config({}))
+        env = read_arm(run).members[0].env()
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
         with Progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.advance())

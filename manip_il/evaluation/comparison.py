@@ -1,52 +1,51 @@
-"""Two arms of one or several training seeds on the same test episodes: which one is better."""
+"""Arms on the same test episodes: which one is better, and what it had cost."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import fmean
 from typing import Any
 
 from manip_il.errors import ManipError
-from manip_il.evaluation.arm import Arm, require_pair
+from manip_il.evaluation.arm import Arm
 from manip_il.evaluation.intervals import (
     CONFIDENCE,
     PairedComparison,
+    Proportion,
+    difference_verdict,
     format_p,
+    format_percent,
     format_points,
     mean_interval,
     sign_flip_exact,
 )
 from manip_il.evaluation.results import EvalResult, compare_results
+from manip_il.evaluation.rounds import COSTS, Cost, Round, Rule, format_amount, has_unlabelled_steps, largest_dip, up_to
+from manip_il.evaluation.tables import NO_CONDITION, Table
 
 FILE_NAME = "compare.json"
-_OF_PAIR = ("both", "only_left", "only_right", "neither", "difference", "interval", "p_value")
+TARGET = 0.95
 
 
 @dataclass(frozen=True)
 class Comparison:
     """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
 
-    Raises `UsageError` if training seeds do not match, `MismatchError` if robot, task or settings differ, and
-    `ManipError` if the test episodes are not the same.
+    Raises `MismatchError` if robot, task or settings differ, and `ManipError` if the test episodes are not the same.
     """
 
     left: Arm
     right: Arm
 
     def __post_init__(self) -> None:
-        require_pair(self.left, self.right)
         # Also policies of different training seeds must have run the same episodes.
         first, *others = (*self.left.members, *self.right.members)
         for other in others:
-            require_same_episodes(first.name, first.test, other.name, other.test)
+            _require_same_episodes(first.name, first.test, other.name, other.test)
         _ = self.pairs
-
-    @property
-    def arms(self) -> tuple[Arm, Arm]:
-        """Left and right."""
-        return self.left, self.right
 
     @cached_property
     def pairs(self) -> tuple[PairedComparison, ...]:
@@ -87,65 +86,192 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """One sentence with the difference, its interval and p."""
-        n, left, right = len(self.pairs), self.left.name, self.right.name
-        sign = -1 if self.difference < 0 else 1
-        better, worse = (left, right) if sign < 0 else (right, left)
-        each = f" on each of {n} training seeds" if n > 1 else ""
-        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes{each}"
-        over = f" on average over {n} training seeds" if n > 1 else ""
+        n, sign = len(self.pairs), -1 if self.difference < 0 else 1
         leads = sum(sign * pair.difference > 0 for pair in self.pairs)
-        ahead = f"{over} (ahead in {leads} of {n})" if over else ""
-        low, high = sorted(100 * sign * end for end in self.interval)
-        points = f"{100 * sign * self.difference:z.1f} points [{low:z.1f}, {high:z.1f}]"  # z: no minus before a 0.0
-        if self.significant:
-            return f"{better} is better than {worse} by {points}{ahead}, {tested}."
-        if self.p_value < 1 - CONFIDENCE:
-            return (
-                f"These policies of {better} are better than those of {worse} ({tested}), but {n} training seeds do "
-                f"not show that others would be: {points}{ahead}."
-            )
-        points = format_points(self.difference, self.interval)
-        return (
-            f"No difference shown between {right} and {left}: {points}{ahead if self.difference else over}, {tested}."
-        )
-
-    @property
-    def numbers(self) -> str:
-        """`+4.2 points [+1.1, +7.3], p = 0.002`: right minus left."""
-        return f"{format_points(self.difference, self.interval)}, {format_p(self.p_value)}"
+        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
+        tested += f" on each of {n} training seeds, ahead in {leads}" if n > 1 else ""
+        names = self.left.name, self.right.name
+        return difference_verdict(names, self.difference, self.interval, tested, significant=self.significant)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; differences are right minus left."""
-        several = len(self.pairs) > 1
+        counts = ("both", "only_left", "only_right", "neither")
         return {
             "left": self.left.name,
             "right": self.right.name,
             "difference": self.difference,
             "interval": list(self.interval),
-            "interval_method": "Student's t over training seeds" if several else "Newcombe's for paired proportions",
             "confidence": CONFIDENCE,
             "p_value": self.p_value,
-            "only_left": sum(pair.only_left for pair in self.pairs),
-            "only_right": sum(pair.only_right for pair in self.pairs),
             "n_episodes": self.pairs[0].n,
             "verdict": self.verdict,
+            **{name: sum(getattr(pair, name) for pair in self.pairs) for name in counts},
+            "differences": [pair.difference for pair in self.pairs],
+        }
+
+
+@dataclass(frozen=True)
+class Study:
+    """Arms with the same training seeds, each tested, and what they had cost.
+
+    baseline: the arm that the others are compared with; arms of different tasks have none (None). rule: chose each
+    run's round. target: validation success whose cost is told. experts: tests of the expert in an arm's task, arm ->
+    name of the test -> result. within: costs up to which validation is told.
+    """
+
+    arms: tuple[Arm, ...]
+    baseline: str | None
+    rule: Rule = field(default_factory=Rule)
+    target: float = TARGET
+    experts: Mapping[str, Mapping[str, EvalResult]] = field(default_factory=dict)
+    within: tuple[tuple[Cost, float], ...] = ()
+
+    @cached_property
+    def comparisons(self) -> dict[str, Comparison]:
+        """Arm -> its comparison with the baseline, for every other arm; empty if there is no baseline."""
+        if self.baseline is None:
+            return {}
+        [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
+        return {arm.name: Comparison(baseline, arm) for arm in self.arms if arm is not baseline}
+
+    @property
+    def verdict(self) -> str:
+        """The first sentence: of two arms which is better; of several the best; of tasks how many reach the target."""
+        if len(self.comparisons) == 1:
+            return next(iter(self.comparisons.values())).verdict
+        ranked = sorted(self.arms, key=lambda arm: -arm.test_rate)
+        best, last, seeds = ranked[0], ranked[-1], len(self.arms[0].members)
+        if self.baseline is None:
+            reach = sum(arm.test_rate >= self.target for arm in ranked)
+            least = f"the last, {last.name}, solves {format_percent(last.test_rate)}"
+            return f"{reach} of {len(ranked)} solve {100 * self.target:g} % of their unseen starts; {least}."
+        over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
+        rates = ", ".join(f"{arm.name} {format_percent(arm.test_rate)}" for arm in ranked[1:])
+        n = best.members[0].test.success.n
+        return f"{best.name} solves {format_percent(best.test_rate)} of {n:,} unseen starts{over}; {rates}."
+
+    @property
+    def facts(self) -> list[str]:
+        """Sentences after the verdict: comparisons with the baseline, how rounds were chosen, meaning of wall-clock."""
+        verdicts = [comparison.verdict for comparison in self.comparisons.values()]
+        facts = verdicts if len(verdicts) > 1 else []
+        if self.comparisons and (seeds := len(self.arms[0].members)) > 1:
+            facts.append(
+                f"Intervals are Student's over {seeds} training seeds; p is exact over test episodes and holds for "
+                "these policies alone."
+            )
+        if any(member.chosen for arm in self.arms for member in arm.members):
+            facts += [self.rule.fact, "Wall-clock is what collecting and fitting took; validating is not counted."]
+        return facts
+
+    def result_tables(self) -> tuple[Table, ...]:
+        """Return the table of results, and success by condition if there are several."""
+        several = self.baseline is not None and len(self.arms[0].members[0].test.by_condition) > 1
+        return (self.results_table(), *([self.condition_table()] if several else []))
+
+    def cost_tables(self) -> tuple[Table, ...]:
+        """Return costs to the target, and success within costs; nothing unless all arms are runs."""
+        if not all(arm.has_histories for arm in self.arms):
+            return ()
+        return (self.target_table(), *([self.within_table()] if self.within else []))
+
+    def results_table(self) -> Table:
+        """Return an arm a row: the expert's success, mean costs, validation, test success, difference, largest dip.
+
+        In brackets each training seed, of one alone the interval.
+        """
+        tests, costs = list(dict.fromkeys(test for found in self.experts.values() for test in found)), self._costs
+        rows: list[tuple[str, ...]] = []
+        for arm in self.arms:
+            found, against = self.experts.get(arm.name, {}), self.comparisons.get(arm.name)
+            cells = [format_percent(found[test].success.rate) if test in found else "" for test in tests]
+            chosen = [member.chosen for member in arm.members if member.chosen]
+            cells += [_mean_cost(cost, chosen) if chosen else "" for cost in costs]
+            cells.append(_rates([one.validation for one in chosen]) if chosen else "")
+            cells.append(_rates([one.test.success for one in arm.members]))
+            points = against and f"{format_points(against.difference, against.interval)}, {format_p(against.p_value)}"
+            dip = f"{100 * max(largest_dip(member.history) for member in arm.members):.1f}" if chosen else ""
+            rows.append((arm.name, *cells, points or "", dip))
+        head = ("arm", *tests, *map(_head, costs), "validation", "test", f"test, against {self.baseline}")
+        return Table((*head, "largest dip [points]"), tuple(rows))
+
+    def condition_table(self) -> Table:
+        """Return a condition a row: success of every arm, the mean over training seeds."""
+        rows = [
+            (
+                name or NO_CONDITION,
+                *(
+                    format_percent(fmean(member.test.by_condition[name].success.rate for member in arm.members))
+                    for arm in self.arms
+                ),
+            )
+            for name in self.arms[0].members[0].test.by_condition
+        ]
+        return Table(("condition", *(arm.name for arm in self.arms)), tuple(rows))
+
+    def target_table(self) -> Table:
+        """Return an arm a row: its mean costs when validation first reached the target in each training seed."""
+        rows: list[tuple[str, ...]] = []
+        for arm in self.arms:
+            first = self._reached(arm)
+            missed = f"not in {first.count(None)} of {len(first)} seeds"
+            rows.append((arm.name, *(missed if None in first else _mean_cost(cost, first) for cost in self._costs)))
+        head = (f"{_head(cost)} to {100 * self.target:g} %" for cost in self._costs)
+        return Table(("arm, validation", *head), tuple(rows))
+
+    def within_table(self) -> Table:
+        """Return an arm a row: the best validation success up to each of the costs `within`, empty before the first."""
+        columns = tuple(f"within {format_amount(*one)}" for one in self.within)
+        rows: list[tuple[str, ...]] = []
+        for arm in self.arms:
+            known = [[up_to(member.history, *one) for member in arm.members] for one in self.within]
+            best = ([max((r.validation for r in own), key=lambda v: v.rate) for own in runs if own] for runs in known)
+            rows.append((arm.name, *(_rates(one) if len(one) == len(arm.members) else "" for one in best)))
+        return Table(("arm, validation", *columns), tuple(rows))
+
+    @property
+    def _costs(self) -> list[Cost]:
+        """Costs in the tables; steps if they are not all labelled."""
+        steps = any(has_unlabelled_steps(member.history) for arm in self.arms for member in arm.members)
+        return [cost for cost in COSTS if cost != "steps" or steps]
+
+    def _reached(self, arm: Arm) -> list[Round | None]:
+        """The round of each training seed in which validation first reached the target."""
+        return [
+            next((one for one in member.history if one.validation.rate >= self.target), None) for member in arm.members
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the contents of `compare.json`."""
+        result = self.arms[0].members[0].test
+        seeds = [episode.seed for episode in result.episodes]
+        return {
+            "verdict": self.verdict,
+            "facts": self.facts,
+            "baseline": self.baseline,
+            "target": self.target,
+            "rule": {"checkpoint": self.rule.checkpoint, "at": self.rule.at, "limit": self.rule.limit},
+            "arms": {arm.name: self._arm_json(arm) for arm in self.arms},
+            "robot": result.robot,
+            "test_seeds": [min(seeds), max(seeds)],
+        }
+
+    def _arm_json(self, arm: Arm) -> dict[str, Any]:
+        against, test = self.comparisons.get(arm.name), arm.members[0].test
+        return {
+            "task": test.task,
+            "settings": test.settings.to_json(),
+            "test_success": arm.test_rate,
+            "against_baseline": against.to_json() if against else None,
+            "expert": {name: found.success.to_json() for name, found in self.experts.get(arm.name, {}).items()},
             "training_seeds": [
-                {"left_seed": left.training_seed, "right_seed": right.training_seed}
-                | {"left": left.to_json(), "right": right.to_json()}
-                | {key: getattr(pair, key) for key in _OF_PAIR}
-                for left, right, pair in zip(self.left.members, self.right.members, self.pairs, strict=True)
+                member.to_json() | {"first_at_target": first.to_json() if first else None}
+                for member, first in zip(arm.members, self._reached(arm), strict=True)
             ],
         }
 
-    def file_json(self) -> dict[str, Any]:
-        """Return the contents of `compare.json`: `to_json`, and on which episodes both were tested."""
-        result = self.left.members[0].test
-        seeds = [episode.seed for episode in result.episodes]
-        settings = {"robot": result.robot, "task": result.task, "settings": result.settings.to_json()}
-        return self.to_json() | settings | {"test_seeds": [min(seeds), max(seeds)]}
 
-
-def require_same_episodes(left_name: str, left: EvalResult, right_name: str, right: EvalResult) -> None:
+def _require_same_episodes(left_name: str, left: EvalResult, right_name: str, right: EvalResult) -> None:
     """Raise `ManipError` with both numbers unless both ran exactly the same seeds."""
     ours, theirs = ({episode.seed for episode in one.episodes} for one in (left, right))
     if ours != theirs:
@@ -155,11 +281,16 @@ def require_same_episodes(left_name: str, left: EvalResult, right_name: str, rig
         )
 
 
-def seeds_facts(count: int) -> list[str]:
-    """Return a sentence on the interval and the test over `count` training seeds; none for a single one."""
-    if count == 1:
-        return []
-    return [
-        f"The interval is Student's over {count} training seeds; with so few it is wide. "
-        "p is exact over test episodes, which flip together for all training seeds, and holds for these policies alone."
-    ]
+def _head(cost: Cost) -> str:
+    return "wall-clock" if cost == "seconds" else cost
+
+
+def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:
+    """The mean amount without the unit that the column's head has."""
+    return format_amount(cost, fmean(one.amount(cost) for one in rounds if one)).removesuffix(f" {cost}")
+
+
+def _rates(found: Sequence[Proportion]) -> str:
+    if len(found) == 1:
+        return str(found[0])
+    return f"{format_percent(fmean(one.rate for one in found))} ({', '.join(f'{100 * one.rate:.1f}' for one in found)})"

@@ -18,7 +18,7 @@ import numpy as np
 
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion, format_percent
 from manip_il.evaluation.results import EpisodeResult
-from manip_il.evaluation.rounds import COSTS, Cost, History, has_unqueried_steps
+from manip_il.evaluation.rounds import COSTS, Cost, History, has_unlabelled_steps
 from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, EXPERT
 
 INK, SOFT, RULE = "#1d2126", "#5b636d", "#e3e5e8"
@@ -154,7 +154,7 @@ def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple
     rounds = [one for curve in curves for run in curve.runs for one in run]
     lowest = min([one.validation.interval[0] for one in rounds] + ([] if target is None else [target]))
     floor = math.floor(10 * lowest) * 10 if lowest > 0.5 else 0  # unlike bars, points may start above 0
-    queried = not any(has_unqueried_steps(run) for curve in curves for run in curve.runs)
+    queried = not any(has_unlabelled_steps(run) for curve in curves for run in curve.runs)
     figures: list[Figure] = []
     for cost in COSTS:
         if not any(cost in curve.costs for curve in curves) or (cost == "steps" and queried):

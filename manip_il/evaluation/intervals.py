@@ -161,16 +161,9 @@ class PairedComparison:
     @property
     def verdict(self) -> str:
         """One sentence with the difference, its interval and p."""
-        numbers = (
-            f"{format_points(self.difference, self.interval)}, McNemar's exact {format_p(self.p_value)}, "
-            f"{self.n:,} paired episodes"
-        )
-        if self.significant:
-            better, worse = (self.right, self.left) if self.difference > 0 else (self.left, self.right)
-            return f"{better} beats {worse}: {numbers}."
-        if self.only_left == self.only_right == 0:
-            return f"{self.right} and {self.left} succeeded in exactly the same episodes: {numbers}."
-        return f"No difference shown between {self.right} and {self.left}: {numbers}."
+        tested = f"{format_p(self.p_value)}, {self.n:,} paired episodes"
+        names = self.left, self.right
+        return difference_verdict(names, self.difference, self.interval, tested, significant=self.significant)
 
 
 def compare_paired(
@@ -196,6 +189,22 @@ def sign_flip_exact(differences: Sequence[int]) -> float:
     total, observed = len(ways) - 1, abs(sum(differences))
     # Whole numbers divided once: exact at any count.
     return sum(count for place, count in enumerate(ways) if abs(2 * place - total) >= observed) / sum(ways)
+
+
+def difference_verdict(
+    names: tuple[str, str], difference: float, interval: tuple[float, float], tested: str, *, significant: bool
+) -> str:
+    """Return in a sentence which of two, left and right, is better, or that nothing shows it.
+
+    difference: right minus left. tested: p, and what it rests on.
+    """
+    left, right = names
+    if not significant:
+        points = format_points(difference, interval)
+        return f"No difference shown between {right} and {left}: {points}, {tested}."
+    better, worse, sign = (left, right, -1) if difference < 0 else (right, left, 1)
+    low, high = sorted(100 * sign * end for end in interval)
+    return f"{better} is better than {worse} by {100 * abs(difference):.1f} points [{low:.1f}, {high:.1f}], {tested}."
 
 
 def format_p(p: float) -> str:

@@ -213,8 +213,8 @@ class EvalResult:
         """
         return cls(
             policy=data["policy"],
-            # Names, not paths: a task's path would be code to run. A reward was a setting of its own once.
-            robot=checks.name("robot", data["robot"]),
+            robot=str(data["robot"]),
+            # No path, which would be code to run. A reward was a setting of its own once.
             task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),

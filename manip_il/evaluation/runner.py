@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,11 +17,10 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.fingerprint import canonical_json
 from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.policy_files import policy_cameras, policy_sha256
 from manip_il.mdp import F64, Episode, State
@@ -39,7 +37,7 @@ _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
 CHECK_EVERY = 100  # episodes after which the width of the interval is checked
 EPISODES_FILE = "episodes.jsonl"
-FOLDER = "evaluations"  # of trials
+FOLDER = "evaluations"  # of several policies
 _world = lru_cache(SCENES_KEPT)(World)
 
 
@@ -166,53 +164,62 @@ def _positions(env: EnvConfig, state: State) -> dict[str, F64]:
     return found
 
 
-@dataclass(frozen=True)
-class EpisodeJournal:
-    """Episodes of an evaluation as they end: first a line of what they have in common, then a line for each.
+def measure(
+    engine: Engine,
+    job: RolloutJob,
+    seeds: Sequence[int],
+    name: str,
+    folder: Path,
+    progress: Progress,
+    *,
+    suite: str = NOMINAL.name,
+    until_width: float | None = None,
+) -> EvalResult:
+    """Return the evaluation of a job that lies in `folder`, and run what is missing; every episode is kept as it ends.
 
-    done: seed -> result of those that were there when it was opened.
+    Raises what `finished_episodes` raises.
     """
+    done = finished_episodes(folder, job, suite)
 
-    path: Path
-    done: Mapping[int, EpisodeResult] = field(default_factory=dict[int, EpisodeResult])
+    def keep(result: EpisodeResult) -> None:
+        append_line(folder / EPISODES_FILE, result.to_json())
+        progress.episode(result)
 
-    @classmethod
-    def open(cls, folder: Path, job: RolloutJob, suite: str) -> EpisodeJournal:
-        """Return the journal in `folder`, begun if there is none. A last line that a kill cut short is dropped.
+    if missing := len(set(seeds) - done.keys()):
+        progress.start(f"evaluate {name}{'' if suite == NOMINAL.name else f', {suite}'}", missing)
+    result = evaluate(engine, job, seeds, name, keep, suite=suite, done=done, until_width=until_width)
+    progress.close()
+    result.write(folder / FILE_NAME)
+    return result
 
-        Raises `MismatchError` if its episodes are those of another policy, environment or version of this program,
-        `ManipError` for a line that is not an episode.
-        """
-        path = folder / EPISODES_FILE
-        common: dict[str, Any] = {
-            "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
-            "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
-            "settings": EvalSettings.of(job, suite).to_json(),
-        }
-        try:
-            records = read_lines(path)
-            results = [EpisodeResult.from_json(record) for record in records[1:]]
-        except (KeyError, TypeError, ValueError, ManipError) as error:
-            raise ManipError(
-                f"{path}: a line that is not an episode ({error}); start again with --overwrite=true"
-            ) from error
-        if not records:
-            append_line(path, common)
-            return cls(path)
-        for key, now in common.items():
-            if (before := records[0].get(key)) != now:
-                what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
-                raise MismatchError(what, "then", before, "now", now)
-        return cls(path, {result.seed: result for result in results})
 
-    def keep(self, on_result: Callable[[EpisodeResult], object]) -> Callable[[EpisodeResult], None]:
-        """Return a callback that appends a result at once, and hands it on."""
+def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, EpisodeResult]:
+    """Return seed -> result of the episodes in `folder`; begin their file, whose first line is what all have in common.
 
-        def add(result: EpisodeResult) -> None:
-            append_line(self.path, result.to_json())
-            on_result(result)
-
-        return add
+    Raises `MismatchError` if they are those of another policy, environment or version of this program, `ManipError` for
+    a line that is not an episode.
+    """
+    path = folder / EPISODES_FILE
+    common: dict[str, Any] = {
+        "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
+        "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
+        "settings": EvalSettings.of(job, suite).to_json(),
+    }
+    try:
+        records = read_lines(path)
+        results = [EpisodeResult.from_json(record) for record in records[1:]]
+    except (KeyError, TypeError, ValueError, ManipError) as error:
+        raise ManipError(
+            f"{path}: a line that is not an episode ({error}); start again with --overwrite=true"
+        ) from error
+    if not records:
+        append_line(path, common)
+        return {}
+    for key, now in common.items():
+        if (before := records[0].get(key)) != now:
+            what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
+            raise MismatchError(what, "then", before, "now", now)
+    return {result.seed: result for result in results}
 
 
 def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
@@ -246,36 +253,6 @@ class Trial:
         driver = ExpertDriver() if policy is None else PolicyDriver((policy,), trust=self.trust)
         return RolloutJob(self.env, driver, episode_hold(self.env), label="last", conditions=self.conditions)
 
-    def file(self, folder: Path, policy: Path | None) -> Path:
-        """Return the file of a policy's or the expert's evaluation, named after its files, environment and episodes.
-
-        So another policy of the same name is another file, and what was measured before stays true.
-        """
-        settings = EvalSettings.of(self.job(policy), self.suite).to_json()
-        sha256 = policy and policy_sha256(policy)
-        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), settings, sha256)
-        return folder / FOLDER / f"{hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]}.json"
-
-    def measure(
-        self,
-        policy: Path | None,
-        name: str,
-        file: Path,
-        engine: Engine,
-        progress: Progress,
-        *,
-        complete: bool = True,
-    ) -> EvalResult:
-        """Return the evaluation of a policy from its file, which is made first if it is not there.
-
-        name: in progress and results. complete: raise `ManipError` if workers died of a seed, which leaves it out.
-        """
-        if not file.is_file():
-            progress.start(f"test {name}{'' if self.suite == 'nominal' else ', ' + self.suite}", len(self.seeds))
-            result = evaluate(engine, self.job(policy), self.seeds, name, progress.episode, suite=self.suite)
-            progress.close()
-            if complete and len(result.episodes) < len(self.seeds):
-                have = f"{len(result.episodes)} of {len(self.seeds)}"
-                raise ManipError(f"{name} has {have} test episodes, because workers died")
-            result.write(file)
-        return EvalResult.read(file)
+    def measure(self, policy: Path | None, name: str, folder: Path, engine: Engine, progress: Progress) -> EvalResult:
+        """Return the evaluation of a policy, or of the expert, in `folder`, see `measure`."""
+        return measure(engine, self.job(policy), self.seeds, name, folder, progress, suite=self.suite)

@@ -12,7 +12,7 @@ from manip_il.cli.dagger import learning_curve
 from manip_il.cli.main import main
 from manip_il.evaluation.arm import read_arm
 
-from .made_runs import ENV, OPTIONS, make_eval, make_run, mark
+from .made_runs import ENV, make_eval, make_run, mark
 
 GOOD, BAD = [True] * 19 + [False], [True] * 8 + [False] * 12
 SIZES = ("--eval.n_episodes=2", "--workers=1")
@@ -26,13 +26,22 @@ def result(folder: Path = Path("runs/compare")) -> dict:
     return json.loads((folder / "compare.json").read_text())
 
 
+def against(right: str = "b") -> dict:
+    return result()["arms"][right]["against_baseline"]
+
+
+def chosen() -> list[int]:
+    """The round of each side's first run."""
+    return [arm["training_seeds"][0]["chosen"]["round"] for arm in result()["arms"].values()]
+
+
 def test_two_evaluations_are_compared_as_they_are(here, capsys, evaluated):
     make_eval(here / "a" / "eval.json", BAD)
     make_eval(here / "b" / "eval.json", GOOD)
     assert compare("a/eval.json", "b") == 0
     out = capsys.readouterr().out
     assert "b is better than a/eval.json by 55.0 points [" in out
-    data = result()
+    data = against()
     assert (data["n_episodes"], data["only_left"], data["only_right"]) == (20, 0, 11)
     assert data["p_value"] == pytest.approx(2 / 2**11)
     assert evaluated == []
@@ -42,18 +51,17 @@ def test_of_a_run_the_rule_takes_the_round(here, policy, capsys):
     make_run(here / "a", policy)
     make_run(here / "b", policy, successes=(0.2, 0.6, 0.4, 0.9), labels=60)
     assert compare("a", "b", *SIZES, "--at=labels", "--checkpoint=last") == 0
-    pair = result()["training_seeds"][0]
     assert result()["rule"] == {"checkpoint": "last", "at": "labels", "limit": 240}
-    assert [pair[side]["chosen"]["round"] for side in ("left", "right")] == [1, 3]
-    assert pair["right"]["policy"] == "b/round_003/policy/checkpoints/last/pretrained_model"
-    assert pair["left"]["n_episodes"] == 2
+    assert chosen() == [1, 3]
+    [right] = result()["arms"]["b"]["training_seeds"]
+    assert right["policy"] == "b/round_003/policy/checkpoints/last/pretrained_model"
+    assert right["n_episodes"] == 2
     assert result()["test_seeds"] == [4_000_000, 4_000_001]
     out = capsys.readouterr().out
     assert "within 240 labels" in out
     assert "No difference shown between b and a: +0.0 points" in out
     assert compare("a", "b", *SIZES, "--overwrite=true") == 0
-    pair = result()["training_seeds"][0]
-    assert [pair[side]["chosen"]["round"] for side in ("left", "right")] == [1, 3]
+    assert chosen() == [1, 3]
 
 
 def test_what_is_measured_is_not_measured_again_unless_the_policy_is_another(here, policy, evaluated, capsys, error):
@@ -79,16 +87,16 @@ def test_training_seeds_are_matched_by_number(here, policy, capsys):
     for seed in (1, 0):
         make_run(here / "b" / f"seed_{seed}", policy, seed)
     assert compare("a", "b", *SIZES) == 0
-    assert "on average over 2 training seeds" in capsys.readouterr().out
-    assert [pair["left_seed"] for pair in result()["training_seeds"]] == [0, 1]
-    assert [pair["right"]["name"] for pair in result()["training_seeds"]] == ["b/seed_0", "b/seed_1"]
+    assert "on each of 2 training seeds" in capsys.readouterr().out
+    members = result()["arms"]["b"]["training_seeds"]
+    assert [(one["seed"], one["name"]) for one in members] == [(0, "b/seed_0"), (1, "b/seed_1")]
 
 
 def test_a_policy_meets_a_run_in_the_runs_environment(here, policy, evaluated):
     make_run(here / "a", policy)
     shutil.copytree(policy, here / "p")
     assert compare("p", "a", *SIZES) == 0
-    assert result()["settings"]["horizon"] == ENV.horizon
+    assert result()["arms"]["p"]["settings"]["horizon"] == ENV.horizon
     assert compare("p", "a", *SIZES, "--overwrite=true", "--seed=1") == 0
     assert result()["test_seeds"][0] == 114_000_000
     assert evaluated == ["p", "a"] * 2
@@ -108,20 +116,13 @@ def test_what_was_not_finite_in_a_fit_is_no_matter(here, policy):
     assert source.policy == here / "fit" / "checkpoints" / "last" / "pretrained_model"
 
 
-def test_a_run_that_is_not_finished_is_said_to_be_so(here, policy, capsys):
-    make_run(here / "a", policy)
-    shutil.rmtree(make_run(here / "b", policy) / "best")
-    assert compare("a", "b", *SIZES) == 0
-    assert "warning: b is not finished: its 3 rounds count" in capsys.readouterr().err
-
-
 def sides(here: Path, policy: Path) -> None:
     """What the bad input below names."""
     make_run(here / "run", policy)
     make_run(here / "seeds" / "seed_0", policy, 0)
     for seed in (5, 6):
         make_run(here / "other_seeds" / f"seed_{seed}", policy, seed)
-    make_run(here / "named_wrong" / "seed_3", policy, 4)
+    make_run(here / "big", policy, labels=1000)
     shutil.copytree(policy, here / "policy")
     make_eval(here / "two" / "eval.json", [True, False])
     make_eval(here / "three" / "eval.json", [True, False, True])
@@ -129,8 +130,6 @@ def sides(here: Path, policy: Path) -> None:
     make_eval(here / "lift" / "eval.json", [True, False], task="lift")
     (here / "broken.json").write_text("{")
     (here / "empty").mkdir()
-    make_run(here / "fresh", policy)
-    (here / "fresh" / "metrics.jsonl").unlink()
 
 
 @pytest.mark.parametrize(
@@ -139,11 +138,9 @@ def sides(here: Path, policy: Path) -> None:
         (["empty", "run"], 2, "empty holds nothing to compare"),
         (["broken.json", "two"], 1, "broken.json is not valid JSON"),
         (["run", "run"], 2, "compared with itself"),
-        (["fresh", "run"], 1, "fresh has no finished round yet"),
-        (["run", "other_seeds"], 2, "training seeds differ: run has [0], other_seeds [5, 6]"),
-        (["named_wrong", "seeds"], 1, "training seed differs"),
+        (["run", "other_seeds"], 2, "training seeds differ: run has [None], other_seeds [5, 6]"),
         (["run", "policy", "--at=label"], 2, "did you mean 'labels'?"),
-        (["run", "seeds/seed_0", "--at=labels:50"], 2, "run has no round within 50 labels; its first took 100 labels"),
+        (["run", "big", "--at=labels"], 2, "the first round of big took 1,000 labels, another run had 300 labels"),
         (["two", "three"], 1, "two has 2, three 3, of which 2 are the same"),
         (["two", "long"], 1, "horizon differs: two has 8, long has 100"),
         (["two", "lift"], 1, "task differs: two has reach, lift has lift"),
@@ -162,9 +159,9 @@ def test_bad_input_is_one_line_before_any_episode(words, code, line, here, polic
 def test_runs_of_other_environments_are_refused_by_name(here, policy, error):
     make_run(here / "a", policy)
     make_run(here / "b", policy)
-    config = here / "b" / "config.yaml"
-    config.write_text(config.read_text().replace("tolerance: 0.0\n", "tolerance: 0.03\n"))
+    file = here / "b" / "round_000" / "eval.json"
+    file.write_text(file.read_text().replace('"tolerance": 0.02', '"tolerance": 0.03'))
     assert compare("a", "b", *SIZES) == 1
     assert "tolerance differs: a has 0.02, b has 0.03" in error()
-    assert ENV.tolerance == 0.02, "reach's own, as the run gives none"
-    assert "tolerance" not in OPTIONS.env
+    assert compare("a", "b", *SIZES, "--env.tolerance=0.04") == 0
+    assert result()["arms"]["b"]["settings"]["tolerance"] == 0.04

@@ -11,8 +11,7 @@ import pytest
 
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import main
-from manip_il.cli.study import expert_trials
-from manip_il.cli.study_file import read_plan
+from manip_il.cli.study import expert_trials, read_plan
 from manip_il.errors import MismatchError
 
 from .made_runs import make_run
@@ -89,8 +88,8 @@ def test_the_answer_is_printed_and_written(here, runs, capsys):
     assert study() == 0
     out = capsys.readouterr().out
     assert "No difference shown between dagger and cloning: +0.0 points" in out
-    assert "within 300 labels (the most that every run reached)" in out
-    data = json.loads((here / "s" / "study.json").read_text())
+    assert "within 300 labels, the most that every run reached" in out
+    data = json.loads((here / "s" / "compare.json").read_text())
     assert data["baseline"] == "cloning"
     assert data["rule"] == {"checkpoint": "best", "at": "labels", "limit": 300}
     first = data["arms"]["dagger"]["training_seeds"][0]
@@ -98,7 +97,6 @@ def test_the_answer_is_printed_and_written(here, runs, capsys):
     assert data["arms"]["cloning"]["training_seeds"][1]["first_at_target"] is None
     page = (here / "s" / "report.html").read_text()
     assert page.count('alt="Validation success over') == 3
-    assert "dagger, training seed 1, collect and fit" in page
 
 
 def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated):
@@ -115,15 +113,6 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 
-def test_a_run_that_never_gets_to_the_rules_amount_ends_the_study_at_once(here, runs, error):
-    (here / "x.yaml").write_text(FILE.replace("at: labels", "at: labels:900"))
-    assert study() == 2
-    assert "--at=labels:900: not every run got that far, one ended at 300 labels" in error()
-    assert study("--resume=true") == 2
-    assert "--at=labels:900: not every run got that far" in error()
-    assert len(runs) == 1
-
-
 @pytest.mark.parametrize(
     ("before", "after", "name"),
     [
@@ -138,7 +127,7 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
     (here / "x.yaml").write_text(FILE.replace(before, after))
     capsys.readouterr()
     assert study("--resume=true") == 1
-    assert f"{name} differs: s/study.yaml has another" in error()
+    assert f"--{name} differs: s/config.yaml has" in error()
     assert len(runs) == 4
 
 
@@ -146,16 +135,19 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
     ("before", "after", "words"),
     [
         ("training_seeds:", "trainig_seeds:", "did you mean 'training_seeds'?"),
-        ("method: cloning", "metod: cloning", "x.yaml: arms.cloning: 'metod' (did you mean 'method'?)"),
+        (
+            "method: cloning",
+            "metod: cloning",
+            "x.yaml: arm 'cloning': unknown key in its options: 'metod'",
+        ),
         ("rounds: 2", "rounds: -1", "x.yaml: arm 'cloning': rounds is -1"),
-        ("rounds: 2", "seed: 2", "x.yaml: common: seed is set by the study itself"),
-        ("dagger:\n", "dagger: 3\n", "arms.dagger: expected a mapping"),
+        ("rounds: 2", "seed: 2", "x.yaml: arm 'cloning': seed is set by the study itself"),
+        ("dagger:\n", "dagger: 3\n", "arm 'dagger': its options: expected a mapping"),
         ("  dagger:", "  ../dagger:", "its name, which becomes a folder, is '../dagger'"),
         ("target: 0.6", "baseline: clonning", "did you mean 'cloning'?"),
         ("at: labels", "at: label", "did you mean 'labels'?"),
-        ("method: cloning", "env.horizon: 9", "horizon differs: arm 'cloning' has 9, arm 'dagger' has 8"),
+        ("method: cloning", "env.horizon: 9", "horizon differs: cloning has 9, dagger has 8"),
         ("at: labels", "expert: {a: 3}", "x.yaml: expert.a: expected a mapping of options, got 3"),
-        ("at: labels", "expert: {a: {vary: [object], suite: all}}", "has suite and vary; expected one of them"),
         ("at: labels", "expert: {a: {vary: [objects]}}", "did you mean 'object'?"),
         (FILE, "", "arms is empty"),
         (FILE, "- 1", "expected a mapping"),
@@ -184,7 +176,7 @@ def test_arms_of_different_tasks_have_no_baseline_and_each_its_own_environment(h
     assert plan.baseline is None
     assert [env.task for env in plan.envs.values()] == ["reach", "lift"]
     (here / "x.yaml").write_text(text + "baseline: lift\n")
-    with pytest.raises(MismatchError, match="task differs: arm 'cloning' has reach, arm 'lift' has lift"):
+    with pytest.raises(MismatchError, match="task differs: cloning has reach, lift has lift"):
         read_plan(here / "x.yaml", None)
 
 
@@ -199,11 +191,10 @@ def test_the_expert_is_tested_where_a_test_changes_something(here):
     noise = trials["lift"]["noise"]
     assert (noise.env.robot, noise.env.task, len(noise.seeds)) == ("fetch", "lift", 500)
     assert noise.conditions[0].ranges == {"random_actions": (0.1, 0.1)}
-    assert trials["cloning"]["own"].file(here, None) != trials["lift"]["own"].file(here, None)
 
 
 @pytest.mark.slow
-def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys, error):
+def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path):
     (tmp_path / "x.yaml").write_text(TINY)
     words = ["compare", str(tmp_path / "x.yaml"), "--workers=1"]
     process = start(*words, f"--output_dir={tmp_path / 'cut'}", log=tmp_path / "log")
@@ -217,19 +208,16 @@ def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys, erro
     assert (tmp_path / "cut" / "cloning" / "seed_0" / "metrics.jsonl").read_bytes() == done
     assert main([*words, f"--output_dir={tmp_path / 'whole'}"]) == 0
     assert answer(tmp_path / "cut") == answer(tmp_path / "whole")
-    capsys.readouterr()
     left, right = tmp_path / "cut" / "cloning", tmp_path / "whole" / "dagger"
-    compared = ["compare", str(left), str(right), "--eval.n_episodes=4", "--workers=1", "--at=seconds:9999"]
-    assert main([*compared, f"--output_dir={tmp_path / 'c'}"]) == 2
-    assert "not every run got that far" in error()
-    assert main([*compared[:-1], f"--output_dir={tmp_path / 'c'}"]) == 0
-    assert json.loads((tmp_path / "c" / "compare.json").read_text())["n_episodes"] == 4
+    compared = ["compare", str(left), str(right), "--eval.n_episodes=4", "--workers=1"]
+    assert main([*compared, f"--output_dir={tmp_path / 'c'}"]) == 0
+    assert (tmp_path / "c" / "report.html").is_file()
 
 
 def answer(folder: Path):
     """What a study found, without times and places."""
-    data = json.loads((folder / "study.json").read_text())
-    gone = ("seconds", "validating_seconds", "name", "policy", "evaluation")
+    data = json.loads((folder / "compare.json").read_text())
+    gone = ("seconds", "name", "policy")
 
     def strip(value):
         if isinstance(value, dict):

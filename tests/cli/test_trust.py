@@ -14,7 +14,7 @@ from manip_il.cli.inputs import find_policy
 from manip_il.cli.main import load, main
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import dump_yaml, parse
-from manip_il.cli.study_file import read_plan
+from manip_il.cli.study import read_plan
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from manip_il.evaluation.arm import Arm, Member
-from manip_il.evaluation.comparison import Comparison
+from manip_il.evaluation.comparison import Study
 from manip_il.evaluation.film import encode_jpeg, encode_mp4
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
@@ -57,9 +57,13 @@ def without_detail(result: EvalResult) -> EvalResult:
     return replace(result, episodes=tuple(replace(e, detail={}, phase_at_end="") for e in result.episodes))
 
 
-def made_comparison(left: Fails, right: Fails, seeds: int = 1) -> Comparison:
+def made_pair(left: Fails, right: Fails, seeds: int = 1) -> Study:
     """Two runs; with several training seeds each seed's policy fails in the same episodes."""
-    return Comparison(_arm("runs/cloning", left, seeds, (0.3, 0.5, 0.6)), _arm("runs/dagger", right, seeds, (0.5, 0.9)))
+    arms = (
+        _arm("runs/cloning", left, seeds, (0.3, 0.5, 0.6)),
+        _arm("runs/dagger", right, seeds, (0.5, 0.9)),
+    )
+    return Study(arms, "runs/cloning")
 
 
 def small_film(number: int) -> Film:
@@ -77,8 +81,7 @@ def _arm(name: str, fails: Fails, seeds: int, successes: tuple[float, ...]) -> A
 
 
 def _member(name: str, seed: int, result: EvalResult, run: History) -> Member:
-    path, chosen = Path(name) / f"seed_{seed}", Rule().select(run, None, name)
-    return Member(path, seed, Path("p"), run, chosen=chosen, result=result, file=Path("e.json"))
+    return Member(Path(name) / f"seed_{seed}", seed, run, Path("p"), Rule().select(run, name), result)
 
 
 def _detail(rng: np.random.Generator, condition: str) -> dict[str, Any]:

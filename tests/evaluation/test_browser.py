@@ -11,23 +11,23 @@ import pytest
 from playwright.sync_api import Browser
 
 from manip_il.evaluation.certificate import certificate_report
-from manip_il.evaluation.compare_report import compare_report, study_report
+from manip_il.evaluation.compare_report import compare_report
 from manip_il.evaluation.eval_report import eval_report, run_report
 from manip_il.evaluation.figures import Curve
 from manip_il.evaluation.report import Report
 from manip_il.evaluation.tables import CLONING, PolicyRow
 
 from .browser import HEIGHT, Opened, chromium, opened
-from .made_evals import far_corner, made_comparison, made_eval, small_film
+from .made_evals import far_corner, made_eval, made_pair, small_film
 from .test_certificate import ACTIONS, certificate, row
+from .test_comparison import STUDY
 from .test_rounds import RUN
-from .test_study import STUDY
 
 pytestmark = pytest.mark.slow
 
 CURVE = Curve("DAgger", (RUN,))
 RESULT = made_eval("runs/a_policy_with_a_name_that_is_rather_long/round_004/policy/pretrained_model", n=200)
-COMPARISON = made_comparison(far_corner, lambda number, _: number % 37 == 0, seeds=2)
+PAIR = made_pair(far_corner, lambda number, _: number % 37 == 0, seeds=2)
 PLAY = """async (video) => {
     await video.play();
     for (let tries = 0; tries < 100 && video.currentTime < 0.2; tries++) await new Promise(go => setTimeout(go, 50));
@@ -66,9 +66,9 @@ def demo_case() -> Case:
 
 CASES = {
     "eval": eval_case,
-    "compare": lambda: Case(compare_report(COMPARISON, "manip-il compare a b")),
+    "compare": lambda: Case(compare_report(PAIR, "a against b", "manip-il compare a b")),
     "demo": demo_case,
-    "study": lambda: Case(study_report(STUDY, "Study", "manip-il compare x.yaml")),
+    "study": lambda: Case(compare_report(STUDY, "Study", "manip-il compare x.yaml")),
     "certify": lambda: Case(certificate_report(certificate(row("action", ACTIONS)), "manip-il robot certify", {})),
 }
 

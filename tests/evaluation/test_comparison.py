@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.arm import Arm, Member
-from manip_il.evaluation.compare_report import comparison_table
-from manip_il.evaluation.comparison import Comparison
+from manip_il.evaluation.arm import Arm, Member, require_pair
+from manip_il.evaluation.comparison import Comparison, Study
 from manip_il.evaluation.intervals import compare_paired
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, write_json
-from manip_il.evaluation.rounds import history
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.rounds import Rule, history
 
 from .test_rounds import records
 
@@ -25,7 +24,7 @@ HARD = [True] * 50 + [False] * 50
 def made_member(outcomes: list[bool], seed: int | None = None, name: str = "p", **changes) -> Member:
     episodes = tuple(EpisodeResult(4_000_000 + i, good, good, 10, 0.0) for i, good in enumerate(outcomes))
     result = EvalResult(name, "panda", "reach", {"mujoco": "3.11.0"}, episodes, SETTINGS)
-    return Member(Path(name), seed, result=replace(result, **changes), file=Path("e.json"))
+    return Member(Path(name), seed, result=replace(result, **changes))
 
 
 def arm(name: str, *outcomes: list[bool]) -> Arm:
@@ -55,8 +54,7 @@ def test_over_training_seeds_the_mean_difference_has_students_interval():
     better = Comparison(arm("A", HARD, HARD, HARD), arm("B", EASY, EASY[1:] + [True], EASY[:-1] + [False]))
     assert [pair.difference for pair in better.pairs] == pytest.approx([0.3, 0.31 - 0.01, 0.3])
     assert better.significant
-    assert "on average over 3 training seeds (ahead in 3 of 3)" in better.verdict
-    assert "100 paired episodes on each of 3 training seeds" in better.verdict
+    assert "100 paired episodes on each of 3 training seeds, ahead in 3" in better.verdict
 
 
 def test_these_policies_may_differ_where_training_seeds_do_not_show_it():
@@ -65,8 +63,7 @@ def test_these_policies_may_differ_where_training_seeds_do_not_show_it():
     assert comparison.p_value < 0.001
     assert low < 0 < high
     assert not comparison.significant
-    assert comparison.verdict.startswith("These policies of B are better than those of A (p < 0.001")
-    assert "do not show that others would be: 16.0 points" in comparison.verdict
+    assert comparison.verdict.startswith("No difference shown between B and A: +16.0 points [")
 
 
 def test_two_equal_differences_alone_are_no_proof():
@@ -96,7 +93,7 @@ def test_random_arms_of_one_quality_are_seldom_called_different():
 
 def test_what_is_not_paired_is_refused():
     with pytest.raises(UsageError, match=r"training seeds differ: A has \[0, 1\], B \[0, 1, 2\]"):
-        Comparison(arm("A", HARD, HARD), arm("B", HARD, HARD, HARD))
+        require_pair(arm("A", HARD, HARD), arm("B", HARD, HARD, HARD))
     with pytest.raises(ManipError, match=r"test episodes differ: A has 100, B 50, of which 50 are the same"):
         Comparison(one("A", HARD), one("B", HARD[:50]))
     with pytest.raises(MismatchError, match=r"robot differs: A has panda, B has fetch"):
@@ -105,23 +102,85 @@ def test_what_is_not_paired_is_refused():
         Comparison(one("A", HARD), Arm("B", (made_member(HARD, settings=EvalSettings(100, 0.05)),)))
 
 
-def test_compare_json_holds_what_the_verdict_rests_on(tmp_path: Path):
-    comparison = Comparison(arm("A", HARD, HARD), arm("B", EASY, EASY[:-1] + [True]))
-    write_json(tmp_path / "new" / "compare.json", comparison.file_json())
-    data = json.loads((tmp_path / "new" / "compare.json").read_text())
-    assert data["difference"] == pytest.approx(0.305)
-    assert data["interval"] == pytest.approx(list(comparison.interval))
-    assert (data["only_left"], data["only_right"]) == (0, 61)
+def member(name: str, seed: int, outcomes: list[bool], successes: tuple[float, ...], labels: int = 100) -> Member:
+    run = history(records(successes, labels), name)
+    made = made_member(outcomes, seed, f"runs/s/{name}/seed_{seed}")
+    return replace(made, chosen=Rule().select(run, name), history=run, policy=Path("p"))
+
+
+SLOW, FAST = (0.3, 0.5, 0.9, 0.8), (0.5, 0.9, 0.9, 1.0)
+STUDY = Study(
+    tuple(
+        Arm(name, tuple(member(name, seed, outcomes, successes, labels) for seed in range(2)))
+        for name, outcomes, successes, labels in (
+            ("cloning", HARD, SLOW, 100),
+            ("dagger", EASY, FAST, 100),
+            ("dart", HARD[:-1] + [True], SLOW, 300),
+        )
+    ),
+    "cloning",
+    target=0.9,
+)
+
+
+def row(study: Study, name: str, which: str = "results_table") -> dict[str, str]:
+    table = getattr(study, which)()
+    return next(dict(zip(table.columns, row, strict=True)) for row in table.rows if row[0] == name)
+
+
+def test_the_headline_names_the_best_or_which_of_two_is_better():
+    rates = "dagger solves 80.0 % of 100 unseen starts, the mean of 2 training seeds; dart 51.0 %, cloning 50.0 %."
+    assert STUDY.verdict == rates
+    two = replace(STUDY, arms=STUDY.arms[:2])
+    assert two.verdict == two.comparisons["dagger"].verdict
+
+
+def test_a_row_holds_what_the_arm_had_cost_and_how_it_did():
+    assert row(STUDY, "dagger") == {
+        "arm": "dagger",
+        "labels": "400",
+        "episodes": "12",
+        "wall-clock": "40.0 s",
+        "validation": "100.0 % (100.0, 100.0)",
+        "test": "80.0 % (80.0, 80.0)",
+        "test, against cloning": "+30.0 points [+30.0, +30.0], p < 0.001",
+        "largest dip [points]": "0.0",
+    }
+    assert row(STUDY, "cloning")["test, against cloning"] == ""
+    assert row(STUDY, "cloning")["largest dip [points]"] == "10.0"
+
+
+def test_the_target_is_told_in_every_cost_and_costs_within_amounts():
+    assert list(row(STUDY, "dagger", "target_table").values()) == ["dagger", "200", "6", "20.0 s"]
+    assert row(replace(STUDY, target=1.0), "cloning", "target_table")["labels to 100 %"] == "not in 2 of 2 seeds"
+    within = replace(STUDY, within=(("labels", 250), ("labels", 50)))
+    assert row(within, "dagger", "within_table") == {
+        "arm, validation": "dagger",
+        "within 250 labels": "90.0 % (90.0, 90.0)",
+        "within 50 labels": "",
+    }
+
+
+def test_compare_json_holds_every_round_and_what_the_verdict_rests_on():
+    data = json.loads(json.dumps(STUDY.to_json(), allow_nan=False))
+    dagger = data["arms"]["dagger"]
+    runs, against = dagger["training_seeds"], dagger["against_baseline"]
+    assert [run["seed"] for run in runs] == [0, 1]
+    assert [one["validation_success"] for one in runs[0]["rounds"]] == list(FAST)
+    assert (runs[0]["chosen"]["round"], runs[0]["first_at_target"]["labels"]) == (3, 200)
+    assert data["arms"]["cloning"]["against_baseline"] is None
+    assert against["difference"] == pytest.approx(0.3)
+    assert (against["only_left"], against["only_right"], against["both"]) == (0, 60, 100)
     assert data["test_seeds"] == [4_000_000, 4_000_099]
-    first = data["training_seeds"][0]
-    assert (first["left_seed"], first["both"], first["only_right"]) == (0, 50, 30)
-    assert first["left"]["success_rate"] == 0.5
 
 
-def test_the_table_says_what_the_chosen_round_had_cost():
-    run = history(records(), "x")
-    chosen = replace(made_member(EASY, 0, "B/seed_0"), chosen=run[2], history=run)
-    table = comparison_table(Comparison(arm("A", HARD), Arm("B", (chosen,))))
-    assert table.rows[1][:6] == ("B", "300", "9", "30.0 s", "80.0 % [49.0, 94.3]", "80.0 % [71.1, 86.7]")
-    assert table.rows[1][6].startswith("+30.0 points [")
-    assert table.rows[0][1:5] == ("",) * 4
+def test_tasks_are_not_compared_and_have_what_the_expert_solves_beside_them():
+    tests = {"expert": STUDY.arms[1].members[0].test, "fetch": STUDY.arms[0].members[0].test}
+    study = replace(STUDY, baseline=None, experts={"dagger": tests, "dart": {"fetch": tests["fetch"]}})
+    worst = "1 of 3 solve 80 % of their unseen starts; the last, cloning, solves 50.0 %."
+    assert replace(study, target=0.8).verdict == worst
+    assert study.comparisons == {}
+    assert {name: row(study, "dagger")[name] for name in tests} == {"expert": "80.0 %", "fetch": "50.0 %"}
+    assert [row(study, "dart")[name] for name in tests] == ["", "50.0 %"]
+    assert not any("against" in column for column in study.results_table().filled().columns)
+    assert study.to_json()["arms"]["dagger"]["expert"]["fetch"]["n_episodes"] == 100

@@ -185,15 +185,14 @@ def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_o
 def test_the_verdict_names_the_better_policy_and_its_margin():
     left, right = [True] * 60 + [False] * 40, [True] * 100
     verdict = compare_paired(left, right, ("BC", "DAgger")).verdict
-    assert verdict.startswith("DAgger beats BC: +40.0 points")
+    assert verdict.startswith("DAgger is better than BC by 40.0 points [")
     assert "p < 0.001" in verdict
-    assert compare_paired(right, left, ("DAgger", "BC")).verdict.startswith("DAgger beats BC: -40.0 points")
+    assert compare_paired(right, left, ("DAgger", "BC")).verdict == verdict
 
 
 def test_without_a_significant_difference_the_verdict_says_so():
     verdict = compare_paired([True, False, True], [True, True, True], ("BC", "DAgger")).verdict
     assert verdict.startswith("No difference shown between DAgger and BC")
-    assert "exactly the same episodes" in compare_paired([True, False], [True, False]).verdict
 
 
 def test_p_values_read_well():

@@ -125,7 +125,6 @@ def refusal(path: Path, text: str) -> str:
         (("settings", "conditions"), [{"name": "a", "knock": 10**400}]),
         (("settings",), None),
         (("task",), "tasks/mine.py"),
-        (("robot",), "../arm.yaml"),
         (("n_episodes",), "x" * 100_000),
     ],
 )

@@ -15,7 +15,7 @@ def records(successes: tuple[float, ...] = SUCCESS, labels: int = 100, seconds: 
         {
             "round": i,
             "labels": labels * (i + 1),
-            "queries": labels * (i + 1) + 5,
+            "steps": labels * (i + 1),
             "episodes": 3 * (i + 1),
             "validation_success": success,
             "validation_episodes": 10,
@@ -30,8 +30,7 @@ RUN = history(records(), "runs/x")
 
 def test_wall_clock_adds_up_without_validating():
     assert [one.seconds for one in RUN] == [10, 20, 30, 40, 50]
-    assert RUN[-1].validating == 500
-    assert (RUN[2].labels, RUN[2].queries, RUN[2].episodes) == (300, 305, 9)
+    assert (RUN[2].labels, RUN[2].steps, RUN[2].episodes) == (300, 300, 9)
     assert str(RUN[1].validation) == "90.0 % [59.6, 98.2]"
 
 
@@ -54,46 +53,26 @@ def test_lines_that_are_no_runs_are_refused_by_name(lines, words):
 
 
 def test_best_is_the_later_of_equals_and_last_is_last():
-    assert Rule("best").select(RUN, None, "x").round == 3
-    assert Rule("last").select(RUN, None, "x").round == 4
+    assert Rule("best").select(RUN, "x").round == 3
+    assert Rule("last").select(RUN, "x").round == 4
 
 
-@pytest.mark.parametrize(
-    ("at", "best", "last"), [("labels:450", 3, 3), ("labels:399", 1, 2), ("episodes:6", 1, 1), ("seconds:20", 1, 1)]
-)
-def test_rounds_count_up_to_the_amount(at: str, best: int, last: int):
-    for checkpoint, expected in (("best", best), ("last", last)):
-        rule = Rule.parse(checkpoint, at)
-        assert rule.select(RUN, rule.limit({"x": RUN}), "x").round == expected
-
-
-def test_without_an_amount_it_is_what_every_run_reached():
+def test_rounds_count_up_to_what_every_run_reached():
     shorter = history(records((0.1, 0.2, 0.3), labels=120, seconds=40), "y")
     both = {"x": RUN, "y": shorter}
-    amounts = {at: Rule.parse("last", at).limit(both) for at in ("end", "labels", "episodes", "seconds")}
-    assert amounts == {"end": None, "labels": 360, "episodes": 9, "seconds": 50}
-    rule = Rule.parse("last", "seconds")
-    assert [rule.select(run, 50, "x").round for run in (RUN, shorter)] == [4, 0]
+    rules = {at: Rule("last", at).limited(both) for at in ("end", "labels", "episodes", "seconds")}
+    limits = {at: rule.limit for at, rule in rules.items()}
+    assert limits == {"end": None, "labels": 360, "episodes": 9, "seconds": 50}
+    assert [rules["seconds"].select(run, "x").round for run in (RUN, shorter)] == [4, 0]
+    assert [rules["labels"].select(run, "x").round for run in (RUN, shorter)] == [2, 2]
 
 
-def test_an_amount_that_no_round_is_within_or_not_every_run_reached_is_refused():
-    rule = Rule.parse("best", "labels:99")
-    with pytest.raises(UsageError, match=r"runs/x has no round within 99 labels; its first took 100 labels"):
-        rule.select(RUN, rule.limit({"x": RUN}), "runs/x")
-    with pytest.raises(UsageError, match="one ended at 500 labels"):
-        Rule.parse("best", "labels:527").limit({"x": RUN})
-    assert Rule.parse("best", "labels:526").limit({"x": RUN}) == 526  # rounds do not end on the dot
-
-
-@pytest.mark.parametrize("at", ["end:5", "labels:", "labels:-1", "labels:nan", "seconds:many", "seconds:inf"])
-def test_an_amount_that_is_none_is_refused(at: str):
-    with pytest.raises(UsageError, match="labels:5000"):
-        Rule.parse("best", at)
-
-
-def test_an_unknown_way_is_answered_with_the_nearest():
-    with pytest.raises(UsageError, match="did you mean 'labels'"):
-        Rule.parse("best", "lables:3")
+def test_a_run_without_a_round_that_early_is_refused():
+    late = {"x": RUN, "late": history(records((0.1,), labels=900), "late")}
+    with pytest.raises(UsageError, match="the first round of late took 900 labels, another run had 500 labels"):
+        Rule("best", "labels").limited(late).select(late["late"], "late")
+    with pytest.raises(UsageError, match="y has no rounds"):
+        Rule("best", "labels").limited({"x": RUN, "y": ()})
 
 
 def test_a_dip_is_measured_from_the_best_before():
