@@ -96,7 +96,7 @@ def test_no_file_may_say_it_and_the_resolved_options_do_not(command, tmp_path):
 def test_a_study_trusts_for_its_runs_what_its_file_may_not(tmp_path):
     path = tmp_path / "s.yaml"
     path.write_text("arms: {a: {rounds: 1}, b: {trust: true}}\ntraining_seeds: 1\n")
-    with pytest.raises(UsageError, match=r"arms\.b: trust: this can only be set on the command line"):
+    with pytest.raises(UsageError, match=r"its options: trust: this can only be set on the command line"):
         read_plan(path, None)
     path.write_text("arms: {a: {rounds: 1}}\ntraining_seeds: 1\n")
     for trust in (False, True):
