@@ -38,11 +38,9 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mcap.importing import read_frames
 from manip_il.mcap.mapping import load_mapping
-from manip_il.robots.files import ModelFiles, _compile
 
 from .cli.made_runs import make_eval, make_policy
 from .pictures import encoded, with_cameras
-from .robots import own
 
 SAMPLE = Path(__file__).parents[1] / "datasets" / "sample"
 INPUTS = int(os.environ.get("FUZZ", "2000"))
@@ -182,7 +180,6 @@ TARGETS = {
     "journal": Target(make_dataset, "journals/*.mcap", lambda folder: read_journals(folder / "journals")),
     "mcap": Target(make_mcap, "in.mcap", read_mcap),
     "mapping": Target(make_mcap, "mapping.yaml", read_mcap, gated=False),
-    "model": Target(own.write, "own.xml", lambda folder: _compile("own", (ModelFiles(folder / "own.xml"),))),
     "policy": Target(make_policy, "config.json", read_policy, gated=False),
     "policy's own": Target(make_policy, "manip_il.json", read_policy, gated=False),
     "eval.json": Target(

@@ -1,4 +1,4 @@
-"""Files of a MuJoCo model: read, mended where the YAML says so, and tried in a child process if they are anyone's."""
+"""Files of a MuJoCo model, read, and mended where the YAML says so."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import mujoco
-import numpy as np
 
 from manip_il import checks
 from manip_il.errors import ManipError, UsageError
@@ -18,7 +17,6 @@ from manip_il.robots.reading import place
 KEYS = ("model", "includes", "meshes", "mend")  # of a YAML
 _MOST_MENDED = 10_000  # of a text that is mended [characters]
 _LARGEST = 16 * 1024**2  # of an MJCF [bytes], and of what it is mended to [characters]
-_LARGEST_NUMBER = 1e15  # of a model; dampings of 1e11 are in use
 
 
 @dataclass(frozen=True)
@@ -90,46 +88,3 @@ def _included(model: bytes, home: Path) -> set[str]:
     """The files that a model includes, and that those do."""
     found = {name.decode() for name in re.findall(rb"<include\s+file=\"([^\"]+)\"", model)}
     return found.union(*(_included((home / name).read_bytes(), home) for name in found))
-
-
-def try_models(robot: str, *models: ModelFiles) -> None:
-    """Compile models of a robot's for the first time, in a child process with limits of memory and time.
-
-    Raises `UsageError` if that fails, or if a number is not finite. robot: its name.
-    """
-    try:
-        checks.in_child(f"the model of robot {robot}", _compile, robot, models)
-    except ManipError as error:
-        raise UsageError(str(error)) from None
-
-
-def _compile(robot: str, models: tuple[ModelFiles, ...]) -> None:
-    for files in models:
-        try:
-            spec = files.load(robot)
-            _require_regular(robot, spec)
-            model = spec.compile()
-            mujoco.MjData(model)
-        except ValueError as error:
-            why = " ".join(str(error).split())
-            raise ManipError(f"robot {robot}: MuJoCo cannot compile {files.model}: {why}") from None
-        except RuntimeError:  # "unknown exception": an allocation beyond the limit
-            raise MemoryError from None
-        for name in sorted(dir(model), key=lambda name: name.endswith("0")):  # those last that follow from others
-            numbers = getattr(model, name)
-            if isinstance(numbers, np.ndarray) and numbers.dtype.kind == "f":
-                wrong = numbers[~(np.abs(numbers) <= _LARGEST_NUMBER)]
-                if wrong.size:
-                    raise ManipError(
-                        f"robot {robot}: {name} of {files.model} has {wrong[0]:g}; expected finite numbers up to "
-                        f"{_LARGEST_NUMBER:g}"
-                    )
-
-
-def _require_regular(robot: str, spec: mujoco.MjSpec) -> None:
-    """Raise `ManipError` for what a model names as a file and is a pipe, a socket or a device."""
-    for one in (*spec.meshes, *spec.textures, *spec.hfields, *spec.skins):
-        for folder in (spec.meshdir, spec.texturedir):
-            path = Path(spec.modelfiledir, folder, one.file)
-            if path.exists() and not path.is_file() and not path.is_dir():
-                raise ManipError(f"robot {robot}: {path} is not a regular file")

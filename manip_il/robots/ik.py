@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import daqp
 import mink
@@ -39,10 +40,17 @@ class ArmIK:
         self._site = model.site("ee").id
         self._costs = costs = robot.costs
         self._frame = mink.FrameTask("ee", "site", _POSITION_COST, costs.orientation, lm_damping=_LM_DAMPING)
-        self._frame.set_target(mink.SE3.identity())
-        assert self._frame.transform_target_to_world is not None
-        self._target = self._frame.transform_target_to_world.wxyz_xyz
-        self._program = _Program(self._configuration, costs.posture, home[: model.nv])
+        self._target = self._frame.transform_target_to_world = mink.SE3.identity()
+        posture = mink.PostureTask(model, costs.posture)  # else a label depends on the path that led to the posture
+        posture.set_target(home)
+        limit = mink.ConfigurationLimit(model)
+        self._tasks, self._bounded, self._gain = [self._frame, posture], limit.indices.astype(int), limit.gain
+        rows = np.eye(model.nv)[self._bounded]
+        self._rows, self._lower = np.vstack([rows, -rows]), np.full(2 * len(rows), -_UNBOUNDED)
+        self._ends, self._sense = (
+            (limit.lower[self._bounded], limit.upper[self._bounded]),
+            np.zeros(2 * len(rows), np.intc),
+        )
         joints = [model.joint(name) for name in robot.joints]
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
         data = self._configuration.data  # views of which each says what the posture is now
@@ -82,11 +90,15 @@ class ArmIK:
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
         """Return the displacement of `step` alone, (arm,) [rad]; weight: of the rotation, by default as upright."""
-        mujoco.mju_mat2Quat(self._target[:4], rotation.ravel())
-        self._target[4:] = position
+        mujoco.mju_mat2Quat(self._target.wxyz_xyz[:4], rotation.ravel())
+        self._target.wxyz_xyz[4:] = position
         self._frame.cost[3:] = self._costs.orientation if weight is None else weight
-        x = self._program.solve(self._frame)
-        if x is None:
+        program: Any = mink.build_ik(self._configuration, self._tasks, 1.0, _DAMPING, [])
+        q, (low, high) = self._qpos[self._bounded], self._ends
+        upper = self._gain * np.concatenate([high - q, q - low])
+        # DAQP itself: through qpsolvers, and with mink's limits, a label takes a half longer.
+        x, _, exit_flag, _ = daqp.solve(program.P, program.q, self._rows, upper, self._lower, self._sense)
+        if exit_flag <= 0:
             return None
         dq = x[self._address]
         longest = max(map(abs, dq.tolist()))
@@ -168,38 +180,3 @@ class ArmIK:
         cosine = (float(self._ee_flat.dot(rotation.ravel())) - 1) / 2
         angle = math.acos(min(1.0, max(-1.0, cosine)))
         return math.hypot(dx, dy, dz, weight * angle)
-
-
-class _Program:
-    """The quadratic program of mink's `build_ik`, bit for bit, in a third of its time.
-
-    What does not change from step to step is made once: the rows that draw the joints home, without which the label
-    depends on the path that led to the posture, and those of their limits. DAQP is called without qpsolvers.
-    """
-
-    def __init__(self, configuration: mink.Configuration, cost: float, home: F64):
-        limit, nv = mink.ConfigurationLimit(configuration.model), configuration.model.nv
-        self._configuration, self._q = configuration, configuration.data.qpos
-        at = limit.indices.astype(int)
-        self._matrix = np.vstack([np.eye(nv)[at], -np.eye(nv)[at]])
-        self._limited, self._signs, self._gain = np.tile(at, 2), np.repeat([-1.0, 1.0], len(at)), limit.gain
-        self._ends = np.concatenate([limit.upper[at], -limit.lower[at]])
-        self._lower = np.full(len(self._matrix), -_UNBOUNDED)
-        self._sense = np.zeros(len(self._matrix), dtype=np.intc)
-        self._cost, self._home = cost, home
-        self._rows, self._errors = np.vstack([np.zeros((6, nv)), cost * np.eye(nv)]), np.zeros(6 + nv)
-        self._transposed, self._homewards = self._rows.T, self._errors[6:]
-        self._hessian = np.zeros((nv, nv))
-        self._diagonal = self._hessian.reshape(-1)[:: nv + 1]
-
-    def solve(self, frame: mink.FrameTask) -> F64 | None:
-        """Return the joint displacement towards the frame's target, (nv,) [rad]; None where there is no solution."""
-        q, rows, errors = self._q, self._rows, self._errors
-        rows[:6], errors[:6], damping = frame.compute_qp_residual(self._configuration)
-        np.multiply(np.subtract(self._home, q, self._homewards), self._cost, self._homewards)
-        self._transposed.dot(rows, self._hessian)  # of few numbers faster than `@`
-        self._diagonal += _DAMPING + damping
-        upper = (self._ends + self._signs * q[self._limited]) * self._gain
-        gradient = -errors.dot(rows)
-        x, _, exit_flag, _ = daqp.solve(self._hessian, gradient, self._matrix, upper, self._lower, self._sense)
-        return x if exit_flag > 0 else None

@@ -14,6 +14,7 @@ from manip_il.errors import ManipError
 from manip_il.robots.files import KEYS, ModelFiles
 from manip_il.robots.reading import FURTHEST, names, numbers, tree_of
 
+TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 
 
@@ -103,6 +104,25 @@ class Workspace:
             for name in ("half_width", "height")
         )
         return cls(numbers(f"{what}.centre", tree["centre"], 2, FURTHEST), half_width, height)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Table of a scene: its lengths along x and y, and the height of its top over the floor [m]."""
+
+    size: tuple[float, ...] = (0.9, 1.2)
+    height: float = 0.4
+
+    @classmethod
+    def read(cls, what: str, tree: Any, space: Workspace) -> Self:
+        """Make it of what YAML holds; `ManipError` names what is wrong: a table smaller than the workspace, too."""
+        tree = tree_of(what, tree, cls)
+        size = numbers(f"{what}.size", tree.get("size", cls.size), 2, FURTHEST, 0.05)
+        if min(size[0] / 2 - TABLE_BEYOND, size[1] / 2) < space.half_width:
+            wide = 2 * space.half_width
+            least = f"{wide + 2 * TABLE_BEYOND:g} by {wide:g} m"
+            raise ManipError(f"{what}.size is {list(size)}; expected at least {least} for the workspace")
+        return cls(size, checks.number(f"{what}.height", tree.get("height", cls.height), 0.05, 3.0))
 
 
 @dataclass(frozen=True)

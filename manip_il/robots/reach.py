@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from manip_il.checks import without_link
 from manip_il.robots import HERE, ROBOTS
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.meeting import CLEARANCE, Body
+from manip_il.robots.geometry import CLEARANCE, Body
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_off_vertical, hand_down, off_yaw
 from manip_il.robots.spec import arm_spec
@@ -178,30 +178,17 @@ def _key(robot: Robot) -> str:
 
 
 def _solve(robot: Robot) -> Reach:
-    return joined(robot, [errors_at(robot, 0, 1)])
-
-
-def errors_at(robot: Robot, part: int, parts: int) -> F64:
-    """Return how far the hand ends from every `parts`-th point of the map's grid, from number `part` on, (k,) [m]."""
+    """Compute the map: how far the hand ends from every point of the grid."""
     from manip_il.robots.ik import ArmIK  # mink takes long to import, and a kept map needs none
 
     (origin, shape), ik, body = _grid(robot), ArmIK(robot), Body(robot)
-    points = [origin + _CELL * np.array(index) for index in list(np.ndindex(*shape))[part::parts]]
-    errors = np.empty(len(points))
-    for place, point in enumerate(points):
+    errors = np.empty(shape, np.float32)
+    for index in np.ndindex(*shape):
+        point = origin + _CELL * np.array(index)
         point[2] = max(point[2], robot.ee.lowest)  # no hand gets to the table itself
         miss, q = _miss(robot, ik, point)
-        errors[place] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
-    return errors
-
-
-def joined(robot: Robot, parts: Sequence[F64]) -> Reach:
-    """Return the map of all parts of `errors_at`, each (k,) [m]."""
-    origin, shape = _grid(robot)
-    errors = np.empty(math.prod(shape))
-    for part, some in enumerate(parts):
-        errors[part :: len(parts)] = some
-    return Reach(origin, errors.reshape(shape).astype(np.float32).astype(np.float64))
+        errors[index] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
+    return Reach(origin, errors.astype(np.float64))
 
 
 def _grid(robot: Robot) -> tuple[F64, tuple[int, ...]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from manip_il.errors import ManipError
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Workspace
+from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Table, Workspace
 from manip_il.robots.servos import RATE, LeRobotConfig
 
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
@@ -15,6 +15,7 @@ FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # on the model,
 UPRIGHT_JOINTS = 6  # with fewer, a hand cannot point down everywhere
 UPRIGHT = Costs()
 SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # of an arm that cannot
+TABLE = Table()
 YAWS = ("world", "shoulder")
 
 
@@ -27,7 +28,8 @@ class Robot:
     added to its inertia [kg m^2]. base: of the root body [m]. fixed: where joints stand that are neither the arm's
     nor the gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
     yaw: where a hand's yaw is zero, along the world's x or straight ahead of the shoulder. wrist_camera: the
-    model's own, on its hand. cameras: of the scene, where they do not stand as for every robot: front, side.
+    model's own, on its hand. cameras: of the scene, where they do not stand as for every robot: front, side. table: of
+    the scene.
     colours: red, green and blue of meshes without contacts, by patterns of names, later ones first. lerobot: how
     LeRobot's recorder writes it, where its servos' numbers are wanted in place of [rad] and [m].
     """
@@ -47,6 +49,7 @@ class Robot:
     yaw: str = "world"
     wrist_camera: str = ""
     cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
+    table: Table = TABLE
     base: tuple[float, ...] | None = None
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     max_joint_step: float = JOINT_STEP

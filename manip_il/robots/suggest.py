@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from manip_il.errors import UsageError
-from manip_il.robots.files import ModelFiles, try_models
+from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import nearest
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.robot import Robot
@@ -52,10 +52,16 @@ class Suggestion:
 def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
     """Look at an MJCF, and at its gripper's where that has one of its own.
 
-    Raises `UsageError` where MuJoCo cannot read them, or no hand or no fingers are found.
+    Raises `UsageError` where MuJoCo cannot read or compile them, or no hand or no fingers are found.
     """
+    try:
+        return _suggest(model, gripper)
+    except ValueError as error:
+        raise UsageError(f"MuJoCo cannot compile {gripper or model}: {' '.join(str(error).split())}") from None
+
+
+def _suggest(model: Path, gripper: Path | None) -> Suggestion:
     files = [ModelFiles(path.absolute()) for path in (model, gripper) if path is not None]
-    try_models(model.stem, *files)
     spec, with_jaws = load(files[0], model.stem), load(files[-1], model.stem)
     if gripper is None:
         palm, jaws = _palm(with_jaws, model)

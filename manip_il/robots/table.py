@@ -12,8 +12,8 @@ from manip_il import checks
 from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
-from manip_il.robots.files import KEYS, ModelFiles, try_models
-from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Workspace
+from manip_il.robots.files import KEYS, ModelFiles
+from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Table, Workspace
 from manip_il.robots.reading import FURTHEST, missing, names, numbers, tree_of
 from manip_il.robots.robot import FOUND, JOINT_STEP, UPRIGHT, YAWS, Robot, costs_of, yaw_of
 from manip_il.robots.servos import LeRobotConfig
@@ -49,8 +49,6 @@ def read_robot(path: Path) -> Robot:
     said: dict[str, Any] = {}
     try:
         said = _said(path, read_yaml(path, "a robot's YAML"))
-        if path not in ROBOTS.values():  # what ships has been compiled
-            try_models(said["name"], *filter(None, (said["files"], said["gripper"].files)))
         lacking = [name for name in FOUND if name not in said]
         if lacking:
             from manip_il.robots.found import complete  # here, as what ships says it all, and mink takes long
@@ -90,6 +88,8 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
     if unknown := [name for name in cameras if name not in SCENE_CAMERAS]:
         raise UnknownName("camera in a robot's YAML:", unknown[0], SCENE_CAMERAS)
     said["cameras"] = {name: CameraPose.read(f"cameras.{name}", one) for name, one in cameras.items()}
+    if "table" in tree:
+        said["table"] = Table.read("table", tree["table"], said["workspace"])
     if tree.get("base") is not None:
         said["base"] = numbers("base", tree["base"], 3, FURTHEST)
     if "lerobot" in tree:

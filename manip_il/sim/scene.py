@@ -14,7 +14,7 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
-from manip_il.robots.parts import CameraPose
+from manip_il.robots.parts import TABLE_BEYOND, CameraPose
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.servos import ServoUnits
@@ -29,9 +29,7 @@ from manip_il.sim.world import Scene
 
 PREFIX = "robot/"  # of everything of the robot's in a scene
 TABLE = "table"  # the name of its geom
-_TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
-_TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
-_FLOOR = -0.4  # [m]
+_THICK = 0.04  # of the table's top [m]
 SCENES_KEPT = 8  # compiled, a process: the finest meshes take 64 MB
 _TURN, _SPARE_TURN = 0.1, 0.1  # of the last joint, to see which way it turns the hand; kept from its limits [rad]
 SEEN, SEEN_HEIGHT = 0.15, 0.45  # half the width, and the height, of a workspace that cameras see from these places [m]
@@ -201,21 +199,21 @@ def _add_look(spec: mujoco.MjSpec) -> None:
 
 def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
-    y, half = robot.workspace.centre[1], np.array(_TABLE_HALF)
+    table, y = robot.table, robot.workspace.centre[1]
+    half = np.array([*table.size, _THICK]) / 2
     middle = [_table_x(robot), y, -half[2]]
     spec.worldbody.add_geom(
         name=TABLE, type=box, size=half, pos=middle, material="table", friction=[1.0, 0.005, 0.0001]
     )
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        leg = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -0.22]
-        spec.worldbody.add_geom(
-            name=f"leg{i}", type=box, size=[0.025, 0.025, 0.18], pos=leg, rgba=[0.35, 0.36, 0.38, 1]
-        )
-    spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, _FLOOR], material="floor")
+        leg = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -(table.height + _THICK) / 2]
+        size = [0.025, 0.025, round((table.height - _THICK) / 2, 9)]
+        spec.worldbody.add_geom(name=f"leg{i}", type=box, size=size, pos=leg, rgba=[0.35, 0.36, 0.38, 1])
+    spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, -table.height], material="floor")
 
 
 def _table_x(robot: Robot) -> float:
-    return robot.workspace.centre[0] + _TABLE_BEYOND
+    return robot.workspace.centre[0] + TABLE_BEYOND
 
 
 def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> None:
@@ -227,8 +225,9 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
     root = [i for i in touching if i in fixed]
     corners = np.array([_corner_lows(model, data, i) for i in root or fixed or touching])
     lowest = float(corners[:, 2].min())
-    height = lowest - 0.01 - _FLOOR
-    on_table = abs(lowest) < _ON_TABLE and abs(corners[:, 0].mean() - _table_x(robot)) < _TABLE_HALF[0]
+    floor = -robot.table.height
+    height = lowest - 0.01 - floor
+    on_table = abs(lowest) < _ON_TABLE and abs(corners[:, 0].mean() - _table_x(robot)) < robot.table.size[0] / 2
     if height <= 0.02 or on_table:
         return
     x, y = corners[:, :2].mean(axis=0)
@@ -236,7 +235,7 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
         name="pedestal",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=[_PEDESTAL, _PEDESTAL, height / 2],
-        pos=[x, y, _FLOOR + height / 2],
+        pos=[x, y, floor + height / 2],
         rgba=[0.28, 0.29, 0.32, 1],
     )
 

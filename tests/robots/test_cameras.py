@@ -1,4 +1,4 @@
-"""Cameras of the scene stand where a robot's YAML says."""
+"""Cameras and table of the scene stand where a robot's YAML says."""
 
 from __future__ import annotations
 
@@ -49,6 +49,29 @@ def test_what_is_not_said_stays_and_another_cameras_place_is_that_of_every_robot
     np.testing.assert_allclose(own.cam_pos[front], PLACED["obliquely"]["position"])
     assert own.cam_fovy[front] == 50
     np.testing.assert_array_equal(own.cam_pos[side], plain.cam_pos[side])
+
+
+def test_the_table_is_as_large_and_as_high_as_said(tmp_path):
+    tree = tree_of("slides") | {"table": {"size": [0.8, 0.7], "height": 0.75}}
+    model = scene_of(str(write(tmp_path, tree=tree)), "reach").model
+    np.testing.assert_allclose(2 * model.geom("table").size[:2], [0.8, 0.7])
+    assert model.geom("table").pos[2] + model.geom("table").size[2] == 0.0
+    assert model.geom("floor").pos[2] == -0.75
+    leg = model.geom("leg0")
+    assert leg.pos[2] - leg.size[2] == pytest.approx(-0.75)
+
+
+@pytest.mark.parametrize(
+    ("table", "says"),
+    [
+        ({"hight": 1}, "did you mean 'height'"),
+        ({"size": [0.2, 1.0]}, "table.size is .*; expected .* for the workspace"),
+        ({"height": 0}, "table.height is 0"),
+    ],
+)
+def test_a_wrong_table_is_one_line(table, says, tmp_path):
+    with pytest.raises(UsageError, match=says):
+        get_robot(str(write(tmp_path, tree=tree_of("slides") | {"table": table})))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from manip_il.evaluation.robot_check import (
 )
 from manip_il.evaluation.robot_page import advice, check_report, task_table, verdict
 from manip_il.evaluation.tables import CLONING, EXPERT
-from manip_il.robots import reach
 from manip_il.robots.gripper import sweep
 from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
@@ -68,13 +67,6 @@ def test_neighbours_that_overlap_in_any_posture_are_no_fault_of_home(tmp_path: P
     scene = scene_of(str(write(tmp_path, model=long)), "reach")
     found = meeting_at(scene.robot, scene.model, PREFIX, np.asarray(scene.robot.home))
     assert set(found) == {("base", "upper")}
-
-
-def test_a_map_in_parts_is_the_whole_map(own: Robot, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(reach, "_BEYOND", -0.05)  # a map of a few points
-    monkeypatch.setattr(reach, "_STEPS", 30)
-    parts = [reach.errors_at(own, part, 3) for part in range(3)]
-    assert reach.joined(own, parts).errors.tobytes() == reach._solve(own).errors.tobytes()
 
 
 def test_shares_of_a_workspace_are_those_of_its_points(own: Robot, monkeypatch: pytest.MonkeyPatch):

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.robots import HERE, reach
+from manip_il.robots.geometry import Body
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.meeting import Body
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, kept_reach, reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_between, hand_down, off_yaw

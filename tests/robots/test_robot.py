@@ -144,7 +144,6 @@ MISTAKES = {
     ),
     "a model that is not there": (but(model="onw.xml"), ["cannot read", "onw.xml", "No such file"]),
     "a folder for a model": (but(model="."), ["robot own", "cannot read"]),
-    "a running program for a package": (but(model="__main__:arm.xml"), ["model is in '__main__'", "not installed"]),
     "includes that are not there": (but(includes="parts", model="missing.xml"), ["cannot read", "missing.xml"]),
 }
 

@@ -1,0 +1,271 @@
+"""Finds on a robot's model what its YAML need not say: joints, motors, the hand's frame, a posture to start from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import UsageError
+from manip_il.robots.files import ModelFiles
+from manip_il.robots.geometry import Body, at_tip, nearest, outline
+from manip_il.robots.gripper import finger_geoms
+from manip_il.robots.ik import ArmIK
+from manip_il.robots.parts import EndEffector
+from manip_il.robots.robot import Robot, costs_of, yaw_of
+from manip_il.robots.rotations import hand_down, rotation_vector
+from manip_il.robots.spec import arm_spec, bare_spec, require
+
+F64 = NDArray[np.float64]
+FORCE = 200.0  # of an arm joint whose model sets no limit [N m]
+ARMATURE = 0.1  # of an arm joint whose model has none [kg m^2]
+FREQUENCY = 2 * math.pi * 6.0  # of a joint with its motor as a spring [rad/s]
+_AT_OBJECT = 0.7  # of the way from closed to open: fingers that turn then stand as they do at an object
+_SETTLE, _STEP = 1000, 0.002  # physics steps, and their length [s]
+FROM_TIP = 0.012  # of the frame, from the fingertips [m]
+_CLEAR = 0.006  # of the fingertips over the table at the frame's lowest [m]
+_SQUARE = 0.95  # cosine of how far the fingers' way may be off an axis of the hand's body to count as along it
+_LEAST_GAP = 1e-4  # between fingers half closed [m]
+_METRES, _TURN = 4, 6  # digits
+_STARTS, _STEPS = 40, 150  # of inverse kinematics: random postures, and steps from each
+_LONGEST = 0.2  # of a joint in a step [rad]
+_HIGHEST = 0.2  # of the hand over the table, or half the workspace's height where that is less [m]
+_LOWER = (1.0, 0.7, 0.4)  # shares of that, tried one after the other
+_ARRIVED = 0.01  # off the place [m], an angle counting as 5 cm a radian
+_ANGLE_AS_LENGTH = 0.05
+_ENOUGH = (0.5, 0.15, 0.25)  # of margin to a limit [rad], of the smallest singular value, of height of the links [m]
+_DIGITS = 4
+
+
+def complete(said: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a YAML says and, for the rest, what its model shows. Raises `UsageError` where it shows nothing."""
+    said = dict(said)
+    spec = bare_spec(said["name"], said["files"], said["hand"], said["gripper"])
+    joints = said.setdefault("joints", arm_joints(said["name"], spec, said["hand"], said["gripper"].joints))
+    require(said["name"], "joint", joints, spec.joints)
+    said.setdefault("costs", costs_of(len(joints)))
+    said.setdefault("yaw", yaw_of(len(joints)))
+    forces, armature = motor_limits(said["name"], said["files"], spec, joints)
+    said.setdefault("forces", forces)
+    said.setdefault("armature", armature)
+    lacking = [name for name in ("ee", "home", "gains") if name not in said]
+    provisional: dict[str, Any] = {
+        "ee": EndEffector(said["hand"], (0.0, 0.0, 0.0)),
+        "home": (0.0,) * len(joints),
+        "gains": (1.0,) * len(joints),
+    }
+    robot = Robot(**(provisional | said))
+    if "ee" in lacking:
+        robot = replace(robot, ee=find_ee(robot))
+    if "home" in lacking:
+        robot = find_home(robot, turns="ee" in lacking)
+    if "gains" in lacking:
+        robot = replace(robot, gains=find_gains(robot))
+    return said | {name: getattr(robot, name) for name in ("ee", "home", "gains")}
+
+
+def arm_joints(robot: str, spec: mujoco.MjSpec, hand: str, gripper: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the joints that turn between the base and the hand. Raises `UsageError` where there are none.
+
+    robot: its name, for messages. gripper: joints that are not the arm's.
+    """
+    require(robot, "body", (hand,), spec.bodies)
+    joints: list[str] = []
+    body = spec.body(hand)
+    while body.name != "world":
+        hinges = [one for one in body.joints if one.type == mujoco.mjtJoint.mjJNT_HINGE and one.name not in gripper]
+        if nameless := [one for one in hinges if not one.name]:
+            raise UsageError(
+                f"robot {robot}: {len(nameless)} joint of body {body.name!r} has no name; name it in the model"
+            )
+        joints[:0] = [one.name for one in hinges]
+        body = body.parent
+    if not joints:
+        raise UsageError(f"robot {robot}: no joint turns between the base and {hand!r}; expected the body of the hand")
+    return tuple(joints)
+
+
+def motor_limits(
+    robot: str, files: ModelFiles, spec: mujoco.MjSpec, joints: Sequence[str]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the greatest torques [N m] and the armatures [kg m^2] of joints, as the model has them."""
+    whole = files.load(robot)  # held: what MuJoCo gives of a model does not keep it
+    motors = {one.target: one for one in whole.actuators}
+    forces = [_greatest_torque(motors.get(name), spec.joint(name)) for name in joints]
+    armature = [float(spec.joint(name).armature) or ARMATURE for name in joints]
+    return tuple(forces), tuple(armature)
+
+
+def _greatest_torque(motor: mujoco._specs.MjsActuator | None, joint: mujoco._specs.MjsJoint) -> float:
+    limits = [tuple(joint.actfrcrange)]
+    if motor is not None:
+        gear = abs(float(motor.gear[0])) or 1.0
+        limits.append(tuple(gear * float(end) for end in motor.forcerange))
+        if motor.biastype == mujoco.mjtBias.mjBIAS_NONE and motor.gaintype == mujoco.mjtGain.mjGAIN_FIXED:
+            gain = gear * abs(float(motor.gainprm[0]))
+            limits.append(tuple(gain * float(end) for end in motor.ctrlrange))
+    greatest = [min(-low, high) for low, high in limits if low < 0 < high]
+    return float(min(greatest, default=FORCE))
+
+
+def find_gains(robot: Robot) -> tuple[float, ...]:
+    """Return kp of each joint [N m/rad]: the joint answers at 6 Hz with what hangs on it at home."""
+    model = arm_spec(robot).compile()
+    data = mujoco.MjData(model)
+    for name, value in zip(robot.joints, robot.home, strict=True):
+        data.joint(name).qpos[0] = value
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    dofs = [model.joint(name).dofadr[0] for name in robot.joints]
+    return tuple(float(f"{FREQUENCY**2 * inertia[dof, dof]:.3g}") for dof in dofs)
+
+
+def find_ee(robot: Robot) -> EndEffector:
+    """Return the frame between the fingertips: z from the hand to them, y along the way that the fingers come together.
+
+    Along axes of the hand's body, where that is nearly so. Raises `UsageError` where the fingers do not come apart.
+    """
+    model, data = _settled(robot, _AT_OBJECT)
+    hand = model.body(robot.hand).id
+    origin, axes = data.xpos[hand], data.xmat[hand].reshape(3, 3)
+    fingers = finger_geoms(model, robot.gripper.fingers)
+    middle = np.mean([data.geom_xpos[geom] for finger in fingers for geom in finger], axis=0)
+    z = _along_axis(axes.T @ (middle - origin))
+    points = {geom: (outline(model, data, geom) - origin) @ axes for finger in fingers for geom in finger}
+    tip = max(float((points[geom] @ z).max()) for geom in points)
+    pads, ends = nearest(model, data, [at_tip(model, data, finger, axes @ z) for finger in fingers])
+    one, other = (ends - origin) @ axes
+    way = other - one - z * (z @ (other - one))
+    if np.linalg.norm(way) < _LEAST_GAP:
+        raise UsageError(f"robot {robot.name}: the fingers do not come apart; look at gripper.fingers and gripper.open")
+    y = _along_axis(way / np.linalg.norm(way), _SQUARE)
+    x = np.cross(y, z)
+    low, high = (max((points[pad] @ x).min() for pad in pads), min((points[pad] @ x).max() for pad in pads))
+    position = x * (low + high) / 2 + y * (y @ (one + other)) / 2 + z * (tip - FROM_TIP)
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.stack([x, y, z], axis=1).ravel())
+    return EndEffector(
+        robot.hand,
+        tuple(round(float(value), _METRES) for value in position),
+        tuple(round(float(value), _TURN) for value in quaternion),
+        round(FROM_TIP + max(0.0, _tip(robot, z) - tip) + _CLEAR, _METRES),
+    )
+
+
+def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The robot with its arm as the model has it, and its fingers at rest at a share of the way from closed to open."""
+    alone = replace(robot, joints=(), home=(), gains=(), forces=(), armature=())
+    spec = arm_spec(alone)
+    spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model = spec.compile()
+    data, config = mujoco.MjData(model), robot.gripper
+    for name, closed, opened in zip(config.joints, config.closed, config.open, strict=True):
+        data.joint(name).qpos[0] = data.actuator(name).ctrl[0] = closed + share * (opened - closed)
+    mujoco.mj_step(model, data, _SETTLE)
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
+def _tip(robot: Robot, z: F64) -> float:
+    """Measure how far the closed fingers go from the hand along its axis (3,) [m]."""
+    model, data = _settled(robot, 0.0)
+    hand = model.body(robot.hand).id
+    along = data.xmat[hand].reshape(3, 3) @ z
+    geoms = [geom for finger in finger_geoms(model, robot.gripper.fingers) for geom in finger]
+    return max(float(((outline(model, data, geom) - data.xpos[hand]) @ along).max()) for geom in geoms)
+
+
+def _along_axis(vector: F64, least: float = 0.0) -> F64:
+    """The unit vector along the axis that a vector is most along, (3,); the vector where its share is below `least`."""
+    axis = int(np.argmax(np.abs(vector)))
+    if abs(float(vector[axis])) < least:
+        return vector
+    unit = np.zeros(3)
+    unit[axis] = np.sign(vector[axis])
+    return unit
+
+
+def find_home(robot: Robot, turns: bool) -> Robot:
+    """Return the robot with its best posture for a hand that points down over the workspace's middle.
+
+    turns: the frame `ee` may be turned by half about z, where that suits the arm better. Raises `UsageError` where the
+    hand gets there from none of forty postures.
+    """
+    halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
+    heights = [min(_HIGHEST, robot.workspace.height / 2) * share for share in _LOWER]
+    found = (max((_best(one, height) for one in halves), key=lambda one: one[0]) for height in heights)
+    best = next((one for one in found if math.isfinite(one[0])), (-math.inf, robot))
+    if not math.isfinite(best[0]):
+        x, y = robot.workspace.centre
+        mount = " gripper.quaternion (how the gripper is put onto the hand)," if robot.gripper.files else ""
+        raise UsageError(
+            f"robot {robot.name}: the hand does not get over the workspace's centre ({x:g}, {y:g}), pointing down;"
+            f" look at workspace.centre,{mount} hand and base, or give home"
+        )
+    return best[1]
+
+
+def _half_turned(ee: EndEffector) -> EndEffector:
+    turned = np.empty(4)
+    mujoco.mju_mulQuat(turned, np.array(ee.quaternion), np.array([0.0, 0.0, 0.0, 1.0]))
+    return replace(ee, quaternion=tuple(round(float(value), 6) for value in turned))
+
+
+def _best(robot: Robot, height: float) -> tuple[float, Robot]:
+    """The best posture of one way round of the hand, and how good it is; minus infinity for none."""
+    soft = robot.leans
+    middle = replace(robot, home=tuple(_middles(robot)))
+    ik, body = ArmIK(middle), Body(middle)
+    limits = _counted(ik.limits)
+    rng = np.random.default_rng(0)
+    best = -math.inf, robot
+    target = np.array([*robot.workspace.centre, height])
+    rotation = hand_down(ik.ahead(target))
+    for _ in range(_STARTS):
+        q, miss = _descend(ik, rng.uniform(*limits.T), target, rotation, soft)
+        if miss < _ARRIVED:
+            worth = _worth(ik, q, limits) - body.meeting(q)
+            if worth > best[0]:
+                best = worth, replace(robot, home=tuple(round(float(value), _DIGITS) for value in q))
+    return best
+
+
+def _middles(robot: Robot) -> F64:
+    return _counted(ArmIK(robot).limits).mean(axis=1)
+
+
+def _counted(limits: F64) -> F64:
+    """Limits of joints, those of a whole turn or without any as half a turn to either side, (arm, 2) [rad]."""
+    free = ~np.isfinite(limits).all(axis=1) | (limits[:, 1] - limits[:, 0] >= 2 * np.pi - 1e-3)
+    return np.where(free[:, None], np.array([-np.pi, np.pi]), limits)
+
+
+def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple[F64, float]:
+    """Joints to which inverse kinematics comes from some, and what it misses the pose by [m]."""
+    counted, miss = _counted(ik.limits), math.inf
+    for _ in range(_STEPS):
+        position, turned = ik.ee_pose(q)
+        off = rotation_vector(rotation @ turned.T)
+        angle = abs(float(off[2])) if soft else float(np.linalg.norm(off))
+        miss = float(np.linalg.norm(target - position)) + _ANGLE_AS_LENGTH * angle
+        dq = ik.displacement(target, rotation, _LONGEST)
+        if dq is None or np.abs(dq).max() < 1e-4:
+            break
+        q = q + dq
+    free = counted[:, 0] == -np.pi
+    q = np.where(free, (q + np.pi) % (2 * np.pi) - np.pi, q)
+    return np.clip(q, *ik.limits.T), miss
+
+
+def _worth(ik: ArmIK, q: F64, limits: F64) -> float:
+    """Rate a posture by its margin to the limits, distance from a singular posture, and height of the links."""
+    margin = float(np.minimum(q - limits[:, 0], limits[:, 1] - q).min())
+    singular = ik.smallest_singular_value(q)
+    parts = (margin, singular, ik.lowest_link(q))
+    return sum(min(1.0, part / enough) for part, enough in zip(parts, _ENOUGH, strict=True))
