@@ -57,7 +57,7 @@ def test_lerobots_dataset_code_is_not_called():
 
 @pytest.mark.parametrize(
     "module",
-    ["intervals", "results", "report", "tables", "certificate"],
+    ["intervals", "results", "report", "tables"],
 )
 def test_reading_results_needs_neither_torch_nor_mujoco(module: str):
     code = f"import sys, manip_il.evaluation.{module}; print({{'torch', 'mujoco', 'lerobot'}} & set(sys.modules))"

@@ -160,9 +160,9 @@ class CertifyOptions:
 
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
-        from manip_il.evaluation.certificate import FILE_NAME, certificate_report
-        from manip_il.evaluation.certify import certify, count_episodes
+        from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
         from manip_il.evaluation.policy_folder import find_policy
+        from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
 
         env, *_ = open_driver(self.policy.path, "expert", self.env, trust=self.trust)
@@ -172,9 +172,7 @@ class CertifyOptions:
             with Progress(count, f"certify {env.robot} {env.task}") as bar, engine:
                 advance = bar.advance
                 certificate = certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)
-            certificate.write(folder / FILE_NAME)
-            report = certificate_report(certificate, command_line("robot certify", self), to_plain(self))
-            report.write(folder / REPORT_FILE)
-        for table in certificate.tables():
-            print_table(table, empty="-")
+            write_json(folder / FILE_NAME, certificate.to_json(), indent=None)
+            certificate.report(command_line("robot certify", self), to_plain(self)).write(folder / REPORT_FILE)
+        print_table(certificate.table(), empty="-")
         say(*certificate.facts(), f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

@@ -76,6 +76,4 @@ class TheoryOptions:
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
         with Progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.advance())
-            gaps = certificate.actions.gaps
-            u = gaps.largest if gaps else 0
-            return measure_shift(engine, env, rounds, u, self.episodes, lambda _: bar.advance())
+            return measure_shift(engine, env, rounds, certificate.mu or 0, self.episodes, lambda _: bar.advance())

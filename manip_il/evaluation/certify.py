@@ -1,16 +1,22 @@
 """Measure the expert's recoverability: rollouts perturbed once, beside the same ones undisturbed.
 
-Expert and simulator are deterministic, so the undisturbed run of a seed gives the cost-to-go of every state on it, and
-the same run with one wrong action gives the cost of that action.
+The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the expert's cost of going
+on after action a in state s, and V*(s) its cost of acting itself, the gap Q*(s, a) - V*(s) is what the action a costs.
+Expert and simulator are deterministic, so the undisturbed run of a seed gives V* of every state on it, and the same run
+with one wrong action gives Q*.
+
+Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest gap, u: a learner that errs in a share e of
+the states it visits within T steps costs at most u T e more than the expert, so linearly in T if a mistake can be
+undone, and not quadratically. Rajaraman et al. (2021) call it mu-recoverability. The largest gap among drawn actions,
+as here, is a lower bound of u.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,18 +26,181 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Query
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.certificate import Case, Certificate, Group, Row
-from manip_il.mdp import F32, F64, Actor, Episode
+from manip_il.errors import ManipError
+from manip_il.evaluation.figures import Bar, rates_figure
+from manip_il.evaluation.intervals import CONFIDENCE, Proportion
+from manip_il.evaluation.report import Report, Section
+from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, EXPERT, INTERVAL, Table
+from manip_il.mdp import Actor, Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import Perturbation, kinds_for
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.table import get_task
 
-_LOG = logging.getLogger(__name__)
+FILE_NAME = "certificate.json"
 NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
-Progress = Callable[[Episode], None]
+Group = Literal["start", "state", "action", "learner"]
+_COLOURS: dict[Group, str] = {"start": EXPERT, "state": DAGGER, "action": CLONING, "learner": BASELINE}
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One episode. moment: the control step from which the expert is judged.
+
+    steps: until solved from there [control steps]; None if not within a horizon. undisturbed: the same without the
+    perturbation, if known.
+    """
+
+    seed: int
+    moment: int
+    steps: int | None
+    undisturbed: int | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """The cases of one kind. kind, words: short and in full; horizon: [control steps].
+
+    left_out: episodes that give no case, as the perturbation found no place or changed nothing, or the task was solved
+    before its moment.
+    """
+
+    group: Group
+    kind: str
+    words: str
+    cases: tuple[Case, ...]
+    horizon: int
+    left_out: int = 0
+
+    @property
+    def success(self) -> Proportion | None:
+        """Solved within a horizon from the moment on; None without cases."""
+        return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
+
+    @property
+    def mean_steps(self) -> float | None:
+        """Mean over the solved cases, until they were [control steps]."""
+        steps = [case.steps for case in self.cases if case.steps is not None]
+        return float(np.mean(steps)) if steps else None
+
+    @property
+    def gaps(self) -> list[int]:
+        """Q*(s, a) - V*(s) of each wrong action [control steps]; the whole horizon if the expert did not recover."""
+        known = [(case.steps, case.undisturbed) for case in self.cases if case.undisturbed is not None]
+        return [self.horizon if steps is None else steps - undisturbed for steps, undisturbed in known]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values; a case is [seed, moment, steps, undisturbed]."""
+        found = {"group": self.group, "kind": self.kind, "words": self.words, "n": len(self.cases)}
+        found |= {"left_out": self.left_out, "mean_steps": self.mean_steps}
+        found |= self.success.to_json() if self.success else {"success_rate": None, "interval": None}
+        return found | {"cases": [[one.seed, one.moment, one.steps, one.undisturbed] for one in self.cases]}
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Recoverability of the expert on one robot and task, one row a kind.
+
+    policy: from whose visited states the expert went on, too; None for none. settings: cases of each kind, seed,
+    horizon [control steps], control_hz, tolerance [m] and success_steps of the runs.
+    """
+
+    robot: str
+    task: str
+    policy: str | None
+    fingerprint: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    rows: tuple[Row, ...]
+
+    def of(self, group: Group) -> tuple[Row, ...]:
+        """Return the rows of a group."""
+        return tuple(row for row in self.rows if row.group == group)
+
+    def pooled(self, group: Group, words: str = "") -> Row:
+        """Return all cases of a group as one row."""
+        rows = self.of(group)
+        cases = tuple(case for row in rows for case in row.cases)
+        return Row(group, "all", words, cases, self.settings["horizon"], sum(row.left_out for row in rows))
+
+    @property
+    def mu(self) -> int | None:
+        """The largest gap of all wrong actions [control steps]: the empirical u of Ross et al. (2011)."""
+        return max(self.pooled("action").gaps, default=None)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the contents of `certificate.json`."""
+        content = {"robot": self.robot, "task": self.task, "policy": self.policy, "fingerprint": dict(self.fingerprint)}
+        content |= {"settings": dict(self.settings), "confidence": CONFIDENCE, "mu": self.mu}
+        return content | {"rows": [row.to_json() for row in self._with_pooled]}
+
+    @property
+    def _with_pooled(self) -> tuple[Row, ...]:
+        states, actions = self.pooled("state", "all changed states"), self.pooled("action", "all wrong actions")
+        return (*self.of("start"), *self.of("state"), states, *self.of("action"), actions, *self.of("learner"))
+
+    def table(self) -> Table:
+        """Return a row a kind: how often and how fast the expert recovers, and what a wrong action costs."""
+        rows: list[tuple[str, ...]] = []
+        for row in self._with_pooled:
+            steps = "" if row.mean_steps is None else f"{row.mean_steps:.1f}"
+            gaps = row.gaps if row.group == "action" else []
+            # a percentile that was seen, the one above if it falls between two
+            p95 = np.percentile(gaps, 95, method="higher") if gaps else None
+            costs = ("", "", "") if p95 is None else (f"{np.mean(gaps):.1f}", f"{p95:.0f}", str(max(gaps)))
+            rows.append((row.words, str(row.success or ""), steps, *costs, str(len(row.cases)), str(row.left_out)))
+        head = ("the expert continues from", f"solved {INTERVAL}", "mean steps", "mean cost", "95 % cost at most")
+        colours = tuple(_COLOURS[row.group] for row in self._with_pooled)
+        return Table((*head, "largest cost", "cases", "left out"), tuple(rows), colours)
+
+    @property
+    def verdict(self) -> str:
+        """The first sentence: how many changed states the expert recovers from."""
+        states = self.pooled("state")
+        changed = f"{states.success} of {len(states.cases):,} changed states" if states.success else "no changed state"
+        return f"The expert on {self.robot} {self.task} recovers from {changed}."
+
+    def facts(self) -> list[str]:
+        """Return sentences on the largest cost, and on the learner's states."""
+        lines: list[str] = []
+        if self.mu is not None:
+            # exact for independent draws, none of which cost more
+            above = 1 - (1 - CONFIDENCE) ** (1 / len(self.pooled("action").gaps))
+            lines.append(
+                f"mu (the u of Ross et al. 2011) is at least {self._in_seconds(self.mu)}; with {CONFIDENCE:.0%} "
+                f"confidence, at most {above:.1%} of such actions cost more."
+            )
+        for row in self.of("learner"):
+            count = row.left_out + len(row.cases)
+            lines.append(f"The policy had solved {row.left_out} of {count} before the expert's turn.")
+        return lines
+
+    def report(self, command: str, config: Mapping[str, Any]) -> Report:
+        """Return the page."""
+        bars = [Bar(row.words, (row.success,), _COLOURS[row.group]) for row in self.rows if row.success]
+        note = (
+            "An episode is perturbed once, at a step drawn from those of the undisturbed one; the expert then has "
+            f"{self._in_seconds(self.settings['horizon'])}. Left out: the perturbation changed nothing, or found no "
+            "place. Cost of a wrong action: control steps until solved after it, less those of the undisturbed episode."
+        )
+        return Report(
+            title=f"Certificate of the expert: {self.robot} {self.task}",
+            verdict=self.verdict,
+            facts=tuple(self.facts()),
+            command=command,
+            sections=(Section("Results", figures=(rates_figure(bars),), tables=(self.table(),), notes=(note,)),),
+            config=config,
+            fingerprint=self.fingerprint,
+        )
+
+    def _in_seconds(self, steps: int) -> str:
+        """Return `100 steps (5 s)`."""
+        return f"{steps} steps ({steps / self.settings['control_hz']:.3g} s)"
+
+
+def count_episodes(env: EnvConfig, cases: int, policy: Path | None = None) -> int:
+    """Return how many episodes `certify` runs at most."""
+    return cases * (2 + len(kinds_for(get_task(env.task))) + (policy is not None))
 
 
 def certify(
@@ -40,118 +209,59 @@ def certify(
     cases: int,
     seed: int = 0,
     policy: Path | None = None,
-    on_episode: Progress | None = None,
+    on_episode: Callable[[Episode], object] = lambda _: None,
     *,
     trust: bool = False,
 ) -> Certificate:
     """Measure the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
 
     A perturbation happens at a step drawn evenly from those that the undisturbed run takes until the task is solved;
-    the expert then has a whole horizon. policy: the expert goes on from states that this one visits, too; trust: see
-    `LearnedPolicy.load`. on_episode: sees every episode as it ends.
+    the expert then has a whole horizon. policy: the expert goes on from states that this one visits, too, at a drawn
+    step of a horizon; trust: see `LearnedPolicy.load`. on_episode: sees every episode as it ends.
     """
-    if cases < 1:
-        raise UsageError(f"cases is {cases}; expected at least 1")
-    run = _Run(engine, env, stream_seeds("certificate", cases, seed), on_episode)
-    rows = [run.starts()]
-    rows += [run.perturbed(kind) for kind in kinds_for(get_task(env.task))]
-    rows.append(run.noisy())
+    seeds = stream_seeds("certificate", cases, seed)
+
+    def rollouts(job: RolloutJob, seeds: Sequence[int] = seeds) -> Iterator[Episode]:
+        for episode in engine.run(job, seeds):
+            yield episode
+            on_episode(episode)
+
+    def row(group: Group, kind: str, words: str, cases: list[Case]) -> Row:
+        in_order = tuple(sorted(cases, key=lambda case: case.seed))
+        return Row(group, kind, words, in_order, env.horizon, len(seeds) - len(cases))
+
+    plain = {episode.seed: episode for episode in rollouts(RolloutJob(env, hold=0))}
+    starts = [_case(episode, 0, env.horizon) for episode in plain.values()]
+    solved = {case.seed: case.steps for case in starts if case.steps is not None}
+    if not solved:
+        raise ManipError(
+            f"the expert solved none of {len(seeds)} undisturbed episodes within {env.horizon} steps, so there is "
+            "nothing to perturb; give it a longer --env.horizon"
+        )
+    rows = [row("start", "start", "undisturbed, from the start", starts)]
+    for kind, known in kinds_for(get_task(env.task)).items():
+        moments = {seed: draw_moment(seed, kind, steps) for seed, steps in solved.items()}
+        longer = replace(env, horizon=max(moments.values()) + env.horizon)
+        job = RolloutJob(longer, hold=0, conditions=(Perturbation(kind, moments),))
+        found: list[Case] = []
+        for episode in rollouts(job, list(moments)):
+            moment = moments[episode.seed]
+            if _differ(episode, plain[episode.seed], moment):
+                found.append(_case(episode, moment, env.horizon, solved[episode.seed] - moment))
+        rows.append(row("action" if known.wrong else "state", kind, known.words, found))
+    job = RolloutJob(env, hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
+    noisy = [_case(episode, 0, env.horizon) for episode in rollouts(job)]
+    rows.append(row("start", "noise", f"{NOISE:.0%} noise on every action", noisy))
     if policy is not None:
-        rows.append(run.taken_over(policy, trust))
-    if engine.given_up:
-        _LOG.warning("left out, as each repeatedly killed its worker: seeds %s", engine.given_up)
+        driver = PolicyDriver((policy,), trust=trust)
+        job = RolloutJob(env, driver, hold=0, label="takeover", query=Query("one"))
+        taken = ((one, np.flatnonzero(one.columns[schema.ACTOR].ravel() == Actor.EXPERT)) for one in rollouts(job))
+        # else the learner solved it before
+        found = [_case(episode, int(steps[0]), env.horizon) for episode, steps in taken if steps.size]
+        rows.append(row("learner", "learner", "states that the policy visited", found))
     settings = {"cases": cases, "seed": seed}
     settings |= {name: getattr(env, name) for name in ("horizon", "control_hz", "tolerance", "success_steps")}
-    name = None if policy is None else str(policy)
-    return Certificate(env.robot, env.task, name, env_fingerprint(env), settings, tuple(rows))
-
-
-def count_episodes(env: EnvConfig, cases: int, policy: Path | None = None) -> int:
-    """Return how many episodes `certify` runs at most."""
-    return cases * (2 + len(kinds_for(get_task(env.task))) + (policy is not None))
-
-
-class _Moment(NamedTuple):
-    """A step of the undisturbed run, how many more that took, its state (m,) and the action (n,) executed there."""
-
-    step: int
-    steps: int
-    state: F64
-    action: F32
-
-
-class _Run:
-    """The rows of one certificate; `starts` comes first, as the others need its runs."""
-
-    def __init__(self, engine: Engine, env: EnvConfig, seeds: Sequence[int], on_episode: Progress | None):
-        self._engine, self._env, self._seeds, self._on_episode = engine, env, seeds, on_episode
-        self._kinds = kinds_for(get_task(env.task))
-        self._moments: dict[str, dict[int, _Moment]] = {kind: {} for kind in self._kinds}  # kind -> seed -> moment
-
-    def starts(self) -> Row:
-        """Episodes as they begin."""
-        cases: list[Case] = []
-        for episode in self._episodes(RolloutJob(self._env, hold=0), self._seeds):
-            case = self._case(episode, 0)
-            cases.append(case)
-            if case.steps is not None:
-                for kind, moments in self._moments.items():
-                    step = draw_moment(case.seed, kind, case.steps)
-                    moments[case.seed] = _Moment(step, case.steps - step, *_state_and_action(episode, step))
-        if not any(case.steps for case in cases):
-            raise ManipError(
-                f"the expert solved none of {len(self._seeds)} undisturbed episodes within {self._env.horizon} steps, "
-                "so there is nothing to perturb; give it a longer --env.horizon"
-            )
-        return self._row("start", "start", "undisturbed, from the start", cases)
-
-    def noisy(self) -> Row:
-        """From where episodes begin, with noise on every action."""
-        job = RolloutJob(self._env, hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
-        cases = [self._case(episode, 0) for episode in self._episodes(job, self._seeds)]
-        return self._row("start", "noise", f"{NOISE:.0%} noise on every action", cases)
-
-    def perturbed(self, kind: str) -> Row:
-        """Episodes perturbed once."""
-        moments = self._moments[kind]
-        steps = {seed: moment.step for seed, moment in moments.items()}
-        longer = replace(self._env, horizon=max(steps.values()) + self._env.horizon)
-        job = RolloutJob(longer, hold=0, conditions=(Perturbation(kind, steps),))
-        cases: list[Case] = []
-        for episode in self._episodes(job, list(moments)):
-            moment = moments[episode.seed]
-            undisturbed = (moment.state, moment.action)
-            if not all(map(np.array_equal, _state_and_action(episode, moment.step), undisturbed)):
-                cases.append(self._case(episode, moment.step, moment.steps))
-        known = self._kinds[kind]
-        return self._row("action" if known.wrong else "state", kind, known.words, cases)
-
-    def taken_over(self, policy: Path, trust: bool) -> Row:
-        """States that a learner visits: at a drawn step of a horizon the expert takes over."""
-        driver = PolicyDriver((policy,), trust=trust)
-        job = RolloutJob(self._env, driver, hold=0, label="takeover", query=Query("one"))
-        cases: list[Case] = []
-        for episode in self._episodes(job, self._seeds):
-            taken = np.flatnonzero(episode.columns[schema.ACTOR].ravel() == Actor.EXPERT)
-            if taken.size:  # else the learner solved it before
-                cases.append(self._case(episode, int(taken[0])))
-        return self._row("learner", "learner", "states that the policy visited", cases)
-
-    def _episodes(self, job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
-        for episode in self._engine.run(job, seeds):
-            yield episode
-            if self._on_episode is not None:
-                self._on_episode(episode)
-
-    def _case(self, episode: Episode, moment: int, undisturbed: int | None = None) -> Case:
-        solved = np.flatnonzero(episode.columns[schema.SUCCESS].ravel()[moment : moment + self._env.horizon])
-        steps = int(solved[0]) + 1 if solved.size else None
-        labelled = bool(episode.columns[schema.LABEL_VALID][-1, 0])
-        return Case(episode.seed, moment, steps, undisturbed, labelled)
-
-    def _row(self, group: Group, name: str, words: str, cases: list[Case]) -> Row:
-        in_order = tuple(sorted(cases, key=lambda case: case.seed))
-        return Row(group, name, words, in_order, self._env.horizon, len(self._seeds) - len(cases))
+    return Certificate(env.robot, env.task, policy and str(policy), env_fingerprint(env), settings, tuple(rows))
 
 
 def draw_moment(seed: int, kind: str, steps: int) -> int:
@@ -159,5 +269,12 @@ def draw_moment(seed: int, kind: str, steps: int) -> int:
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
 
 
-def _state_and_action(episode: Episode, step: int) -> tuple[F64, F32]:
-    return episode.columns[schema.SIM_STATE][step].copy(), episode.columns[schema.EXECUTED_ACTION][step].copy()
+def _case(episode: Episode, moment: int, horizon: int, undisturbed: int | None = None) -> Case:
+    solved = np.flatnonzero(episode.columns[schema.SUCCESS].ravel()[moment : moment + horizon])
+    return Case(episode.seed, moment, int(solved[0]) + 1 if solved.size else None, undisturbed)
+
+
+def _differ(one: Episode, other: Episode, step: int) -> bool:
+    """Whether state or executed action of a step are not those of the other episode."""
+    names = (schema.SIM_STATE, schema.EXECUTED_ACTION)
+    return not all(np.array_equal(one.columns[name][step], other.columns[name][step]) for name in names)

@@ -10,7 +10,6 @@ from typing import Literal
 import pytest
 from playwright.sync_api import Browser
 
-from manip_il.evaluation.certificate import certificate_report
 from manip_il.evaluation.compare_report import compare_report
 from manip_il.evaluation.eval_report import eval_report, run_report
 from manip_il.evaluation.figures import Curve
@@ -69,7 +68,7 @@ CASES = {
     "compare": lambda: Case(compare_report(PAIR, "a against b", "manip-il compare a b")),
     "demo": demo_case,
     "study": lambda: Case(compare_report(STUDY, "Study", "manip-il compare x.yaml")),
-    "certify": lambda: Case(certificate_report(certificate(row("action", ACTIONS)), "manip-il robot certify", {})),
+    "certify": lambda: Case(certificate(row("action", ACTIONS)).report("manip-il robot certify", {})),
 }
 
 
