@@ -42,7 +42,7 @@ class RobotNewOptions:
     def run(self) -> None:
         """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
         from manip_il.data.atomic import write_file
-        from manip_il.evaluation.robot_page import advice, verdict
+        from manip_il.evaluation.robot_check import advice, verdict
         from manip_il.robots.suggest import found_lines, suggest, yaml_of
         from manip_il.robots.table import get_robot
 
@@ -98,8 +98,7 @@ class RobotCheckOptions:
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` if a task cannot be done."""
         from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.robot_check import FILE_NAME
-        from manip_il.evaluation.robot_page import check_report, looks
+        from manip_il.evaluation.robot_check import FILE_NAME, check_report, looks
         from manip_il.robots.gripper import sweep
         from manip_il.robots.table import get_robot
         from manip_il.tasks.table import get_task
@@ -126,7 +125,7 @@ class RobotCheckOptions:
             raise ManipError(f"{self.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
 
     def _say(self, found: RobotCheck) -> None:
-        from manip_il.evaluation.robot_page import advice, home_line, task_table, verdict
+        from manip_il.evaluation.robot_check import advice, home_line, task_table, verdict
         from manip_il.evaluation.tables import print_table
 
         say(home_line(found))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,17 +14,23 @@ import numpy as np
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import UsageError
+from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
+from manip_il.evaluation.film import encode_jpeg
+from manip_il.evaluation.report import Report, Section, Still
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
+from manip_il.evaluation.tables import CLONING, EXPERT, Table
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
+from manip_il.sim.config import FILM
 from manip_il.sim.home import Pair, meeting_at
+from manip_il.sim.render import Line, Overview, marked_picture
 from manip_il.sim.scene import PREFIX
-from manip_il.sim.task import Task
+from manip_il.sim.task import TakesShape, Task
 from manip_il.sim.variation import widest_grasp
 from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
@@ -34,44 +42,39 @@ SOLVES = 0.9  # share of clean episodes that the expert solves, of a task that c
 STARTS = 50  # of each task that are drawn
 ENOUGH = 0.95  # share of a workspace that a robot reaches, of one that suits it
 LOW = 0.03  # height of what lies on the table [m]
-_FEW = 3  # starts without a place, after which no more are drawn
 _NARROWER = 0.01  # steps in which a smaller workspace is tried [m]
+_ROOM = 0.13  # of the map around the workspace [m]
+_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+_AXES = ((0.85, 0.12, 0.12, 1.0), (0.10, 0.62, 0.20, 1.0), (0.10, 0.30, 0.90, 1.0))  # x red, y green, z blue
+_SPACE = (0.05, 0.45, 0.75, 1.0)
 
 
 @dataclass(frozen=True)
 class TaskCheck:
     """One task with a robot.
 
-    widths: of what is grasped [m]. refused: why there is no scene, or why a start found no place; else empty. found,
-    drawn: starts. objects, goals: where on the table they are, x and y [m]; goals are those and the furniture. clean,
-    noisy: evaluations of the expert, as it is and with a tenth of its actions random; None if none ran.
+    width: of the widest object that is grasped [m]; 0 if there is none. starts: how many found a place; refused: why
+    there is no scene, or why the next start found none. clean, noisy: evaluations of the expert, as it is and with a
+    tenth of its actions random; None if none ran.
     """
 
     name: str
-    widths: Mapping[str, float]
+    width: float
+    starts: int = 0
     refused: str = ""
-    found: int = 0
-    drawn: int = 0
-    objects: tuple[tuple[float, float], ...] = ()
-    goals: tuple[tuple[float, float], ...] = ()
     clean: EvalResult | None = None
     noisy: EvalResult | None = None
 
     @property
-    def has_starts(self) -> bool:
-        """Whether every start that was drawn found a place."""
-        return 0 < self.found == self.drawn
-
-    @property
     def done(self) -> bool:
         """Whether the robot can do it."""
-        return self.has_starts and (self.clean is None or self.clean.success.rate >= SOLVES)
+        return not self.refused and (self.clean is None or self.clean.success.rate >= SOLVES)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        starts = {"found": self.found, "drawn": self.drawn} if self.drawn else None
-        facts = {"widths": dict(self.widths), "refused": self.refused, "starts": starts}
-        return {"task": self.name, "done": self.done} | facts | {"clean": _json(self.clean), "noisy": _json(self.noisy)}
+        facts = {"done": self.done, "width": self.width, "starts": self.starts, "refused": self.refused}
+        tests = {"clean": self.clean, "noisy": self.noisy}
+        return {"task": self.name} | facts | {key: one and one.success.to_json() for key, one in tests.items()}
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,7 @@ def check_robot(
     overlaps = tuple(meeting_at(robot, scene.model, PREFIX, np.asarray(robot.home)))
     checked = [check_starts(name, task) for task in tasks]
     for place, task in enumerate(checked):
-        if episodes and task.has_starts:
+        if episodes and not task.refused:
             found: list[EvalResult] = []
             for condition in (NOMINAL, read_condition("random_actions")):
                 job = RolloutJob(make_config(name, task.name), hold=HOLD, label="last", conditions=(condition,))
@@ -130,29 +133,18 @@ def check_robot(
 
 
 def check_starts(name: str, task: str) -> TaskCheck:
-    """Draw a task's starts with a robot as episodes do; stops after a few that find no place."""
-    the_task = get_task(task)
-    checked = TaskCheck(task, widths(the_task))
+    """Draw a task's starts with a robot as episodes do, until one finds no place."""
+    the_task, starts = get_task(task), 0
+    width = max(widths(the_task).values(), default=0.0)
     try:
-        scene = scene_of(name, task)
+        world = World(scene_of(name, task))
+        world.update()
+        for seed in stream_seeds("validation", STARTS):
+            the_task.draw(rng_for(seed, "reset"), world)
+            starts += 1
     except UsageError as error:
-        return replace(checked, refused=str(error))
-    world = World(scene)
-    world.update()
-    objects, goals, why, found, drawn = list[tuple[float, float]](), list[tuple[float, float]](), "", 0, 0
-    for seed in stream_seeds("validation", STARTS):
-        if drawn - found == _FEW:
-            break
-        drawn += 1
-        try:
-            poses = the_task.draw(rng_for(seed, "reset"), world).poses
-        except UsageError as error:
-            why = str(error)
-            continue
-        found += 1
-        for thing, (at, _) in poses.items():
-            (objects if thing in scene.objects else goals).append((float(at[0]), float(at[1])))
-    return replace(checked, refused=why, found=found, drawn=drawn, objects=tuple(objects), goals=tuple(goals))
+        return TaskCheck(task, width, starts, str(error))
+    return TaskCheck(task, width, starts)
 
 
 def widths(task: Task) -> dict[str, float]:
@@ -168,23 +160,149 @@ def widths(task: Task) -> dict[str, float]:
 
 def reach_facts(robot: Robot) -> tuple[float, float]:
     """Return `table` and `half_width` of a `RobotCheck`; takes seconds if the map of the reach is not kept yet."""
-    reach, (x, y), half_width = reach_of(robot), robot.workspace.centre, robot.workspace.half_width
-
-    def share(half: float) -> float:
-        steps = np.linspace(-half, half, 41).tolist()
-        return float(np.mean([reach.has((x + dx, y + dy, LOW)) for dx in steps for dy in steps]))
-
+    half_width = robot.workspace.half_width
     narrower = np.arange(half_width, 0.0, -_NARROWER).tolist()
-    return share(half_width), round(next((half for half in narrower if share(half) >= ENOUGH), 0.0), 3)
+    enough = next((half for half in narrower if np.mean(_reached(robot, half, 41)) >= ENOUGH), 0.0)
+    return float(np.mean(_reached(robot, half_width, 41))), round(enough, 3)
 
 
-def _json(result: EvalResult | None) -> dict[str, Any] | None:
-    if result is None:
-        return None
-    success = result.success
-    return {
-        "successes": success.successes,
-        "n": success.n,
-        "interval": success.interval,
-        "failures": result.failures,
-    }
+def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
+    """Whether the hand, pointing down, gets to the points of a square on the table, n x n, in rows along x."""
+    reach, (x, y), steps = reach_of(robot), robot.workspace.centre, np.linspace(-half, half, n).tolist()
+    return [[reach.has((x + dx, y + dy, LOW)) for dx in steps] for dy in steps]
+
+
+def check_report(
+    check: RobotCheck, pictures: Sequence[Still], no_pictures: str, command: str, config: Mapping[str, Any]
+) -> Report:
+    """Return the page of a check. no_pictures: why there are none."""
+    lead = () if pictures else (f"No pictures: {no_pictures}",)
+    tasks = (
+        f"Starts: of {STARTS} that are drawn, how many find a place within reach before one does not. Random actions: "
+        "a tenth of the control steps, the gripper's too. Intervals are Wilson's score intervals."
+    )
+    home = "Of ee, x is red, y (the fingers' way) green, z (out of the hand) blue; the workspace is blue."
+    reach = (
+        f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table: where "
+        "it is green."
+    )
+    return Report(
+        title=f"{check.robot.name}: robot check",
+        verdict=verdict(check),
+        facts=advice(check),
+        command=command,
+        config=config,
+        sections=(
+            Section("Tasks", tables=(task_table(check),), notes=(tasks,)),
+            Section("At home in its scene", lead, stills=tuple(pictures), notes=(home, home_line(check))),
+            Section("Where it reaches", figures=(_reach_figure(check.robot),), notes=(reach,)),
+        ),
+    )
+
+
+def verdict(check: RobotCheck) -> str:
+    """Return in a sentence which tasks a robot can do."""
+    count, cannot = len(check.tasks), ", ".join(task.name for task in check.failed)
+    asked = any(task.clean is not None for task in check.tasks)
+    can, end = ("can do", "") if asked else ("has starts for", "; the expert was not asked")
+    words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} task{'s' if count > 1 else ''}{end}"
+    words += f"; it cannot do {cannot}" if cannot else ""
+    shaken = [(task.name, task.noisy.success) for task in check.tasks if task.done and task.noisy is not None]
+    if poor := [f"{one} in {success.successes} of {success.n}" for one, success in shaken if success.rate < SOLVES]:
+        words += f"; with a tenth of the steps random the expert solves {', '.join(poor)} episodes"
+    return f"{words}."
+
+
+def task_table(check: RobotCheck) -> Table:
+    """Return the tasks: object against opening, starts, and the expert's success, clean and with random actions."""
+    columns = ("task", "object [mm]", "starts", "expert [95 % interval]", "with random actions")
+    rows: list[tuple[str, ...]] = []
+    for task in check.tasks:
+        fits = "fits" if task.width < check.opening else "too wide"
+        wide = f"{1000 * task.width:.0f}, {fits}" if task.width else "none grasped"
+        tests = (str(one.success) if one else "" for one in (task.clean, task.noisy))
+        rows.append((task.name, wide, f"{task.starts} of {STARTS}", *tests))
+    return Table(columns, tuple(rows), tuple(EXPERT if task.done else CLONING for task in check.tasks))
+
+
+def home_line(check: RobotCheck) -> str:
+    """Return in sentences how wide the gripper opens, and whether the robot is free at home."""
+    opens = f"The gripper opens to {1000 * check.opening:.1f} mm."
+    if not check.overlaps:
+        return f"{opens} At home no part of the robot touches another or the table."
+    pairs = ", ".join(f"{one} and {other}" for one, other in check.overlaps)
+    return f"{opens} At home these overlap, as in every posture: {pairs}; take one of their contacts out of the model."
+
+
+def _reach_figure(robot: Robot) -> Figure:
+    """Draw where the hand, pointing down, gets to on the table, and the workspace."""
+    (x, y), half = robot.workspace.centre, robot.workspace.half_width
+    wide = half + _ROOM
+    extent = (x - wide, x + wide, y - wide, y + wide)
+    with drawing(1, size=(3.6, 3.6)) as (drawn, axes):
+        axis, reached = axes[0, 0], np.array(_reached(robot, wide, 61), float)
+        axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=3, interpolation="nearest")
+        axis.plot(*np.array([(x + a * half, y + b * half) for a, b in _SQUARE]).T, color=INK, lw=1)
+        axis.set(xlim=extent[:2], ylim=extent[2:], xlabel="x, away from the base [m]", ylabel="y, to its left [m]")
+        axis.grid(visible=False)
+        return to_figure(drawn, "Where the hand reaches on the table, from above")
+
+
+def advice(check: RobotCheck) -> tuple[str, ...]:
+    """Return what to change in the robot's YAML, the arm's first, then for each task that cannot be done."""
+    lines, space = list[str](), check.robot.workspace
+    if check.table < ENOUGH:
+        change = f"take half_width: {check.half_width:g} in place of {space.half_width:g}"
+        if not check.half_width:
+            change = f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green"
+        if not check.table and check.robot.gripper.files is not None:
+            change += "; or turn the gripper on the hand by gripper.quaternion"
+        lines.append(f"The hand gets to {100 * check.table:.0f} % of the workspace on the table: {change}.")
+    return (*lines, *(line for task in check.failed for line in _task_advice(check, task)))
+
+
+def _task_advice(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
+    if task.width >= check.opening:
+        change = "widen gripper.open, or leave the task out"
+        if isinstance(get_task(task.name), TakesShape):
+            narrow = max(0.005, math.floor(0.6 * check.opening / 0.005) * 0.005)
+            change = f"choose a narrower one, --task.object=box:{narrow:.3g}, or widen gripper.open"
+        sizes = f"{1000 * task.width:.0f} mm wide, the gripper opens {1000 * check.opening:.0f} mm"
+        yield f"{task.name}: its object is {sizes}: {change}."
+    elif task.refused:
+        yield f"{task.name}: {task.refused}."
+    elif task.clean is not None:
+        success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
+        failed = f"the expert fails in {success.n - success.successes} of {success.n} episodes"
+        watch = f"manip-il view --robot.type={check.name} --task.type={task.name}"
+        yield f"{task.name}: {failed}, {count} in phase {phase}; watch it: {watch}"
+
+
+def looks(name: str) -> tuple[Still, ...]:
+    """Return pictures of a robot at home, with its frame `ee` and its workspace drawn into them.
+
+    Raises `RenderError` without off-screen OpenGL.
+    """
+    scene = scene_of(name, "reach")
+    data, gripper = mujoco.MjData(scene.model), scene.gripper
+    data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
+    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
+    mujoco.mj_forward(scene.model, data)
+    ee, rotation = data.site_xpos[scene.ee_site].copy(), data.site_xmat[scene.ee_site].reshape(3, 3)
+    lines = [Line(ee, ee + 0.06 * axis, colour, 0.0035) for axis, colour in zip(rotation.T, _AXES, strict=True)]
+    (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
+    corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]
+    lines += [Line(a, b, _SPACE, 0.003) for a, b in itertools.pairwise(corners)]
+    points = np.vstack([data.xpos[1:], corners])
+    points = points[np.abs(points).max(axis=1) < 3]  # without what was put out of sight
+    low, high = points.min(axis=0), points.max(axis=0)
+    distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
+    views: tuple[tuple[str | Overview, str], ...] = (
+        (Overview((low + high) / 2, distance, 55.0, -20.0), "from outside"),
+        ("front", "what camera front sees"),
+        ("wrist", "what camera wrist sees"),
+    )
+    data.mocap_pos[:, 2] = -9.0  # goals: out of sight
+    return tuple(
+        Still(words, encode_jpeg(marked_picture(scene, data, view, (480, 640), FILM, lines))) for view, words in views
+    )

@@ -10,7 +10,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.errors import RenderError
-from manip_il.evaluation import robot_page
+from manip_il.evaluation import robot_check
 from manip_il.robots.reach import Reach, keep_reach
 from manip_il.robots.table import get_robot
 
@@ -34,7 +34,7 @@ def no_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise RenderError("no off-screen OpenGL")
 
-    monkeypatch.setattr(robot_page, "looks", refuse)
+    monkeypatch.setattr(robot_check, "looks", refuse)
 
 
 def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: None, capsys):
@@ -42,21 +42,12 @@ def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: N
     assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=0", f"--output_dir={out}"]) == 0
     said = capsys.readouterr()
     assert "the page has no pictures: no off-screen OpenGL" in said.err
-    assert "own has starts for reach; the expert was not asked." in said.out
+    assert "own has starts for 1 of 1 task; the expert was not asked." in said.out
     page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
     assert "No pictures: no off-screen OpenGL" in page
     assert "data:image/jpeg" not in page
-    assert found["tasks"] == [
-        {
-            "task": "reach",
-            "done": True,
-            "widths": {},
-            "refused": "",
-            "starts": {"found": 50, "drawn": 50},
-            "clean": None,
-            "noisy": None,
-        }
-    ]
+    facts = {"task": "reach", "done": True, "width": 0.0, "starts": 50, "refused": ""}
+    assert found["tasks"] == [facts | {"clean": None, "noisy": None}]
 
 
 def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_opengl: None, capsys):
@@ -101,4 +92,4 @@ def test_the_page_of_an_arm_has_pictures_and_episodes(own: Path, tmp_path: Path,
     assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=2", f"--output_dir={out}"]) == 0
     assert "| 50 of 50 | 100" in capsys.readouterr().out.replace("  ", " ")
     assert (out / "check.html").read_text().count("data:image/jpeg") == 3
-    assert json.loads((out / "check.json").read_text())["tasks"][0]["clean"]["successes"] == 2
+    assert json.loads((out / "check.json").read_text())["tasks"][0]["clean"]["success_rate"] == 1

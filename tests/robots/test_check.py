@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from manip_il.evaluation import robot_check, robot_page
+from manip_il.evaluation import robot_check
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.robot_check import (
     RobotCheck,
     TaskCheck,
+    advice,
+    check_report,
     check_starts,
     reach_facts,
+    task_table,
+    verdict,
     widths,
 )
-from manip_il.evaluation.robot_page import advice, check_report, task_table, verdict
 from manip_il.evaluation.tables import CLONING, EXPERT
 from manip_il.robots.gripper import sweep
 from manip_il.robots.reach import Reach
@@ -78,15 +80,14 @@ def test_shares_of_a_workspace_are_those_of_its_points(own: Robot, monkeypatch: 
     assert half_width == 0
 
 
-def test_starts_are_drawn_until_a_few_find_no_place(own: Robot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_starts_are_drawn_until_one_finds_no_place(own: Robot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     path = str(write(tmp_path))
     monkeypatch.setattr("manip_il.sim.world.reach_of", lambda robot: EVERYWHERE)
     facts = check_starts(path, "reach")
-    assert (facts.found, facts.drawn, facts.refused, facts.done) == (50, 50, "", True)
-    assert len(facts.goals) == 50
+    assert (facts.starts, facts.refused, facts.done) == (50, "", True)
     monkeypatch.setattr("manip_il.sim.world.reach_of", lambda robot: Reach(EVERYWHERE.origin, EVERYWHERE.errors + 1))
     facts = check_starts(path, "reach")
-    assert (facts.found, facts.drawn, facts.done) == (0, 3, False)
+    assert (facts.starts, facts.done) == (0, False)
     assert "none of 1000 places" in facts.refused
 
 
@@ -99,29 +100,28 @@ def evaluation(solved: int) -> EvalResult:
     return EvalResult("expert", "own", "lift", {}, episodes, EvalSettings(100, 0.02))
 
 
-FOUND: dict[str, Any] = {"found": 50, "drawn": 50}
 SOLVED, FAILED = evaluation(10), evaluation(7)
 TASK_CHECKS = {
-    "solved": (TaskCheck("lift", {"object": 0.05}, clean=SOLVED, noisy=FAILED, **FOUND), True, []),
-    "not asked": (TaskCheck("lift", {"object": 0.05}, **FOUND), True, []),
+    "solved": (TaskCheck("lift", 0.05, 50, clean=SOLVED, noisy=FAILED), True, []),
+    "not asked": (TaskCheck("lift", 0.05, 50), True, []),
     "failed": (
-        TaskCheck("lift", {"object": 0.05}, clean=FAILED, noisy=FAILED, **FOUND),
+        TaskCheck("lift", 0.05, 50, clean=FAILED, noisy=FAILED),
         False,
         ["lift: the expert fails in 3 of 10", "2 in phase close", "--robot.type=own.yaml --task.type=lift"],
     ),
     "too wide": (
-        TaskCheck("lift", {"object": 0.12}, "it is 0.12 m wide"),
+        TaskCheck("lift", 0.12, 0, "it is 0.12 m wide"),
         False,
         ["120 mm wide", "--task.object=box:0.05", "gripper.open"],
     ),
-    "too wide, its own": (TaskCheck("stack", {"object": 0.12}, "wide"), False, ["gripper.open, or leave the task out"]),
-    "no room": (TaskCheck("sort", {}, "no place for it", found=3, drawn=6), False, ["sort: no place for it"]),
+    "too wide, its own": (TaskCheck("stack", 0.12, 0, "wide"), False, ["gripper.open, or leave the task out"]),
+    "no room": (TaskCheck("sort", 0.0, 3, "no place for it"), False, ["sort: no place for it"]),
 }
 
 
 @pytest.mark.parametrize("case", TASK_CHECKS)
 def test_what_cannot_be_done_is_said_with_what_to_change(case: str, own: Robot, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(robot_page, "reach_of", lambda robot: EVERYWHERE)
+    monkeypatch.setattr(robot_check, "reach_of", lambda robot: EVERYWHERE)
     task, done, words = TASK_CHECKS[case]
     check = a_check(own, task)
     assert task.done == done
@@ -137,11 +137,11 @@ def test_what_cannot_be_done_is_said_with_what_to_change(case: str, own: Robot, 
 
 def test_a_task_that_random_actions_spoil_is_said_beside_what_can_be_done(own: Robot):
     spoiled, steady = (
-        TaskCheck(name, {}, clean=SOLVED, noisy=noisy, **FOUND) for name, noisy in (("lift", FAILED), ("reach", SOLVED))
+        TaskCheck(name, 0.0, 50, clean=SOLVED, noisy=noisy) for name, noisy in (("lift", FAILED), ("reach", SOLVED))
     )
     said = "with a tenth of the steps random the expert solves lift in 7 of 10 episodes"
     assert said in verdict(a_check(own, spoiled, steady))
-    assert verdict(a_check(own, steady)) == "own can do reach."
+    assert verdict(a_check(own, steady)) == "own can do 1 of 1 task."
 
 
 def test_a_workspace_beyond_reach_gets_a_width_that_is_within(own: Robot):
