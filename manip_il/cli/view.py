@@ -44,7 +44,7 @@ class ViewOptions:
     """Watch a robot at its task: in MuJoCo's viewer, without a display in a browser (Rerun), or from a file.
 
     Shows episodes in real time until the window is closed, Ctrl-C, or so many. Without a display it serves the pictures
-    of the cameras, joints, actions, phase, error and progress to a browser; `--output` writes them to a file for `rerun
+    of the cameras, joints, actions, phase and progress to a browser; `--output` writes them to a file for `rerun
     FILE.rrd`, on any machine, as fast as they come.
     """
 

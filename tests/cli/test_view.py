@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -69,12 +68,8 @@ def test_a_file_holds_every_step_as_it_was_simulated(tmp_path, no_opengl, capsys
     progress = np.array(column(path, schema.PROGRESS, SCALARS)).ravel()
     recorded = np.concatenate([episode.columns[schema.PROGRESS].ravel() for episode in episodes]).astype(float)
     np.testing.assert_allclose(progress, recorded, atol=1e-6)
-    error = np.array(column(path, "error", SCALARS)).ravel()
-    assert error[0] > 0.02 > error[steps[0] - 1]
     events = [line for [line] in column(path, "events", TEXT)]
-    task = "seed 3000000: Move the hand to the green goal."
-    assert events[:2] == [task, f"seed 3000000: solved, {steps[0]} steps"]
-    assert len(events) == 4
+    assert events == [f"seed {3_000_000 + i}: solved, {steps[i]} steps" for i in range(2)]
     assert f"/{schema.EXPERT_PHASE}" in entities(path)
     assert not any(schema.IMAGES in entity for entity in entities(path))
 
@@ -139,10 +134,3 @@ def test_a_display_that_does_not_answer_is_said_in_one_line(monkeypatch, error):
     monkeypatch.setenv("DISPLAY", ":77")
     assert main(REACH) == 1
     assert "no window can be opened on the display (DISPLAY=:77)" in error()
-
-
-def test_without_rerun_what_to_install_is_said_in_one_line(monkeypatch, tmp_path, no_opengl, error):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    assert main([*REACH, f"--output={tmp_path / 'a.rrd'}"]) == 1
-    assert "rerun is not installed; run: pip install 'rerun-sdk" in error()
-    assert list(tmp_path.iterdir()) == []
