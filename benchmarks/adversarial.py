@@ -34,9 +34,8 @@ from manip_il.algorithms.gail import gail
 from manip_il.algorithms.vector_env import ActionRange, Lockstep
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.learn.discriminators import Discriminator
-from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
+from manip_il.learn.network import MLPNetwork, Shape, fit_statistics, threads
 from manip_il.learn.ppo import Learner, lent_generators
-from manip_il.learn.threads import threads
 from manip_il.learn.transitions import Demonstrations, Transitions
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 

@@ -30,8 +30,8 @@ from lerobot.datasets import LeRobotDataset
 import datasets
 from manip_il.data.dataset import Dataset
 from manip_il.learn.batches import Augment, pictures_to_float
+from manip_il.learn.network import threads
 from manip_il.learn.samples import Pictures, Samples, Windows
-from manip_il.learn.threads import threads
 
 BATCH = 64
 SECONDS = 2.0  # of ours, each time

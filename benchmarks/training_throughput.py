@@ -24,8 +24,8 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec, features
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.mlp import MLPConfig
+from manip_il.learn.network import threads
 from manip_il.learn.sources import Sources
-from manip_il.learn.threads import threads
 from manip_il.learn.train import Trainer
 
 BATCH = 512

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.learn.fit_config import FitConfig, MLPOptions
+from manip_il.learn.fit_config import FitConfig
 from manip_il.option import check_bounds, option
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, make_config
@@ -278,5 +278,5 @@ def check_labels(config: RunConfig) -> None:
         from manip_il.learn.losses import LIKELIHOODS
         from manip_il.learn.policy import NO_LIKELIHOOD
 
-        if not fit.is_mlp or fit.policy.get("loss", MLPOptions.loss) not in LIKELIHOODS:
+        if not fit.is_mlp or fit.policy.get("loss") not in LIKELIHOODS:
             raise UsageError(NO_LIKELIHOOD)

@@ -33,10 +33,9 @@ from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.discriminators import Discriminator
-from manip_il.learn.network import MLPNetwork
+from manip_il.learn.network import MLPNetwork, threads
 from manip_il.learn.ppo import Learner, lent_generators
 from manip_il.learn.start import save_policy, start_conversion, start_policy
-from manip_il.learn.threads import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
     TRAINING_STATE,

@@ -147,7 +147,7 @@ class CNNPolicy(MLPPolicy):
             self.privileged = _perceptron(self.seen_size, config.width, config.depth, size)
             self.register_buffer("truth_mean", torch.zeros(size))
             self.register_buffer("truth_scale", torch.ones(size))
-        self.model = MLPNetwork(self.seen_size + size, n, config.network_shape())
+        self.model = MLPNetwork(self.seen_size + size, n, config)
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:

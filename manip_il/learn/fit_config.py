@@ -37,15 +37,6 @@ def _by_default(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class MLPOptions:
-    """The options of the mlp that change most; `MLPConfig` has them all."""
-
-    loss: str = option("l1", "l1, mse, gaussian, mixture or categorical")
-    width: int = option(256, "units per layer")
-    depth: int = option(3, "hidden layers")
-
-
-@dataclass(frozen=True)
 class FitConfig:
     """Options of a fit; None is the default of the policy's kind.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, override
 
 import torch
@@ -24,13 +24,11 @@ from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.fit_config import MLPOptions
-from manip_il.learn.names import EE_DELTA, JOINT_DELTA
+from manip_il.learn.names import EE_DELTA
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
 from manip_il.learn.samples import Table, valid_frames
 
 __path__: list[str] = []
-SIGMA = 3.0  # [bins]
 
 
 @LRSchedulerConfig.register_subclass("warm_up_and_cosine")
@@ -54,34 +52,14 @@ class WarmUpAndCosineConfig(LRSchedulerConfig):
 
 @PreTrainedConfig.register_subclass("mlp")
 @dataclass
-class MLPConfig(PreTrainedConfig):
-    """A multi-layer perceptron from joint and environment state to one action.
+class MLPConfig(Shape, PreTrainedConfig):
+    """A multi-layer perceptron from joint and environment state to one action; its options are `Shape`'s.
 
-    loss: one of `manip_il.learn.losses.LOSSES`. components: of `mixture`. bins: a dimension, of
-    `categorical`, over the range of the data. sigma: how far `categorical` smears a target, in bins; 0: over the two
-    nearest. None is the default, but for a configuration with features, as a checkpoint's is: it was saved before there
-    was a sigma, so it is 0. clamp: bound of the normalised inputs, in standard deviations, so that a state
-    far off the data cannot blow the outputs up. action_space: of `manip_il.learn.action_spaces`, in which it learns.
-    scales: lengths s [m]; of every offset x among the inputs (`object_from_ee.x`, ...) tanh(x / s) is an input, too.
-    scaled: the columns of these offsets, taken from the dataset.
+    A configuration with features but no sigma, as a checkpoint's, was saved before there was one, so it is 0.
 
     The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
-
-    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of range.
     """
-
-    width: int = MLPOptions.width
-    depth: int = MLPOptions.depth
-    activation: str = "silu"
-    loss: str = MLPOptions.loss
-    components: int = 5
-    bins: int = 21
-    sigma: float | None = None
-    clamp: float = 10.0
-    action_space: str = JOINT_DELTA
-    scales: tuple[float, ...] = ()
-    scaled: tuple[int, ...] = ()
 
     device: str | None = "cpu"
     push_to_hub: bool = False  # type: ignore[assignment]
@@ -95,19 +73,10 @@ class MLPConfig(PreTrainedConfig):
     observation_delta_indices = action_delta_indices = reward_delta_indices = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sigma is None:
-            self.sigma = 0.0 if self.input_features else SIGMA
-        try:
-            self.network_shape()
-        except UsageError:
-            raise
-        except ManipError as error:
-            raise UsageError(f"policy.{error}") from error
-
-    def network_shape(self) -> Shape:
-        """Return the part that the network is built from."""
-        return Shape(**{field.name: getattr(self, field.name) for field in fields(Shape)})
+        PreTrainedConfig.__post_init__(self)
+        if self.sigma is None and self.input_features:
+            self.sigma = 0.0
+        Shape.__post_init__(self)
 
     @override
     def validate_features(self) -> None:
@@ -180,7 +149,7 @@ class MLPPolicy(PreTrainedPolicy):
         features = config.input_features or {}
         config.input_features = {key: features[key] for key in self.inputs}
         width = sum(features[key].shape[0] for key in self.inputs)
-        self.model = MLPNetwork(width, features[STATE].shape[0], config.network_shape())
+        self.model = MLPNetwork(width, features[STATE].shape[0], config)
 
     def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
         """The columns of the inputs that say how far one thing is from another."""

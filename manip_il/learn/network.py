@@ -6,7 +6,8 @@ importing LeRobot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,60 +20,65 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from manip_il import checks
-from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import ARM, GRIPPER
 from manip_il.learn.checkpoint import WEIGHTS
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
+from manip_il.option import check_bounds, option
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always
 # multiplies this many, filled up with zeros.
 ROWS = 64
-_ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
-ACTIVATIONS = tuple(_ACTIVATIONS)
+ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
+SIGMA = 3.0  # [bins]
 # [rad] or [m]. An input that moves less than this in all of the data is noise that division by its
 # deviation would blow up: it is multiplied by zero instead, so the network never sees it.
 CONSTANT_INPUT = 1e-4
 CONSTANT_TARGET = 1e-6
 
 
-@dataclass(frozen=True)
+@dataclass
 class Shape:
-    """Sizes and kinds that a network is built from; the names are those of `MLPConfig`, which says what they mean.
+    """Sizes and kinds that a network is built from: the options of the `mlp` policy, which are `MLPConfig`'s, too.
 
-    Raises `ManipError` for a value out of range or of another type, `UnknownName` for a loss or activation.
+    loss: one of `LOSSES`. components: of `mixture`. bins: a dimension, of `categorical`, over the range of the data.
+    sigma: how far `categorical` smears a target, in bins; 0: over the two nearest. clamp: bound of the normalised
+    inputs, in standard deviations, so that a state far off the data cannot blow the outputs up. action_space: of
+    `manip_il.learn.action_spaces`, in which it learns. scales: lengths s [m]; of every offset x among the inputs
+    (`object_from_ee.x`, ...) tanh(x / s) is an input, too. scaled: the columns of these offsets, taken from the
+    dataset.
+
+    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of range.
     """
 
-    width: int
-    depth: int
-    activation: str
-    loss: str
-    components: int
-    bins: int
-    clamp: float
-    sigma: float = 0.0  # checkpoints from before there was one have none
+    width: int = option(256, "units per layer", at_least=1)
+    depth: int = option(3, "hidden layers", at_least=1)
+    activation: str = "silu"
+    loss: str = "l1"
+    components: int = option(5, "Gaussians of a mixture", at_least=1)
+    bins: int = option(21, "bins a dimension", at_least=2)
+    sigma: float | None = option(None, "by default 3 bins", at_least=0)
+    clamp: float = option(10.0, "standard deviations", at_least=1e-9)
     action_space: str = JOINT_DELTA
     scales: tuple[float, ...] = ()
     scaled: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("scales", "scaled"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
-        if not all(checks.number("scales", scale, 0.0) > 0 for scale in self.scales):
-            raise ManipError(f"scales is {list(self.scales)}; expected lengths of more than 0")
+        self.sigma = SIGMA if self.sigma is None else self.sigma
+        self.scales, self.scaled = tuple(self.scales), tuple(self.scaled)
+        check_bounds(self, "policy.")
         for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS), ("action_space", ACTION_SPACES)):
             if (value := getattr(self, name)) not in known:
                 raise UnknownName(name, str(value), known)
-        for name, least in (("width", 1), ("depth", 1), ("components", 1), ("bins", 2)):
-            checks.whole(name, getattr(self, name), least, 100_000)
-        if not checks.number("clamp", self.clamp, 0.0) > 0:
-            raise ManipError(f"clamp is {self.clamp}; expected more than 0")
-        checks.number("sigma", self.sigma, 0.0)
+        if not all(scale > 0 for scale in self.scales):
+            raise UsageError(f"policy.scales is {list(self.scales)}; expected lengths of more than 0")
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Shape:
-        """Return the shape in a policy's `config.json`; what an older one does not say is the default."""
-        return cls(**{one.name: config[one.name] for one in fields(cls) if one.name in config})
+        """Return the shape in a policy's `config.json`; one from before there was a sigma has none."""
+        given: dict[str, Any] = {one.name: config[one.name] for one in fields(Shape) if one.name in config}
+        return cls(**{"sigma": 0.0} | given)
 
 
 Statistics = Mapping[str, Tensor]  # by the names of `MLPNetwork`'s buffers
@@ -127,10 +133,10 @@ class MLPNetwork(nn.Module):
         self.adds_joints = shape.action_space == JOINT_DELTA
         self.scales, self.scaled, self.inputs = shape.scales, list(shape.scaled), inputs
         inputs += len(shape.scales) * len(shape.scaled)
-        self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma)
+        self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma or 0.0)
         layers: list[nn.Module] = []
         for width in (inputs, *[shape.width] * (shape.depth - 1)):
-            layers += [nn.Linear(width, shape.width), _ACTIVATIONS[shape.activation]()]
+            layers += [nn.Linear(width, shape.width), ACTIVATIONS[shape.activation]()]
         self.layers = nn.Sequential(*layers, nn.Linear(shape.width, self.head.size))
         for name, size in (("input", inputs), ("target", n)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -194,6 +200,17 @@ class MLPNetwork(nn.Module):
         if not self.adds_joints:
             return targets
         return torch.cat([inputs[:, : self.n - 1] + targets[:, ARM], targets[:, GRIPPER:]], dim=1)
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Let torch use `count` threads inside. They wait by spinning: two on one free core are far slower than one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:

@@ -18,8 +18,7 @@ from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.losses import LIKELIHOODS
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
-from manip_il.learn.network import MLPNetwork, Shape, read_weights
-from manip_il.learn.threads import threads
+from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
 from manip_il.mdp import F32, F64, Images
 
 if TYPE_CHECKING:  # it imports LeRobot, which takes seconds

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from manip_il.errors import ManipError
 from manip_il.learn.batches import generator_of
+from manip_il.learn.network import threads
 from manip_il.learn.reward import RewardNetwork, RewardShape
-from manip_il.learn.threads import threads
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 BY_CHANCE = 0.1  # E

@@ -36,9 +36,9 @@ from manip_il.learn.lerobot_config import LeRobotFit, without_places
 from manip_il.learn.lerobot_policy import build_policy, build_processors
 from manip_il.learn.metrics import Writer, metric_writers
 from manip_il.learn.names import OWN_SPACE
+from manip_il.learn.network import threads
 from manip_il.learn.samples import I64, Batch, load_data
 from manip_il.learn.sources import Sources, input_columns
-from manip_il.learn.threads import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
     last_checkpoint,

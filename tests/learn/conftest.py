@@ -13,8 +13,8 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec, features
 from manip_il.learn.checkpoint import Origin
+from manip_il.learn.network import threads
 from manip_il.learn.sources import Sources
-from manip_il.learn.threads import threads
 from manip_il.mdp import Episode
 
 N, K, EPISODES, LENGTH = 4, 6, 12, 20

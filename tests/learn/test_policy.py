@@ -20,8 +20,8 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
 from manip_il.learn.losses import LIKELIHOODS, LOSSES
 from manip_il.learn.mlp import MLPPolicy
+from manip_il.learn.network import threads
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.threads import threads
 from manip_il.learn.train import fit
 
 from ..damage import edit_json

@@ -10,7 +10,7 @@ import pytest
 
 from manip_il.data import schema as s
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.learn.threads import threads
+from manip_il.learn.network import threads
 from manip_il.mdp import Episode
 from manip_il.preferences.pairs import Clips
 
