@@ -96,7 +96,7 @@ def record(root: Path, size: int) -> Path:
 
 def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
     """Updates as lerobot-train makes them, with the same options."""
-    config = ours.lerobot.policy
+    config: Any = ours.pipeline.policy
     meta: Any = LeRobotDataset("manip/benchmark", root=root).meta
     dataset = LeRobotDataset("manip/benchmark", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
     workers = min(8, len(os.sched_getaffinity(0)))
@@ -105,7 +105,7 @@ def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
     )
     policy = make_policy(config, ds_meta=meta).train()
     before, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
-    optimizer: Any = ours.lerobot.optimizer().build(policy.get_optim_params())
+    optimizer: Any = ours.pipeline.optimizer.build(policy.get_optim_params())
     accelerator = Accelerator(mixed_precision=ours.accelerator.mixed_precision)
     policy, optimizer = accelerator.prepare(policy, optimizer)
     while True:

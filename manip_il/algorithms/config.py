@@ -258,10 +258,10 @@ def check_labels(config: RunConfig) -> None:
 
     LeRobot's configurations are made for this, which imports it; they raise what is wrong with them, too.
     """
-    from manip_il.learn.lerobot_config import LeRobotFit
+    from manip_il.learn.lerobot_config import lerobot_options
 
     fit = config.fit
-    LeRobotFit(fit)
+    lerobot_options(fit)
     plan, dropped = plan_of(fit)
     name, rule = fit.policy.get("type", "mlp"), config.query
     if config.label == "per_state" and plan > 1 and rule.kind != "every":

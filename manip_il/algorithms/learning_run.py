@@ -31,7 +31,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD
-from manip_il.learn.checkpoint import Origin
+from manip_il.learn.checkpoint import Origin, in_one_line
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork, threads
 from manip_il.learn.ppo import Learner, lent_generators
@@ -40,9 +40,8 @@ from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
     TRAINING_STATE,
     last_checkpoint,
+    new_checkpoint,
     read_step,
-    readable_state,
-    unpublished,
     write_own_files,
 )
 from manip_il.learn.transitions import Transitions, read_demonstrations
@@ -98,7 +97,7 @@ class LearningRun(Run):
         checkpoint = last_checkpoint(self.folder, resume=True)
         if checkpoint is not None:
             step, policy = read_step(checkpoint), checkpoint / PRETRAINED_MODEL
-            with readable_state(checkpoint):
+            with in_one_line(f"{checkpoint} cannot be resumed"):
                 self._number, self._simulated = int(step["step"]), int(step["simulated"])
                 self._metrics, self._validated_at = dict(step["metrics"]), int(step["validated_at"])
             yield self._result(policy, self._validate_if_due(policy))
@@ -109,7 +108,7 @@ class LearningRun(Run):
     def iterations(self) -> Iterator[int]:
         """Yield the numbers, from 1 or from the last finished iteration's on, until all steps are simulated."""
         if checkpoint := last_checkpoint(self.folder, resume=True):
-            with readable_state(checkpoint), threads(1):
+            with in_one_line(f"{checkpoint} cannot be resumed"), threads(1):
                 self._learner.load(checkpoint / TRAINING_STATE, self._modules)
         while self._simulated < self.config.steps:
             self._number += 1
@@ -169,7 +168,7 @@ class LearningRun(Run):
         fingerprint, space = env_fingerprint(config.env), self.conversion.space
         origin = Origin.of(self._spec, fingerprint, self._options(), action_space=space)
         step = {"step": self._number, "simulated": self._simulated, "metrics": self._metrics}
-        with unpublished(self.folder / "checkpoints" / f"{self._number:06d}") as new:
+        with new_checkpoint(self.folder / "checkpoints" / f"{self._number:06d}") as new:
             save_policy(self._policy, self.conversion, new / PRETRAINED_MODEL)
             (new / TRAINING_STATE).mkdir()
             self._learner.save(new / TRAINING_STATE, self._modules)

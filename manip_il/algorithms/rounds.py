@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.algorithms.config import RunConfig, Sampling
-from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
+from manip_il.collect.environments import env_actions
 from manip_il.collect.query import action_gap
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
@@ -89,9 +89,6 @@ def fit_round(
         Sources(tuple(map(Dataset.open, roots))),
         round_fit(config, init_from, member),
         folder,
-        spec=env_spec(config.env, config.cameras),
-        fingerprint=env_fingerprint(config.env, config.cameras),
-        look=asdict(config.cameras.look) if config.cameras is not None else None,
         resume=True,
         weights=weights,
     )

@@ -122,8 +122,7 @@ class DaggerOptions:
         cameras = common.camera_config(self.cameras or CAMERAS if sees else self.cameras, self.image, small=True)
         if start is None:
             return observation, cameras
-        from manip_il.learn.checkpoint import Checkpoint
-        from manip_il.learn.policy_files import policy_cameras
+        from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 
         return observation or Checkpoint.open(start).observation, cameras or policy_cameras(start)
 

@@ -17,7 +17,7 @@ from manip_il.evaluation.film import Shot, run_states
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import EpisodeResult, EvalResult, merge_results
 from manip_il.evaluation.runner import episode_result, replay_differences
-from manip_il.learn.policy_files import policy_sha256
+from manip_il.learn.checkpoint import policy_sha256
 
 NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing is loaded
 

@@ -43,8 +43,8 @@ class ExportOptions:
             raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
         if missing := [name for name in ONNX_PACKAGES if find_spec(name) is None]:
             raise ManipError(f"an ONNX file needs {' and '.join(missing)}: pip install 'manip_il[export]'")
+        from manip_il.learn.checkpoint import policy_sha256
         from manip_il.learn.export import export_onnx
-        from manip_il.learn.policy_files import policy_sha256
 
         exported = export_onnx(path, policy_sha256(path))
         write_file(self.output, exported.data)

@@ -149,7 +149,7 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
     """
     from manip_il.collect.environments import env_fingerprint, env_spec
     from manip_il.data.fingerprint import compare_fingerprints
-    from manip_il.learn.policy_files import policy_cameras
+    from manip_il.learn.checkpoint import policy_cameras
 
     path, origin, cameras = checkpoint.path, checkpoint.origin, policy_cameras(checkpoint.path)
     spec = env_spec(env, cameras)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:  # the learner takes a second to import
     from numpy.typing import NDArray
 
     from manip_il.data.dataset import Dataset
-    from manip_il.learn.lerobot_config import LeRobotFit
     from manip_il.learn.sources import Sources
 
 RANK = "RANK"  # the variable by which processes that were started together know their place
@@ -48,7 +47,7 @@ class TrainOptions:
     """
 
     example: ClassVar[str] = (
-        "manip-il train --dataset.root=datasets/demos --policy.type=act --policy.chunk_size=16 --output_dir=runs/act"
+        "manip-il train --dataset.root=datasets/demos --policy.type=act --observation=state --output_dir=runs/act"
     )
     first: ClassVar[str] = "dataset.root policy observation action_space steps batch_size output_dir resume"
     dataset: SourceGroup
@@ -78,14 +77,14 @@ class TrainOptions:
 
     def run(self) -> None:
         """Read the datasets, fit, and say where the checkpoint is."""
-        from manip_il.learn.lerobot_config import LeRobotFit
+        from manip_il.learn.lerobot_config import lerobot_options
 
         if not _is_first_process():
             set_quiet(True)
         config, folder = self._fit_config(), self.output.output_dir
-        lerobot = LeRobotFit(config)  # refuses what LeRobot would, before anything is written
+        options, _ = lerobot_options(config)  # refuses what LeRobot would, before anything is written
         sources = self._sources(config)
-        weights = self._frame_weights(lerobot, sources.datasets[0])
+        weights = self._frame_weights(getattr(options.policy, "chunk_size", None), sources.datasets[0])
         with self.output.open(self) if _is_first_process() else contextlib.nullcontext():
             path = self._fit(config, sources, weights)
         if _is_first_process():
@@ -114,15 +113,14 @@ class TrainOptions:
             warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
         return sources
 
-    def _frame_weights(self, lerobot: LeRobotFit, dataset: Dataset) -> NDArray[np.float64] | None:
+    def _frame_weights(self, chunk: int | None, dataset: Dataset) -> NDArray[np.float64] | None:
         """Return how often each frame is drawn, relative to the others, (N,); None if all are drawn alike."""
         if self.weights is None:
             return None
         from manip_il.learn.samples import rabc_weights
 
         episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
-        ahead = getattr(lerobot.policy, "chunk_size", None) or int(dataset.fps)
-        weights = rabc_weights(self.weights, episodes, ahead)
+        weights = rabc_weights(self.weights, episodes, chunk or int(dataset.fps))
         say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         return weights
 

@@ -14,8 +14,7 @@ from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, ga
 from manip_il.collect.rollout import Act, Environment, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError, UsageError
-from manip_il.learn.checkpoint import Checkpoint
-from manip_il.learn.policy_files import policy_cameras
+from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig

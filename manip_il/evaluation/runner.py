@@ -22,7 +22,7 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.policy_files import policy_cameras, policy_sha256
+from manip_il.learn.checkpoint import policy_cameras, policy_sha256
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.sim.scene import SCENES_KEPT

@@ -7,21 +7,25 @@ and weights alone are listed in `PLAIN`, the steps of their processors in `_STEP
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, OWN_OBJECT, STATE, RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
+from manip_il.sim.config import CameraConfig, Look
 
 CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that carry an action space
 
+_FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 _PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 _LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
 _PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
@@ -221,6 +225,44 @@ class Checkpoint:
             if name not in self.processors:
                 hint = "LeRobot's migrate_policy_normalization adds it to an old checkpoint"
                 raise ManipError(f"no {self.path / name}; {hint}")
+
+
+def policy_sha256(policy: Path) -> str:
+    """Return the SHA-256 of everything in a policy's folder that decides how it acts, but not of where it lies."""
+    digest = hashlib.sha256()
+    for path in sorted(policy.iterdir()):
+        if path.is_file() and path.name not in _FOR_PEOPLE:
+            digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def policy_cameras(policy: Path) -> CameraConfig | None:
+    """Return cameras, size and light of the pictures that a checkpoint was trained with; None for one without.
+
+    The light is the default if the checkpoint does not say. Raises `ManipError` for cameras that environments do not
+    have, and for a folder or a size that cannot be.
+    """
+    checkpoint = Checkpoint.open(policy)
+    pictures, origin = checkpoint.pictures, checkpoint.origin
+    if not pictures:
+        return None
+    in_order = origin.cameras if origin is not None and set(origin.cameras) == set(pictures) else tuple(pictures)
+    try:
+        size = next(iter(pictures.values()))
+        return CameraConfig(in_order, *size, Look(**(origin.look or {}) if origin else {}))
+    except (UsageError, TypeError) as error:
+        raise ManipError(f"{policy}: its pictures cannot be rendered ({error}); see its {META_FILE}") from error
+
+
+@contextmanager
+def in_one_line(what: str) -> Iterator[None]:
+    """Turn errors of every kind, which others' code raises for files from anywhere, into `ManipError`: `what: ...`."""
+    try:
+        yield
+    except ManipError:
+        raise
+    except Exception as error:
+        raise ManipError(f"{what}: {type(error).__name__}: {checks.one_line(error)}") from error
 
 
 def require_trust(

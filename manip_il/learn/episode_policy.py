@@ -24,8 +24,7 @@ from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
 
-from manip_il import checks
-from manip_il.errors import ManipError
+from manip_il.learn.checkpoint import in_one_line
 
 Batch = dict[str, Any]
 ROWS = 25  # of the episodes that run in lockstep, whose numbers follow each other: each has a row to itself
@@ -57,18 +56,14 @@ class EpisodePolicy:
         """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
         self.forget([episode for episode in self._steps if episode not in set(episodes)])
         seeds = [self._next_seed(episode) for episode in episodes]
-        try:
-            # mixed precision if the policy was trained so, as lerobot-eval has it
-            with torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext():
-                if self.module.config.type == "diffusion":
-                    actions = self._after(self._planned(self._observed(batch, episodes), episodes, seeds))
-                else:
-                    rows = [_rows(batch, i) for i in range(len(episodes))]
-                    actions = torch.cat([self._one(*row) for row in zip(rows, episodes, seeds, strict=True)])
-        except ManipError:
-            raise
-        except Exception as error:  # the code of any policy, with options and statistics from anywhere
-            raise ManipError(f"the policy cannot act: {type(error).__name__}: {checks.one_line(error)}") from error
+        # mixed precision if the policy was trained so, as lerobot-eval has it
+        half = torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
+        with in_one_line("the policy cannot act"), half:
+            if self.module.config.type == "diffusion":
+                actions = self._after(self._planned(self._observed(batch, episodes), episodes, seeds))
+            else:
+                rows = [{key: value[i : i + 1] for key, value in batch.items()} for i in range(len(episodes))]
+                actions = torch.cat([self._one(*row) for row in zip(rows, episodes, seeds, strict=True)])
         return actions.to("cpu", torch.float32)
 
     def forget(self, episodes: Iterable[int]) -> None:
@@ -134,11 +129,6 @@ class EpisodePolicy:
             plans = model.generate_actions(batch, noise=torch.stack(noise))
         for row, (episode, _) in block.items():
             self._memories[episode][ACTION].extend(plans[row : row + 1].transpose(0, 1))
-
-
-def _rows(batch: Batch, i: int) -> Batch:
-    """One row of what is there for every episode, (1, ...)."""
-    return {key: value[i : i + 1] for key, value in batch.items()}
 
 
 def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 
-from manip_il import checks
 from manip_il.data.schema import IMAGES
-from manip_il.errors import ManipError, UnknownName
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.action_steps import add_steps  # known here, they are known to what is loaded
-from manip_il.learn.checkpoint import CONFIG, MEASURED, PROCESSORS, Checkpoint
-from manip_il.learn.lerobot_config import policy_class, policy_types
+from manip_il.learn.checkpoint import MEASURED, PROCESSORS, Checkpoint, in_one_line
+from manip_il.learn.lerobot_config import policy_class
 from manip_il.learn.names import MLP
 from manip_il.learn.network import warm_start
-from manip_il.learn.training_state import readable_state
 
 _DEVICE_STEP = "device_processor"
 _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all of the data is noise, not scale
@@ -40,23 +37,16 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
     warm = config.type == MLP and start is not None and resumed is None
     config.pretrained_path = None if warm else resumed or start
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
-            policy = make_policy(config, ds_meta=meta)
-    except ManipError:
-        raise
-    except ImportError as error:
-        raise ManipError(f"--policy.type={config.type} needs more packages: {error}") from error
-    except Exception as error:  # weights from anywhere, read by the code of any policy: errors of every kind
-        if config.pretrained_path is not None:
-            line = f"{type(error).__name__}: {checks.one_line(error)}"
-            raise ManipError(f"{config.pretrained_path} does not fit this policy: {line}") from error
-        if not weights or not isinstance(error, OSError):
-            raise
-        raise ManipError(
-            f"cannot download {weights} ({error}): train from scratch with --policy.pretrained_backbone_weights=null, "
-            f"or put the file that torchvision names into {torch.hub.get_dir()}/checkpoints"
-        ) from error
+    what = f"{config.pretrained_path} does not fit this policy"
+    if config.pretrained_path is None:
+        what = f"cannot make --policy.type={config.type}"
+    if weights:
+        what += (
+            f" with {weights} (without a network: --policy.pretrained_backbone_weights=null, or put the file that "
+            f"torchvision names into {torch.hub.get_dir()}/checkpoints)"
+        )
+    with _lerobot(what):
+        policy = make_policy(config, ds_meta=meta)
     if warm:
         model: Any = policy.model
         warm_start(model, Path(str(start)))
@@ -66,31 +56,30 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     return policy
 
 
-def build_processors(
-    config: PreTrainedConfig,
-    meta: Any,
-    checkpoint: Path | None,
-    *,
-    trust: bool = False,
-    conversion: Conversion | None = None,
-) -> tuple[Any, Any]:
-    """Return LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's.
+def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion | None = None) -> tuple[Any, Any]:
+    """Return LeRobot's pre- and postprocessor, new, with the dataset's statistics.
 
-    conversion: of the actions, which the dataset's metadata then has, if the processors are to carry one. Raises
-    what `Checkpoint.require_trust` raises, and `ManipError` if the checkpoint's cannot be read.
+    conversion: of the actions, which the dataset's metadata then has, if the processors are to carry one.
     """
-    if checkpoint is None:
-        before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
-        if conversion is not None:
-            add_steps(before, after, conversion)
-        return before, after
-    opened = Checkpoint.open(checkpoint)
-    opened.require_processors()
-    opened.require_trust(trust)
-    converted = {} if conversion is None else {MEASURED: {"converted": True}}
-    overrides = {_DEVICE_STEP: {"device": config.device}, **converted}
-    with readable_state(checkpoint):
-        return make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=overrides)
+    before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
+    if conversion is not None:
+        add_steps(before, after, conversion)
+    return before, after
+
+
+def load_processors(
+    checkpoint: Checkpoint, config: PreTrainedConfig, *, trust: bool = False, learns: bool = False
+) -> tuple[Any, Any]:
+    """Return the processors of a checkpoint, on the configuration's device. learns: going on with a fit.
+
+    Raises `ManipError` if they are not there, and what `Checkpoint.require_trust` raises.
+    """
+    checkpoint.require_processors()
+    checkpoint.require_trust(trust)
+    names = [step["registry_name"] for step in checkpoint.processors[PROCESSORS[0]]]
+    overrides = {_DEVICE_STEP: {"device": config.device}, **({MEASURED: {"converted": True}} if learns else {})}
+    kept = {name: values for name, values in overrides.items() if name in names}
+    return make_pre_post_processors(config, str(checkpoint.path), preprocessor_overrides=kept)
 
 
 def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -116,31 +105,22 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
     Raises `UnknownName` for a type that is not known, `ManipError` if packages are missing, if what it names would have
     to be trusted and is not, or if LeRobot cannot load the folder.
     """
-    kind, path = checkpoint.kind, checkpoint.path
-    if kind not in policy_types():
-        raise UnknownName(f"policy type in {path / CONFIG}:", kind, policy_types())
-    checkpoint.require_processors()
-    checkpoint.require_trust(trust)
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
-            return _load(checkpoint, device)
-    except ImportError as error:
-        raise ManipError(
-            f"{path} is a policy of type {kind!r}, which needs more packages: {checks.one_line(error)}"
-        ) from error
-    except Exception as error:  # a folder from anywhere, read by the code of any policy: errors of every kind
-        raise ManipError(f"{path}: LeRobot cannot load it: {type(error).__name__}: {checks.one_line(error)}") from error
-
-
-def _load(checkpoint: Checkpoint, device: str) -> tuple[PreTrainedPolicy, Any, Any]:
+    cls = policy_class(checkpoint.kind)
     own = {key: value for key, value in checkpoint.config.items() if key != "type"}
-    # Not `PreTrainedConfig.from_pretrained`, which leaves a temporary file behind each time
-    config = draccus.decode(policy_class(checkpoint.kind), own | {"device": device})
-    # Weights come from the checkpoint; torchvision would download its own first.
-    if hasattr(config, "pretrained_backbone_weights"):
-        config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
-    policy = get_policy_class(checkpoint.kind).from_pretrained(checkpoint.path, config=config, strict=True)
-    placed = any(step["registry_name"] == _DEVICE_STEP for step in checkpoint.processors[PROCESSORS[0]])
-    overrides = {_DEVICE_STEP: {"device": device}} if placed else {}
-    before, after = make_pre_post_processors(config, str(checkpoint.path), preprocessor_overrides=overrides)
-    return policy, before, after
+    checkpoint.require_trust(trust)
+    with _lerobot(f"{checkpoint.path}: LeRobot cannot load it"):
+        # Not `PreTrainedConfig.from_pretrained`, which leaves a temporary file behind each time
+        config = draccus.decode(cls, own | {"device": device})
+        # Weights come from the checkpoint; torchvision would download its own first.
+        if hasattr(config, "pretrained_backbone_weights"):
+            config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
+        processors = load_processors(checkpoint, config, trust=trust)
+        policy = get_policy_class(checkpoint.kind).from_pretrained(checkpoint.path, config=config, strict=True)
+        return policy, *processors
+
+
+@contextlib.contextmanager
+def _lerobot(what: str) -> Iterator[None]:
+    """`in_one_line`, and what LeRobot prints is dropped, as standard output belongs to the caller."""
+    with in_one_line(what), contextlib.redirect_stdout(io.StringIO()):
+        yield

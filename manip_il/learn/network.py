@@ -77,8 +77,9 @@ class Shape:
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Shape:
         """Return the shape in a policy's `config.json`; one from before there was a sigma has none."""
-        given: dict[str, Any] = {one.name: config[one.name] for one in fields(Shape) if one.name in config}
-        return cls(**{"sigma": 0.0} | given)
+        given: dict[str, Any] = {"sigma": 0.0}
+        given |= {one.name: config[one.name] for one in fields(Shape) if one.name in config}
+        return cls(**given)
 
 
 Statistics = Mapping[str, Tensor]  # by the names of `MLPNetwork`'s buffers

@@ -18,13 +18,13 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, STATS, TASK_INDEX, TIMESTAMP
 from manip_il.data.schema import ACTION, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.learn.checkpoint import in_one_line
 
 I64 = NDArray[np.int64]
 Table = Mapping[str, NDArray[Any]]
@@ -256,10 +256,8 @@ def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 
-    try:
+    with in_one_line(f"{path} is no file of weights"):
         found = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
-    except Exception as error:  # of every kind: a file of the user's, read by pandas
-        raise ManipError(f"{path} is no file of weights: {checks.one_line(error)}") from error
     if found.episode_lookup != dict(enumerate(episodes.tolist())):
         frames = f"{len(found.episode_lookup)} frames"
         raise MismatchError("episodes", str(path), frames, "the dataset", f"{len(episodes)} frames")

@@ -1,5 +1,6 @@
-"""Checkpoints of a run in LeRobot's layout: written whole or not at all, and gone on from.
+"""What a run keeps: its metrics, and checkpoints in LeRobot's layout, written whole or not at all, and gone on from.
 
+    OUTPUT/metrics.jsonl, OUTPUT/tensorboard
     OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors policy_*processor*.json|safetensors
                                                   train_config.json manip_il.json
                              /training_state/     optimizer_*.safetensors|json scheduler_state.json
@@ -12,21 +13,27 @@ before. A run goes on with `lerobot-train --config_path=.../pretrained_model/tra
 
 from __future__ import annotations
 
+import functools
+import importlib
 import json
 import os
-import shutil
-from collections.abc import Generator, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
-from manip_il.data.atomic import writing
-from manip_il.errors import FolderExistsError, ManipError
+from manip_il.data.atomic import new_folder, write_file
+from manip_il.data.json_lines import Record, append_line, read_lines
+from manip_il.errors import FolderExistsError, UsageError
 from manip_il.learn.checkpoint import META_FILE, Origin
 
+if TYPE_CHECKING:  # LeRobot takes seconds to import
+    from lerobot.configs.train import TrainPipelineConfig
+
 PRETRAINED_MODEL, TRAINING_STATE, STEP_FILE = "pretrained_model", "training_state", "training_step.json"
-_LAST = "last"
+METRICS_FILE, TENSORBOARD_FOLDER = "metrics.jsonl", "tensorboard"
+Writer = Callable[[Record], None]
 
 
 def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
@@ -34,7 +41,7 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
 
     Raises `FolderExistsError` if there is one, unless `resume`.
     """
-    last = output_dir / "checkpoints" / _LAST
+    last = output_dir / "checkpoints/last"
     if not (last / PRETRAINED_MODEL).is_dir():
         return None
     if not resume:
@@ -44,51 +51,23 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
 
 def read_step(checkpoint: Path) -> dict[str, Any]:
     """Return the step and the resume key of a checkpoint folder. Raises `ManipError` if it has none."""
-    path = checkpoint / TRAINING_STATE / STEP_FILE
-    if not path.is_file():
-        raise ManipError(f"no {path}: this checkpoint cannot be resumed; use it as init_from instead")
-    values = checks.read_json(path, "the step of a run")
-    checks.whole(f"{path}: step", values.get("step"), 0, 10**12)
-    return values
+    return checks.read_json(checkpoint / TRAINING_STATE / STEP_FILE, "the step of a run")
 
 
 @contextmanager
-def readable_state(checkpoint: Path) -> Iterator[None]:
-    """Turn what LeRobot, torch and safetensors raise for files that are not whole into `ManipError`."""
-    try:
-        yield
-    except ManipError:
-        raise
-    except Exception as error:  # of every kind: files of tensors and JSON, read by others' code
-        line = checks.shorten(checks.one_line(error))
-        raise ManipError(
-            f"{checkpoint} cannot be resumed ({type(error).__name__}: {line}); start again with --overwrite=true"
-        ) from error
-
-
-@contextmanager
-def unpublished(final: Path) -> Generator[Path]:
+def new_checkpoint(final: Path) -> Generator[Path]:
     """Give an empty folder to write a checkpoint into; on leaving, it gets its name and is `last`.
 
-    An exception removes it. Raises `WriteError` if the disk is full or read-only.
+    An exception removes it. Raises `ManipError` if the disk is full or read-only.
     """
-    temporary = final.parent / f".{final.name}.tmp"
-    try:
-        with writing(final):
-            final.parent.mkdir(parents=True, exist_ok=True)
-            for stale in (temporary, final):  # of a run that was killed before it could switch `last` over
-                shutil.rmtree(stale, ignore_errors=True)
-            temporary.mkdir()
-            yield temporary
-            for path in temporary.rglob("*.safetensors"):  # hidden from other users, a container's among them
-                path.chmod(temporary.stat().st_mode & 0o666)
-            temporary.rename(final)
-            link = final.parent / ".last.tmp"
-            link.unlink(missing_ok=True)
-            link.symlink_to(final.name)
-            os.replace(link, final.parent / _LAST)  # in one rename
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with new_folder(final, replace=True) as new:  # of a run that was killed before it could switch `last` over
+        yield new
+        for path in new.rglob("*.safetensors"):  # hidden from other users, a container's among them
+            path.chmod(new.stat().st_mode & 0o666)
+    link = final.parent / ".last.tmp"
+    link.unlink(missing_ok=True)
+    link.symlink_to(final.name)
+    os.replace(link, final.parent / "last")  # in one rename
 
 
 def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:
@@ -98,3 +77,55 @@ def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -
         (f"{TRAINING_STATE}/{STEP_FILE}", step),
     ):
         (checkpoint / path).write_text(json.dumps(values, indent=2) + "\n")
+
+
+@contextmanager
+def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
+    """Give the functions to call with each record: of the file of lines, and of what else the user asked for.
+
+    step: the fit goes on from there. curves: for TensorBoard. pipeline: with the options for Weights & Biases. Raises
+    `UsageError` if one of them is not installed.
+    """
+    with ExitStack() as stack:
+        writers = [json_lines(output_dir / METRICS_FILE, step)]
+        if curves:
+            writers.append(stack.enter_context(_tensorboard(output_dir / TENSORBOARD_FOLDER, step)))
+        if pipeline.wandb.enable:
+            pipeline.resume = step > 0
+            writers.append(_weights_and_biases(pipeline))
+        yield writers
+
+
+def json_lines(path: Path, step: int) -> Writer:
+    """Return a function that adds a line, null if a number is not finite; lines after `step` are dropped first."""
+    kept = [record for record in read_lines(path) if record["step"] <= step] if step > 0 else []
+    write_file(path, "".join(f"{json.dumps(record)}\n" for record in kept).encode())
+    return functools.partial(append_line, path)
+
+
+@contextmanager
+def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
+    """Give a function that adds a point to every curve."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise UsageError("--tensorboard=true needs TensorBoard: pip install 'manip_il[tensorboard]'") from error
+    with SummaryWriter(str(folder), purge_step=step + 1 if step else None) as writer:
+
+        def write(record: Record) -> None:
+            for name, value in record.items():
+                writer.add_scalar(name, value, record["step"])
+            writer.flush()
+
+        yield write
+
+
+def _weights_and_biases(config: TrainPipelineConfig) -> Writer:
+    """Return a function that adds a point by LeRobot's own logger."""
+    try:
+        importlib.import_module("wandb")  # LeRobot's logger imports it, and says less
+        from lerobot.common.wandb_utils import WandBLogger
+    except ImportError as error:
+        raise UsageError("--wandb.enable=true needs Weights & Biases: pip install wandb") from error
+    logger = WandBLogger(config)
+    return lambda record: logger.log_dict(dict(record), record["step"])

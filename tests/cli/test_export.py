@@ -14,9 +14,8 @@ import pytest
 import manip_il.cli.export as command
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
-from manip_il.learn.checkpoint import Origin
+from manip_il.learn.checkpoint import Origin, policy_sha256
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.policy_files import policy_sha256
 from manip_il.tasks.config import make_config
 
 from ..learn.tiny_policies import write_checkpoint

@@ -19,7 +19,7 @@ from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import ManipError, UsageError
-from manip_il.learn.lerobot_config import LeRobotFit
+from manip_il.learn.lerobot_config import lerobot_options
 
 from ..damage import edit_json
 from .made_runs import ENV, make_eval, make_policy, make_run
@@ -68,7 +68,7 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, pol
         assert main(command) == 1
         assert re.search(r"evil/x.*add --trust=true", error())
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
-        LeRobotFit(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._fit_config())  # pyright: ignore[reportAttributeAccessIssue]
+        lerobot_options(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._fit_config())  # pyright: ignore[reportAttributeAccessIssue]
     assert not (tmp_path / "out").exists()
 
 
@@ -129,4 +129,4 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     task = ["--task.type=reach"] if command == "dagger" else []
     options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
     fit = options.config().fit if command == "dagger" else options._fit_config()  # pyright: ignore[reportAttributeAccessIssue]
-    assert Path(LeRobotFit(fit).policy.pretrained_path).resolve() == find_policy(run).resolve()
+    assert Path(lerobot_options(fit)[0].policy.pretrained_path).resolve() == find_policy(run).resolve()

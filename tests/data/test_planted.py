@@ -10,7 +10,7 @@ import pytest
 from manip_il.data.atomic import exclusive
 from manip_il.data.json_lines import append_line
 from manip_il.errors import ManipError
-from manip_il.learn.metrics import json_lines
+from manip_il.learn.training_state import json_lines
 
 HELD = b"of the user\n"
 

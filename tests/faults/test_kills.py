@@ -30,7 +30,7 @@ EVAL = (
     "--output_dir={folder}/out",
 )
 UNEQUAL = ("config.yaml", "report.html")  # they name the folder, and when what happened
-CLOCK = ("seconds", "samples_per_s", "data_share")
+CLOCK = ("seconds", "samples_per_s", "update_s")
 
 
 @dataclass

@@ -19,7 +19,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_class, policy_config, policy_types
 from manip_il.learn.names import PLAIN
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.train import fit
+from manip_il.learn.train import Trainer
 from manip_il.tasks.config import make_config
 
 from .tiny_policies import edit_config, refused, write_checkpoint
@@ -32,7 +32,7 @@ EVIL = {
 
 @pytest.fixture
 def mlp(dataset, tmp_path) -> Path:
-    return fit(dataset, FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8), tmp_path / "run")
+    return Trainer(dataset, FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8), tmp_path / "run").fit()
 
 
 def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured, tmp_path):

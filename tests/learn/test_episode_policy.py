@@ -137,9 +137,7 @@ def test_a_policy_of_mixed_precision_acts_in_it(act):
 
 def test_a_type_that_is_not_known_is_named_with_the_nearest(act):
     edit_config(act, type="akt")
-    with pytest.raises(
-        UnknownName, match=r"config\.json: 'akt' \(did you mean 'act'\?\); known: act, .*diffusion, .*mlp"
-    ):
+    with pytest.raises(UnknownName, match=r"policy 'akt' \(did you mean 'act'\?\); known: act, .*diffusion, .*mlp"):
         LearnedPolicy.load(act)
 
 

@@ -22,7 +22,7 @@ from manip_il.learn.losses import LIKELIHOODS, LOSSES
 from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.network import threads
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.train import fit
+from manip_il.learn.train import Trainer
 
 from ..damage import edit_json
 from .tiny_policies import observations
@@ -34,7 +34,7 @@ def checkpoint(dataset, tmp_path):
 
 
 def make_checkpoint(dataset, folder, loss="mse"):
-    return fit(dataset, FitConfig({"loss": loss}, steps=3, batch_size=32), folder / loss)
+    return Trainer(dataset, FitConfig({"loss": loss}, steps=3, batch_size=32), folder / loss).fit()
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -67,7 +67,7 @@ def test_acting_is_the_same_through_lerobots_processors(checkpoint):
 
 def test_a_categorical_checkpoint_from_before_targets_were_smeared_acts_as_it_did(dataset, tmp_path):
     config = FitConfig({"loss": "categorical", "sigma": 0.0}, steps=3, batch_size=32)
-    path = fit(dataset, config, tmp_path / "run")
+    path = Trainer(dataset, config, tmp_path / "run").fit()
     states, environments = observations(9)
     before = LearnedPolicy.load(path).act(states, environments)
     edit_json(path / CONFIG, lambda settings: settings.pop("sigma"))
@@ -138,7 +138,9 @@ def test_a_policy_without_a_likelihood_says_so_in_one_line(checkpoint, act):
 def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, spec, tmp_path):
     names = ("ee.x", "goal_from_object.x", "goal_from_object.y", "e3", "e4", "e5")
     data = write(table, spec=replace(spec, environment_state_names=names))
-    path = fit(data, FitConfig({"scales": [0.003, 0.03], "width": 16}, steps=3, batch_size=32), tmp_path / "run")
+    path = Trainer(
+        data, FitConfig({"scales": [0.003, 0.03], "width": 16}, steps=3, batch_size=32), tmp_path / "run"
+    ).fit()
     policy, states, environments = LearnedPolicy.load(path), *observations(70)
     network: Any = policy.module
     assert (network.scaled, network.inputs, len(network.input_mean)) == ([5, 6], 10, 14)
@@ -147,7 +149,7 @@ def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, sp
     actions = policy.act(states, environments)
     assert np.array_equal(policy.act(states[7:9], environments[7:9]), actions[7:9])
     assert np.array_equal(MLPPolicy.from_pretrained(path).model.act(raw).numpy().astype(np.float64), actions)
-    again = fit(data, FitConfig({"path": str(path)}, steps=1, lr=1e-12, batch_size=32), tmp_path / "again")
+    again = Trainer(data, FitConfig({"path": str(path)}, steps=1, lr=1e-12, batch_size=32), tmp_path / "again").fit()
     np.testing.assert_allclose(LearnedPolicy.load(again).act(states, environments), actions, atol=2e-5)
     with pytest.raises(UsageError, match="scales is for offsets"):
-        fit(write(table, "other"), FitConfig({"scales": [0.003]}), tmp_path / "other_run")
+        Trainer(write(table, "other"), FitConfig({"scales": [0.003]}), tmp_path / "other_run").fit()

@@ -6,8 +6,7 @@ import pytest
 
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import Origin
-from manip_il.learn.policy_files import policy_cameras
+from manip_il.learn.checkpoint import Origin, policy_cameras
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.tasks.config import make_config
 

@@ -25,10 +25,10 @@ from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_policy import usable_statistics
 from manip_il.learn.losses import LOSSES
-from manip_il.learn.metrics import METRICS_FILE, json_lines
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.sources import Sources, check_same_sources, input_columns, recorded_look
 from manip_il.learn.train import Trainer
+from manip_il.learn.training_state import METRICS_FILE, json_lines
 
 from .conftest import LENGTH, make_table, write_table
 from .tiny_policies import ACT, DIFFUSION, observations
@@ -134,7 +134,7 @@ def test_a_chunk_policy_learns_and_says_how(fit, tmp_path):
     first, _, last = read_lines(tmp_path / "run" / METRICS_FILE)
     assert last["loss"] < 0.7 * first["loss"]
     assert last["val_loss"] < first["val_loss"]
-    assert {"grad_norm", "lr", "samples_per_s", "data_share", "l1_loss", "val_l1_loss"} <= first.keys()
+    assert {"grad_norm", "lr", "samples_per_s", "update_s", "l1_loss", "val_l1_loss"} <= first.keys()
 
 
 def test_held_out_episodes_are_never_learnt_from(dataset, tmp_path):
@@ -168,7 +168,7 @@ def test_a_run_is_neither_trained_over_nor_continued_as_another(fit, write, tabl
 
 def test_a_half_written_checkpoint_is_passed_over(fit, tmp_path, weights):
     straight = weights(fit(name="a"))
-    for stale in (".000002.tmp/pretrained_model", "000002/pretrained_model"):
+    for stale in (".000002.abc.partial/pretrained_model", "000002/pretrained_model"):
         (tmp_path / "b/checkpoints" / stale).mkdir(parents=True)
     after = weights(fit(name="b", resume=True))
     assert all(torch.equal(straight[key], after[key]) for key in after)
@@ -178,7 +178,7 @@ def test_a_half_written_checkpoint_is_passed_over(fit, tmp_path, weights):
 def test_a_run_whose_state_is_broken_is_not_resumed(name, fit, tmp_path):
     fit()
     (tmp_path / "run/checkpoints/last/training_state" / name).write_bytes(b"[[[")
-    with pytest.raises(ManipError, match=rf"{name} is not valid JSON|cannot be resumed .*--overwrite=true"):
+    with pytest.raises(ManipError, match=rf"{name} is not valid JSON|cannot be resumed; .*--overwrite=true"):
         fit(resume=True)
 
 
@@ -282,7 +282,7 @@ def test_a_checkpoint_has_lerobots_layout_and_no_place_of_this_machine(fit, spec
         assert origin is not None
         space = "joint_delta" if settings is MLP else "joint_target"
         assert replace(origin, options={}, datasets=[]) == Origin.of(spec, {"mujoco": "3.11"}, action_space=space)
-        assert origin.options["steps"] == 4
+        assert origin.options["eval_split"] == 0.2
         assert origin.datasets == [{"name": "dataset", "frames": 240, "weight": None}]
         origin.check_fits(spec)
 

@@ -12,7 +12,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.runner import positions
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.lerobot_config import LeRobotFit
+from manip_il.learn.lerobot_config import lerobot_options
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
@@ -160,8 +160,8 @@ def test_branches_begin_in_the_states_of_the_path(driver: Driver):
 
 def test_actions_that_are_no_joint_targets_are_learnt_as_they_are():
     fit = FitConfig(policy={"type": "mlp"})
-    assert LeRobotFit(fit, ACTION_MEANING).action_space == "joint_target"
-    assert LeRobotFit(fit).action_space == "joint_delta"
+    assert lerobot_options(fit, ACTION_MEANING)[1] == "joint_target"
+    assert lerobot_options(fit)[1] == "joint_delta"
 
 
 @pytest.mark.slow
