@@ -105,7 +105,8 @@ def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
     )
     policy = make_policy(config, ds_meta=meta).train()
     before, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
-    optimizer: Any = ours.pipeline.optimizer.build(policy.get_optim_params())
+    preset: Any = ours.pipeline.optimizer
+    optimizer: Any = preset.build(policy.get_optim_params())
     accelerator = Accelerator(mixed_precision=ours.accelerator.mixed_precision)
     policy, optimizer = accelerator.prepare(policy, optimizer)
     while True:

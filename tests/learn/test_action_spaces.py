@@ -23,7 +23,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.sources import Sources
-from manip_il.learn.train import Trainer, fit
+from manip_il.learn.train import Trainer
 from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.servos import LeRobotConfig
@@ -121,7 +121,7 @@ def test_a_hand_motion_is_in_the_worlds_axes_and_a_far_one_is_approached(robot):
 @every_space
 def test_the_mlp_learns_each_space_from_the_same_table_and_gives_joint_targets(table, sources, tmp_path, space):
     config = FitConfig({"width": 64, "depth": 2}, action_space=space, steps=600, batch_size=36, eval_split=0.0)
-    path = fit(sources, config, tmp_path)
+    path = Trainer(sources, config, tmp_path).fit()
     policy = LearnedPolicy.load(path)
     assert (policy.checkpoint.space, policy.checkpoint.origin.action_space) == (space, space)
     actions = policy.act(table[STATE], table["observation.environment_state"])
@@ -177,7 +177,7 @@ def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_t
 
 
 def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
-    path = fit(sources, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee")
+    path = Trainer(sources, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee").fit()
     more = LearnedPolicy.load(trainer_of(sources, tmp_path / "more", {"path": str(path)}, None).fit())
     assert (more.checkpoint.space, more.checkpoint.robot) == (EE_DELTA, "panda")
     assert np.isfinite(more.act(table[STATE], table["observation.environment_state"])).all()
@@ -188,7 +188,7 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
 
 
 def test_a_checkpoint_from_before_there_was_a_choice_acts_as_it_did(table, sources, tmp_path):
-    path = fit(sources, FitConfig({"width": 8}, **SMALL), tmp_path)
+    path = Trainer(sources, FitConfig({"width": 8}, **SMALL), tmp_path).fit()
     observed = table[STATE], table["observation.environment_state"]
     acted = LearnedPolicy.load(path).act(*observed)
     for name in ("config.json", META_FILE):
