@@ -39,7 +39,7 @@ def replay(
     episode = run_states(job, seed)
     say(*_lines(before))
     if video is not None:
-        write_file(video, Shot.of(job, episode).film().mp4)
+        write_file(video, Shot(job, episode).film().mp4)
         say(f"video: {video}")
     if differences := replay_differences(before, episode_result(job, episode)):
         raise ManipError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean, pstdev
@@ -166,9 +166,7 @@ class EvalOptions:
             width = f"the interval is {100 * (high - low):.2f} points wide"
             say(f"stopped after {len(result.episodes):,} episodes: {width}")
 
-    def _report(
-        self, result: EvalResult, folder: Path, films: Mapping[bool, Sequence[Film]] | None = None, no_films: str = ""
-    ) -> None:
+    def _report(self, result: EvalResult, folder: Path, films: Sequence[Film] = (), no_films: str = "") -> None:
         from manip_il.evaluation.eval_report import eval_report
 
         page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films)

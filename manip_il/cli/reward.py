@@ -46,6 +46,7 @@ class IrlOptions:
         )
         from manip_il.data.dataset import Dataset
         from manip_il.evaluation.results import write_json
+        from manip_il.evaluation.tables import print_table
         from manip_il.rewards.methods import learn
         from manip_il.seeding import rng_for, stream_base
 
@@ -60,7 +61,7 @@ class IrlOptions:
         with self.output.open(self) as folder:
             write_json(folder / FILE_NAME, found.to_json())
             inverse_report(found, command_line("reward irl", self), to_plain(self), timings).write(folder / REPORT_FILE)
-        say(*weight_table(found).aligned_lines())
+        print_table(weight_table(found))
         if line := open_line(found):
             warn(line)
         say(f"report: {folder / REPORT_FILE}")

@@ -41,6 +41,7 @@ class TheoryOptions:
     def run(self) -> None:
         """Compute, measure, write the page and the file, print the slopes."""
         from manip_il.evaluation.results import write_json
+        from manip_il.evaluation.tables import print_table
         from manip_il.theory.bounds import all_curves
         from manip_il.theory.linear import drifts
         from manip_il.theory.processes import PROCESSES
@@ -62,7 +63,8 @@ class TheoryOptions:
             write_json(folder / FILE_NAME, theory.to_json())
             report = theory_report(theory, command_line("theory", self), to_plain(self), timings)
             report.write(folder / REPORT_FILE)
-        say(*slope_table(theory).aligned_lines(), f"policies above their bound: {theory.above}")
+        print_table(slope_table(theory))
+        say(f"policies above their bound: {theory.above}")
         say(f"report: {folder / REPORT_FILE}")
 
     def _shift(self, run: Path) -> Shift:

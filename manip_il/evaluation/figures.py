@@ -28,12 +28,11 @@ _PANEL = (4.4, 3.0)  # of a figure that stands beside others [inches]
 _NAME = 20  # characters of a bar's name in a line
 _LOG_SPAN = 20  # amounts that differ by this factor or more are shown on a logarithmic axis
 _COST_WORDS = {"labels": "expert labels", "steps": "simulated steps", "seconds": "wall-clock [s]"}
-_MINUTES = 300.0  # from so many seconds on they are shown as minutes
 _DPI = 96
 MAX_MARKS = 200  # of one outcome on a map; more would hide each other
 MAP_NOTE = (
     "Circles: starts, squares: goals, crosses: where failed episodes ended. "
-    f"Of each outcome {MAX_MARKS} episodes are drawn at most."
+    f"Of each outcome the first {MAX_MARKS} episodes are drawn at most."
 )
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same with whatever fonts a machine has
@@ -170,32 +169,21 @@ def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple
 
 def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, target: float | None) -> None:
     amounts = [one.amount(cost) for curve in curves for run in curve.runs for one in run]
-    unit, name = (
-        1.0,
-        {"labels": "expert labels", "steps": "simulated steps", "seconds": "wall-clock [s]"}.get(cost, cost),
-    )
-    if cost == "seconds" and max(amounts) >= _MINUTES:
-        unit, name = 60.0, "wall-clock [min]"
+    name = _COST_WORDS.get(cost, cost)
     for place, curve in enumerate(curves):
-        style: dict[str, Any] = {
-            "color": curve.colour,
-            "marker": _MARKERS[place % len(_MARKERS)],
-            "zorder": 3 + len(curves) - place,
-        }
-        lines = [
-            ([one.amount(cost) / unit for one in run], [100 * one.validation.rate for one in run]) for run in curve.runs
-        ]
-        label = plain(textwrap.shorten(curve.name, 40))
+        style: dict[str, Any] = {"color": curve.colour, "marker": _MARKERS[place % len(_MARKERS)]}
+        style["label"] = plain(textwrap.shorten(curve.name, 40))
+        lines = [([one.amount(cost) for one in run], [100 * one.validation.rate for one in run]) for run in curve.runs]
         if len(lines) == 1:
             [(x, y)], [run] = lines, curve.runs
             ends = [[100 * abs(one.validation.rate - one.validation.interval[side]) for one in run] for side in (0, 1)]
-            axis.errorbar(x, y, yerr=ends, capsize=3, ms=5, lw=1.6, label=label, **style)
+            axis.errorbar(x, y, yerr=ends, capsize=3, ms=5, lw=1.6, **style)
             continue
         for x, y in lines:
             axis.plot(x, y, color=curve.colour, lw=0.9, alpha=0.4)
         # Only rounds that every seed has: else the mean would jump where a seed ends.
         xs, ys = ([*map(fmean, zip(*part, strict=False))] for part in zip(*lines, strict=True))
-        axis.plot(xs, ys, lw=1.8, ms=5, label=label, **style)
+        axis.plot(xs, ys, lw=1.8, ms=5, **style)
     if target is not None:
         axis.axhline(100 * target, color=INK, ls="--", lw=1, label=f"target, {format_percent(target)}")
     if min(amounts) > 0 and max(amounts) / min(amounts) >= _LOG_SPAN:
@@ -206,49 +194,42 @@ def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, t
 
 def curve_note(curves: Sequence[Curve]) -> str:
     """Return what the marks of `curve_figures` mean."""
+    marks = f"bars are {CONFIDENCE:.0%} intervals"
     if any(len(curve.runs) > 1 for curve in curves):
-        note = "Validation success by round, the mean over training seeds; thin lines are the seeds."
-    else:
-        note = f"Validation success by round; bars are {100 * CONFIDENCE:g} % intervals."
-    return f"{note} Wall-clock is collecting and fitting, without validating."
+        marks = "the mean over training seeds; thin lines are the seeds"
+    return f"Validation success by round; {marks}. Wall-clock is collecting and fitting, without validating."
 
 
 def failure_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
     """Draw from above where episodes started, were to go and failed; no figure if none has its places.
 
-    Of failed and of solved episodes at most `MAX_MARKS` are drawn, evenly chosen.
+    Of failed and of solved episodes the first `MAX_MARKS` are drawn.
     """
-    known = [
-        (one, start, goal)
-        for one in episodes
-        if (start := one.place("start")) is not None and (goal := one.place("goal")) is not None
-    ]
-    if not known:
+    known = [(one, one.place("start"), one.place("goal")) for one in episodes]
+    found = [(one, start[:2], goal[:2]) for one, start, goal in known if start is not None and goal is not None]
+    if not found:
         return ()
-    points = np.array([place[:2] for _, *both in known for place in both])
+    points = np.array([place for _, *both in found for place in both])
     middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, 0.55 * float(np.ptp(points, axis=0).max()) + 0.01
     counts: list[str] = []
     with drawing(1, size=(_PANEL[0], 4.6)) as (drawn, axes):
         axis = axes[0, 0]
         for name, success, colour in (("solved", True, BASELINE), ("failed, from start to goal", False, CLONING)):
-            found = [every for every in known if every[0].success == success]
-            counts.append(f"{len(found)} {name}")
-            if not found:
+            own = [every for every in found if every[0].success == success]
+            counts.append(f"{len(own)} {name}")
+            if not own:
                 continue
-            places = np.unique(np.linspace(0, len(found) - 1, min(len(found), MAX_MARKS)).round().astype(int))
-            shown = [found[place] for place in places]
-            starts, goals = (np.array([every[which][:2] for every in shown]) for which in (1, 2))
+            starts, goals = (np.array([every[which] for every in own[:MAX_MARKS]]) for which in (1, 2))
             style = {"color": colour, "ls": "", "ms": 4, "alpha": 0.5 if success else 0.9}
             style["fillstyle"] = "none" if success else "full"
             axis.plot(*starts.T, marker="o", label=name, **style)
             axis.plot(*goals.T, marker="s", **style)
             if not success:
                 axis.plot(*np.stack([starts, goals]).T, color=colour, lw=0.7, alpha=0.3)
-                ends = np.array([end[:2] for one, *_ in shown if (end := one.place("end")) is not None])
+                ends = np.array([end[:2] for one, *_ in own[:MAX_MARKS] if (end := one.place("end")) is not None])
                 axis.plot(*ends.reshape(-1, 2).T, "x", color=INK, ms=4, mew=0.9, alpha=0.6)
         # Where it is, however far an object rolled away.
         axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
         axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]")
-        axis.set_title("seen from above", loc="left")
         drawn.legend(loc="outside lower left")
         return (to_figure(drawn, f"Starts and goals seen from above: {', '.join(counts)}"),)

@@ -27,14 +27,11 @@ from manip_il.evaluation.report import Film, Still
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import Progress
 from manip_il.mdp import Episode
-from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.config import FILM, CameraConfig
 
-AFTER_SUCCESS = 1.0  # filmed after the task is solved [s]
 FILM_EVERY = 2  # control steps a frame of film
 _SIZE = (240, 320)  # height and width [pixels]
 _LOG = logging.getLogger(__name__)
-Frames = Sequence[NDArray[np.uint8]]
 
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
@@ -48,20 +45,14 @@ class Shot:
 
     job: RolloutJob
     episode: Episode
-    title: str
+    title: str = ""
     caption: str = ""
     stills: int = 0
-
-    @classmethod
-    def of(cls, job: RolloutJob, episode: Episode) -> Shot:
-        """Show an episode with its seed, and the condition if not nominal: `Seed 4000000, knocked`."""
-        condition = draw(job.conditions or (NOMINAL,), episode.seed).condition
-        return cls(job, episode, f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}"))
 
     def film(self) -> Film:
         """Return the film, whose poster is its last frame; `RenderError` without off-screen OpenGL."""
         env, fps = self.job.env, self.job.env.control_hz // FILM_EVERY or 1
-        states = self.episode.columns[schema.SIM_STATE][: filmed_steps(self.episode, env.control_hz) : FILM_EVERY]
+        states = self.episode.columns[schema.SIM_STATE][::FILM_EVERY]
         pictures = render_states(env, CameraConfig(("front",), *_SIZE, FILM), states)
         frames = list(pictures[schema.IMAGES + "front"])
         chosen = np.unique(np.linspace(0, len(frames) - 1, self.stills).round().astype(int)) if self.stills else []
@@ -86,36 +77,29 @@ def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], s
 
 def film_outcomes(
     engine: Engine, job: RolloutJob, result: EvalResult, most: int, folder: Path, progress: Progress
-) -> tuple[dict[bool, list[Film]], str]:
-    """Run up to `most` failures (False) and successes (True) of an evaluation again and film them, into `folder`, too.
+) -> tuple[list[Film], str]:
+    """Run up to `most` failures and as many successes of an evaluation again and film them, into `folder`, too.
 
-    Returns what `film_shots` does, by outcome.
+    Returns what `film_shots` does.
     """
-    outcomes = {good: [one.seed for one in result.episodes if one.success == good][:most] for good in (False, True)}
-    seeds = [seed for found in outcomes.values() for seed in found]
-    if not seeds:
-        return {}, ""
-    progress.start("films", len(seeds))
-    episodes = {episode.seed: episode for episode in engine.run(job, seeds)}
-    films, why = film_shots([Shot.of(job, episodes[seed]) for seed in seeds], progress)
-    found: dict[bool, list[Film]] = {False: [], True: []}
-    for film, seed in zip(films, seeds, strict=False):  # no films without OpenGL
-        good = episodes[seed].success
-        found[good].append(film)
+    shown = [one for good in (False, True) for one in [e for e in result.episodes if e.success == good][:most]]
+    if not shown:
+        return [], ""
+    progress.start("films", len(shown))
+    episodes = {episode.seed: episode for episode in engine.run(job, [one.seed for one in shown])}
+    shots: dict[str, Shot] = {}
+    for one in shown:
+        outcome, caption = "success" if one.success else "failure", f"seed {one.seed}, {one.condition}".rstrip(", ")
+        shot = Shot(job, episodes[one.seed], outcome.capitalize(), caption)
+        shots[f"seed_{one.seed}_{outcome}.mp4"] = shot
+    films, why = film_shots(shots.values(), progress)
+    for film, name in zip(films, shots, strict=False):  # no films without OpenGL
         folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / f"seed_{seed}_{'success' if good else 'failure'}.mp4", film.mp4)
-    return found, why
+        write_file(folder / name, film.mp4)
+    return films, why
 
 
-def filmed_steps(episode: Episode, fps: int) -> int:
-    """Return how many control steps are filmed: until `AFTER_SUCCESS` after success, else all."""
-    solved = episode.columns[schema.SUCCESS].ravel()
-    if not solved.any():
-        return len(episode)
-    return min(len(episode), int(np.argmax(solved)) + 1 + round(AFTER_SUCCESS * fps))
-
-
-def encode_mp4(frames: Frames, fps: int) -> bytes:
+def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
     """Return an MP4 that browsers play from its first bytes on: H.264, 4:2:0, index in front.
 
     frames: at least one, uint8 (height, width, 3), both even, as 4:2:0 needs them.

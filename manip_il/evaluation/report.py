@@ -46,11 +46,7 @@ class Film:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report. Empty parts are left out.
-
-    formulas: one a line; notes: paragraphs under the tables; named: names and values, folded away under a heading;
-    under: another heading within the section before, for parts that belong to it.
-    """
+    """A part of a report. Empty parts are left out. formulas: one a line; notes: paragraphs under the tables."""
 
     heading: str
     lead: tuple[str, ...] = ()
@@ -60,8 +56,6 @@ class Section:
     notes: tuple[str, ...] = ()
     stills: tuple[Still, ...] = ()
     films: tuple[Film, ...] = ()
-    named: Mapping[str, Mapping[str, str]] = field(default_factory=dict[str, Mapping[str, str]])
-    under: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

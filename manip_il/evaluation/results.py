@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from manip_il.tasks.config import EnvConfig
 
 FILE_NAME = "eval.json"
-Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
 # Of every episode, in the order of `EpisodeResult`.
 _KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
 
@@ -48,15 +47,13 @@ class EpisodeResult:
         name = self.detail.get("condition")
         return name if isinstance(name, str) else ""
 
-    def place(self, when: Literal["start", "end", "goal"]) -> Place | None:
-        """Return where the object, or the hand if the task has none, was or was to go [m]; None if nothing says it."""
+    def place(self, when: Literal["start", "end", "goal"]) -> list[float] | None:
+        """Return where the object, or the hand if the task has none, was or was to go, or None if nothing says it.
+
+        x away from the robot, y to its left, z above the table's top [m].
+        """
         found = self.detail.get(when)
-        if isinstance(found, Mapping):
-            found = found.get("object", found.get("hand"))
-        if not isinstance(found, list | tuple) or len(found) != 3:
-            return None
-        x, y, z = map(float, found)
-        return x, y, z
+        return found.get("object", found.get("hand")) if isinstance(found, Mapping) else found
 
     def to_json(self) -> dict[str, Any]:
         """Return the episode as `eval.json` holds it."""
@@ -111,10 +108,8 @@ class EvalSettings:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        plain = ("horizon", "tolerance", "control_hz", "success_steps", "hold", "suite")
-        conditions = [condition.to_json() for condition in self.conditions]
-        own = {"object": self.object} if self.object else {}
-        return {key: getattr(self, key) for key in plain} | {"conditions": conditions} | own
+        plain = {field.name: getattr(self, field.name) for field in fields(self)}
+        return plain | {"conditions": [condition.to_json() for condition in self.conditions]}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
@@ -236,14 +231,10 @@ class EvalResult:
         path = path / FILE_NAME if path.is_dir() else path
         data = checks.read_json(path, f"an {FILE_NAME} of manip-il eval")
         try:
-            result = cls.from_json(data)
-            stated = int(data.get("n_episodes", len(result.episodes)))
+            return cls.from_json(data)
         except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, ManipError) as error:
             why = f"key {error} is missing" if isinstance(error, KeyError) else checks.one_line(error)
             raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
-        if stated != len(result.episodes):
-            raise MismatchError(f"{path}: number of episodes", "n_episodes", stated, "episodes", len(result.episodes))
-        return result
 
 
 def compare_results(left: EvalResult, right: EvalResult, names: tuple[str, str] | None = None) -> PairedComparison:

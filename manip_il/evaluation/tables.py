@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from manip_il.errors import ManipError, printable
+from manip_il.errors import printable
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.evaluation.results import EvalResult
 
@@ -33,23 +33,11 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     colours: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise ManipError(f"a table's row has {len(row)} cells, its head {len(self.columns)}: {row}")
-
     def filled(self) -> Table:
         """Return the table without the columns that no row fills."""
         keep = [i for i in range(len(self.columns)) if i == 0 or any(row[i] for row in self.rows)]
         rows = tuple(tuple(row[i] for i in keep) for row in self.rows)
         return Table(tuple(self.columns[i] for i in keep), rows, self.colours)
-
-    def aligned_lines(self) -> list[str]:
-        """Return columns as wide as their widest cell, a rule under the head; all but the first set right."""
-        cells = (self.columns, *self.rows)
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in cells]
-        return [lines[0].rstrip(), "-" * len(lines[0]), *lines[1:]]
 
 
 def print_table(table: Table, console: Console | None = None, empty: str = "") -> None:

@@ -51,9 +51,9 @@ class Case:
 
 
 def eval_case() -> Case:
-    films = {False: [small_film(1), small_film(2)], True: [small_film(3)]}
-    report = eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films, curve=CURVE)
-    return Case(report, tuple(film.caption for some in films.values() for film in some))
+    films = [small_film(number) for number in range(3)]
+    report = eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films)
+    return Case(report, tuple(film.caption for film in films))
 
 
 def demo_case() -> Case:
