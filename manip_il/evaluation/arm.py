@@ -16,7 +16,7 @@ from manip_il.evaluation.policy_folder import EXPECTED, find_policy, require_sou
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.runner import FOLDER, Progress, Trial
-from manip_il.learn.policy_files import policy_sha256
+from manip_il.learn.checkpoint import policy_sha256
 from manip_il.tasks.config import EnvConfig
 
 _SEED_FOLDER = re.compile(r"seed_(\d+)")
