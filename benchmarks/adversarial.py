@@ -173,7 +173,7 @@ class Run:
 
     def rollouts(self, number: int) -> Transitions:
         count = self._settings.episodes
-        self._envs.seeds = stream_seeds("reinforcement", (number + 1) * count, self._seed)[-count:]
+        self._envs.seed(stream_seeds("reinforcement", (number + 1) * count, self._seed)[-count])
         with lent_generators(self._stream("rollouts")):
             rows = self._learner.collect()
         self.simulated += self._envs.simulated

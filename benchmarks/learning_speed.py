@@ -77,7 +77,8 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
     config = LearningConfig(method="gail", env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
     run = LearningRun(config, folder, Engine())
     recorded = [Recorded(env, None) for _ in range(config.episodes)]
-    run.envs.episodes = recorded
+    for one, episode in zip(run.envs.envs, recorded, strict=True):
+        one.episode = episode
     d = run.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
     found = []
     for number, _ in zip(run.iterations(), range(iterations), strict=False):

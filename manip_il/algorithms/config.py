@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,34 +18,30 @@ if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
     from manip_il.collect.query import Query
     from manip_il.sim.conditions import Condition
 
-_KINDS = "constant:B, linear:ROUNDS or exponential:B, with B from 0 to 1 and at least 1 round"
-
 
 @dataclass(frozen=True)
 class BetaSchedule:
     """`kind:parameter`. Round 0 is the expert's own: beta is 1.
 
     `constant:0` lets the learner drive alone from round 1 on (the paper's parameter-free choice), `linear:5` falls
-    evenly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round. Raises `UsageError`
-    for anything else.
+    evenly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round.
     """
 
     kind: str
     parameter: float
 
-    def __post_init__(self) -> None:
-        allowed = {"constant": 0 <= self.parameter <= 1, "linear": self.parameter >= 1}
-        if not (allowed | {"exponential": 0 <= self.parameter <= 1}).get(self.kind):
-            raise UsageError(f"beta is '{self}'; expected {_KINDS}")
-
     @classmethod
     def parse(cls, text: str) -> BetaSchedule:
-        """Read what `str` writes."""
+        """Read what `str` writes. Raises `UsageError` for anything else."""
         kind, _, parameter = text.partition(":")
         try:
-            return cls(kind, float(parameter))
-        except ValueError as error:
-            raise UsageError(f"beta is {text!r}; expected {_KINDS}") from error
+            number = float(parameter)
+        except ValueError:
+            number = math.nan
+        if not ((kind == "linear" and number >= 1) or (kind in ("constant", "exponential") and 0 <= number <= 1)):
+            kinds = "constant:B, linear:ROUNDS or exponential:B, with B from 0 to 1 and at least 1 round"
+            raise UsageError(f"beta is {text!r}; expected {kinds}")
+        return cls(kind, number)
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.parameter:g}"
@@ -60,58 +57,16 @@ class BetaSchedule:
         return self.parameter**round_
 
 
-@dataclass(frozen=True)
-class Algorithm:
-    """One way to learn: the function of its name, in the module of its name. title: in reports. driver: for the help.
-
-    learner_drives: whether it does in some rounds, so that label, query and beta mean something. takes_images: whether
-    policies may look at pictures.
-    """
-
-    title: str
-    driver: str
-    learner_drives: bool = True
-    takes_images: bool = True
-
-
-ALGORITHMS = {
-    "dagger": Algorithm("DAgger", "the learner"),
-    "cloning": Algorithm("Cloning", "the expert", learner_drives=False),
-    "dart": Algorithm("DART", "the expert with noise like the learner's errors", False, takes_images=False),
-}
+ALGORITHMS = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}  # each the function and module of its name
+EXPERT_DRIVES = ("cloning", "dart")  # throughout, so that label, query and beta mean nothing
 
 if TYPE_CHECKING:
     Method = str
 else:
     Method = Literal[*ALGORITHMS]  # the choices of `--method`
 
-
-@dataclass(frozen=True)
-class Sampling:
-    """Relative weight of a frame. All equal: each frame once an epoch.
-
-    demonstrations: of round 0. corrections: of later rounds, where the expert drove, or its label differs from the
-    executed action by more than a quarter of the longest step. rollouts: the others of later rounds.
-    """
-
-    demonstrations: float = option(1.0, "weight of a frame of round 0", at_least=0)
-    corrections: float = option(
-        1.0, "weight of a later frame where the expert drove or would have acted differently", at_least=0
-    )
-    rollouts: float = option(1.0, "weight of the other later frames", at_least=0)
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "sampling.")
-        if self.demonstrations == 0:
-            raise UsageError("sampling.demonstrations is 0, but round 0 has nothing else to learn from")
-
-    @property
-    def is_even(self) -> bool:
-        """Whether no kind is preferred."""
-        return self.demonstrations == self.corrections == self.rollouts
-
-
 _LEARNER_ALONE = BetaSchedule("constant", 0.0)
+_DEFAULTS = ("per_state", None, _LEARNER_ALONE)  # of label, query and beta
 
 
 @dataclass(frozen=True)
@@ -147,7 +102,6 @@ class RunConfig:
     ensemble: int = option(
         1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND", at_least=1
     )
-    sampling: Sampling = field(default_factory=Sampling)
     refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
     refit_steps: int | None = option(
         None, "gradient steps in later rounds, with --refit=warm; by default as many", at_least=1
@@ -180,10 +134,8 @@ class RunConfig:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
         if not 0 <= self.rounds < MAX_ROUNDS:
             raise UsageError(f"rounds is {self.rounds}; expected 0 or more, fewer than {MAX_ROUNDS}")
-        if self.redraw and (self.cameras is None or self.label != "per_state" or not self.sampling.is_even):
-            raise UsageError("redraw is for policies on pictures, with --label=per_state and even sampling")
-        if self.refit_steps is not None and self.refit == "scratch":
-            raise UsageError("refit_steps is for refit=warm; a policy from scratch takes all steps")
+        if self.redraw and (self.cameras is None or self.label != "per_state"):
+            raise UsageError("redraw is for policies on pictures, with --label=per_state")
         self._check_method()
         self._check_queries()
 
@@ -191,35 +143,23 @@ class RunConfig:
         """Options are for the method, and pictures are rendered exactly if the policy takes some."""
         if self.method not in ALGORITHMS:
             raise UnknownName("method", self.method, ALGORITHMS)
-        algorithm, queries = ALGORITHMS[self.method], (self.label, self.query_rule, self.beta)
-        if not algorithm.learner_drives and queries != ("per_state", None, _LEARNER_ALONE):
+        if self.method in EXPERT_DRIVES and (self.label, self.query_rule, self.beta) != _DEFAULTS:
             raise UsageError(f"method {self.method!r} has the expert drive throughout; leave out label, query and beta")
-        if not self.fit.takes_images:
-            if self.cameras is not None:
-                raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation")
-            return
-        if not algorithm.takes_images:
-            raise UsageError(
-                f"method {self.method!r} measures the learner's errors from state vectors; it is not for a policy on "
-                "images"
-            )
-        if self.cameras is None:
+        if self.fit.takes_images and self.cameras is None:
             raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
+        if self.cameras is not None and not self.fit.takes_images:
+            raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation")
+        if self.method == "dart" and self.cameras is not None:
+            raise UsageError("method 'dart' measures the learner's errors from state vectors; it is not for images")
 
     def _check_queries(self) -> None:
-        rule, kind = self.query_rule, self.query_rule.kind if self.query_rule else "every"
+        rule = self.query_rule
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
             raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
-        if self.label == "takeover" and rule is not None and kind == "every":
-            raise UsageError("label is 'takeover' and query 'every': the expert would drive from the first step on")
-        if kind == "ensemble" and self.ensemble < 2:
-            raise UsageError(f"query is '{rule}', but there is one policy; give ensemble=2 or more")
         if self.start is not None and self.ensemble > 1:
-            raise UsageError(
-                f"ensemble is {self.ensemble}, but --policy.path is one policy to begin with; leave it out"
-            )
-        if kind != "ensemble" and self.ensemble > 1:
-            raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
+            raise UsageError(f"ensemble is {self.ensemble}, but --policy.path is one policy to begin with")
+        if (rule is not None and rule.kind == "ensemble") != (self.ensemble > 1):
+            raise UsageError(f"ensemble is {self.ensemble}, query '{rule or 'every'}'; ensemble:BOUND takes 2 or more")
 
     def episodes(self, round_: int) -> int:
         """Return episodes of a round."""
@@ -254,7 +194,7 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
 
 
 def check_labels(config: RunConfig) -> None:
-    """Raise `UsageError` for labels that the policy cannot learn from, or a query rule that it cannot answer.
+    """Raise `UsageError` for labels that the policy cannot learn from.
 
     LeRobot's configurations are made for this, which imports it; they raise what is wrong with them, too.
     """
@@ -274,9 +214,3 @@ def check_labels(config: RunConfig) -> None:
             f"branch_steps is {config.steps_of_branch}, but {name} leaves out the last {dropped} frames of "
             "every episode; give more, or --policy.drop_n_last_frames=0"
         )
-    if rule.kind == "likelihood":
-        from manip_il.learn.losses import LIKELIHOODS
-        from manip_il.learn.policy import NO_LIKELIHOOD
-
-        if not fit.is_mlp or fit.policy.get("loss") not in LIKELIHOODS:
-            raise UsageError(NO_LIKELIHOOD)

@@ -118,8 +118,9 @@ class LearningRun(Run):
     def rollouts(self, number: int) -> Transitions:
         """Run the learner's episodes of an iteration; return all steps, those of absorbing states too."""
         self._number = number
-        seeds = stream_seeds("reinforcement", number * self.config.episodes, self.config.seed)
-        self.envs.seeds = seeds[-self.config.episodes :]
+        self.envs.seed(
+            stream_seeds("reinforcement", number * self.config.episodes, self.config.seed)[-self.config.episodes]
+        )
         with self._timed("collect"), threads(1), lent_generators(self._stream(number, "rollouts")):
             self._rows = self._learner.collect()
         self._simulated += self.envs.simulated

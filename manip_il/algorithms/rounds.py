@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,19 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.algorithms.config import RunConfig, Sampling
-from manip_il.collect.environments import env_actions
-from manip_il.collect.query import action_gap
-from manip_il.data.dataset import Dataset, joined_columns
-from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
+from manip_il.algorithms.config import RunConfig
+from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import LEROBOT, FitConfig
-from manip_il.mdp import Actor
 from manip_il.seeding import stream_base
 
 F64 = NDArray[np.float64]
 CHUNK_STEPS = 20_000  # of a round, for LeRobot's policies, if none are given
-CORRECTION = 0.25  # of the longest step: if expert and learner differ by more, the label corrects
-_SAMPLED_BY = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)
 
 
 @dataclass(frozen=True)
@@ -77,14 +71,11 @@ def fit_round(
     """Fit, or go on with fitting, a policy to datasets; return the checkpoint's `pretrained_model`.
 
     init_from: start there (see `refit`). on_log: sees the metrics, {} at a step without. member: of the ensemble,
-    each from a seed of its own. weights: how often each frame is drawn, (N,); by default as the run's `sampling` says.
+    each from a seed of its own. weights: how often each frame is drawn, (N,); by default once an epoch.
     """
     from manip_il.learn.sources import Sources
     from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
 
-    if weights is None and not config.sampling.is_even:
-        scale = env_actions(config.env).scale
-        weights = frame_weights(config.sampling, joined_columns(roots, _SAMPLED_BY), scale)
     trainer = Trainer(
         Sources(tuple(map(Dataset.open, roots))),
         round_fit(config, init_from, member),
@@ -105,11 +96,3 @@ def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0)
         steps = config.refit_steps or steps
     seed = stream_base("training", config.seed) + member
     return replace(config.fit, steps=steps, seed=seed, init_from=init_from or config.start)
-
-
-def frame_weights(sampling: Sampling, table: Mapping[str, NDArray[Any]], scale: F64) -> F64:
-    """Return how often each frame of a table is drawn, (N,). scale: the longest step of an action, (n,)."""
-    gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
-    by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
-    later = np.where(by_expert | (gap > CORRECTION), sampling.corrections, sampling.rollouts)
-    return np.where(table[ROUND].reshape(-1) == 0, sampling.demonstrations, later).astype(np.float64)

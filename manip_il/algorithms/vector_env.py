@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, override
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from manip_il.collect.environments import make_env
-from manip_il.errors import MismatchError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.network import MLPNetwork
 from manip_il.mdp import Observation
@@ -98,94 +99,79 @@ class ActionRange:
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
-class Lockstep(VecEnv):
-    """Episodes of `horizon` steps, side by side. Observations (B, d + 2): inputs, absorbing or not, share of time gone.
+class Unending(gymnasium.Env[F32, F64]):
+    """An episode that goes on in an absorbing state once it has ended, and never says that it has.
 
-    episodes: each a `RobotEpisode`, or what has its methods. conversion: of the policy's raw targets into actions; the
-    first of the inputs are the measured joints that it needs. `seeds` are those of the next `reset`. simulated: control
-    steps since then. executed: actions (T, B, n) since then.
+    Observes (d + 2,): inputs, absorbing or not, share of `horizon` gone. Steps take actions, not targets. episode: a
+    `RobotEpisode`, or what has its methods. simulated: control steps since `reset`.
     """
+
+    def __init__(self, episode: Any, space: spaces.Box, horizon: int):
+        self.episode, self.action_space, self._horizon = episode, space, horizon
+        self._steps = self.simulated = 0
+        episode.start(0)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (len(episode.inputs()) + 2,), np.float32)
+
+    @override
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[F32, dict[str, Any]]:
+        self.episode.start(seed)
+        self._steps = self.simulated = 0
+        return self._observe(), {}
+
+    @override
+    def step(self, action: F64) -> tuple[F32, float, bool, bool, dict[str, Any]]:
+        if not self.episode.ended:
+            self.episode.advance(action)
+            self.simulated += 1
+        self._steps += 1
+        return self._observe(), 0.0, False, False, {}
+
+    def _observe(self) -> F32:
+        ended = self.episode.ended
+        inputs = np.zeros(self.observation_space.shape[0] - 2) if ended else self.episode.inputs()
+        return np.append(inputs, [ended, self._steps / self._horizon]).astype(np.float32)
+
+
+class Lockstep(DummyVecEnv):
+    """Episodes of one length, side by side; `seed` sets that of the first at the next `reset`, the others follow on it.
+
+    conversion: of the policy's raw targets into actions; the first of the inputs are the measured joints that it needs.
+    executed: actions (T, B, n) since `reset`.
+    """
+
+    envs: list[Unending]
 
     def __init__(
         self, episodes: Sequence[Any], actions: ActionRange, horizon: int, conversion: Conversion | None = None
     ):
-        self.episodes: Sequence[Any] = list(episodes)
-        self.actions, self.horizon, self._conversion = actions, horizon, conversion or Conversion()
-        self.seeds: Sequence[int] = range(len(episodes))
-        self.simulated, self._step, self._given = 0, 0, np.empty((0, 0), np.float32)
-        self._seen = np.empty((0, 0), np.float32)
+        super().__init__([partial(Unending, episode, actions.space, horizon) for episode in episodes])
+        self.range, self._conversion = actions, conversion or Conversion()
         self.executed: list[F64] = []
-        self.episodes[0].start(0)
-        d = len(self.episodes[0].inputs())
-        self._width = d + 2
-        super().__init__(len(episodes), spaces.Box(-np.inf, np.inf, (d + 2,), np.float32), actions.space)
 
     @property
     def solved(self) -> NDArray[np.bool_]:
         """Whether each episode has succeeded so far, (B,)."""
-        return np.array([one.solved for one in self.episodes])
+        return np.array([one.episode.solved for one in self.envs])
+
+    @property
+    def simulated(self) -> int:
+        """Control steps since `reset`, of all episodes; none in absorbing states."""
+        return sum(one.simulated for one in self.envs)
 
     @override
     def reset(self) -> F32:
-        """Begin the episodes of `seeds`; return observations (B, d + 2). Raises `MismatchError` for another number."""
-        if len(self.seeds) != self.num_envs:
-            raise MismatchError("number", "environments", self.num_envs, "seeds", len(self.seeds))
-        for episode, seed in zip(self.episodes, self.seeds, strict=True):
-            episode.start(seed)
-        self.simulated, self._step, self.executed = 0, 0, []
-        return self._observe()
+        """Begin the episodes; return observations (B, d + 2)."""
+        self.executed = []
+        return np.asarray(super().reset())
 
     @override
     def step_async(self, actions: F32) -> None:
-        """Take the actions (B, n) of the next step, normalised."""
-        self._given = actions
-
-    @override
-    def step_wait(self) -> Any:
-        """Advance every episode that is under way; return observations, rewards of 0, dones and infos."""
-        targets = self.actions.raw(self._given).astype(np.float32)
-        running = [row for row, episode in enumerate(self.episodes) if not episode.ended]
+        """Take normalised actions (B, n), of which targets become actions for all episodes at once."""
+        targets = self.range.raw(actions).astype(np.float32)
+        running = [row for row, one in enumerate(self.envs) if not one.episode.ended]
         executed = np.zeros(targets.shape)
         if running:
-            joints = self._seen[running, : targets.shape[1]]
+            joints = np.asarray(self._obs_from_buf())[running, : targets.shape[1]]
             executed[running] = self._conversion.decode(targets[running], joints)
-        for row in running:
-            self.episodes[row].advance(executed[row])
-        self.simulated += len(running)
-        self._step += 1
         self.executed.append(executed)
-        done = np.full(self.num_envs, self._step >= self.horizon)
-        infos: list[dict[str, Any]] = [{} for _ in self.episodes]
-        return self._observe(), np.zeros(self.num_envs, np.float32), done, infos
-
-    def _observe(self) -> F32:
-        rows = np.zeros((self.num_envs, self._width), np.float32)
-        for row, episode in zip(rows, self.episodes, strict=True):
-            if episode.ended:
-                row[-2] = 1.0
-            else:
-                row[:-2] = episode.inputs()
-        rows[:, -1] = self._step / self.horizon
-        self._seen = rows
-        return rows
-
-    # What else the interface asks for: nobody uses it here.
-
-    @override
-    def close(self) -> None: ...
-
-    @override
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [None] * self.num_envs
-
-    @override
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise NotImplementedError(attr_name)
-
-    @override
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        raise NotImplementedError(method_name)
-
-    @override
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
+        super().step_async(executed)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, Sampling, check_labels
+from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, check_labels
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_given, require_dataset, round_policy
 from manip_il.cli.options import Given, command_line, given, group, to_plain
@@ -52,7 +52,8 @@ class DaggerOptions:
     first: ClassVar[str] = "robot.type task.type demonstrations rounds episodes_per_round policy output_dir resume"
     env: Given = common.env_given()
     method: Method = option(
-        "dagger", f"who drives after round 0: {', '.join(one.driver for one in ALGORITHMS.values())}"
+        "dagger",
+        "who drives after round 0: the learner, the expert, the expert with noise like the learner's errors",
     )
     dataset: GivenGroup = field(default_factory=GivenGroup)
     settings: Given = given(RunConfig, prefix="")
@@ -61,7 +62,6 @@ class DaggerOptions:
         "when it is queried: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; "
         "by default every, for takeover one, for branch probability:1/STEPS",
     )
-    sampling: Sampling = field(default_factory=Sampling)
     fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
     cameras: list[str] = option(list, f"{common.CAMERAS_HELP}, for a policy on images; by default all for cnn")
     image: Given = common.image_given(small=True)
@@ -104,7 +104,6 @@ class DaggerOptions:
             method=self.method,
             conditions=varied(self.vary, env, sees=cameras is not None),
             fit=FitConfig(**self.fit | of_fit),
-            sampling=self.sampling,
             cameras=cameras,
             datasets=tuple(self.dataset.root),
             start=start,
@@ -156,7 +155,7 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[Result]) ->
     from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
 
     best, folder = best_result(results), options.output.output_dir
-    kind = ALGORITHMS[config.method].title
+    kind = ALGORITHMS[config.method]
     first = "cloning" if config.start is None else "the policy given"
     names = [f"{first} (round 0)", *(f"{kind}, round {result.number}" for result in results[1:])]
     rows = [

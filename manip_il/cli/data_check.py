@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.inputs import REWARD, dataset_differences, exists, load_reward, require_dataset
-from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output
+from manip_il.cli.options import group
+from manip_il.cli.outputs import Output
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError
 from manip_il.option import option
@@ -120,7 +119,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
 class ScoreOptions:
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
-    Writes scores.json, report.html, and rabc.parquet: weights of frames, for manip-il train --weights= and for
+    Writes scores.json and rabc.parquet: weights of frames, for manip-il train --weights= and for
     lerobot-train --sample_weighting.progress_path=. Where the dataset says which episodes failed, it says how well the
     score finds them.
     """
@@ -146,22 +145,17 @@ class ScoreOptions:
             WEIGHTS_FILE,
             Scores,
             fact_lines,
-            score_report,
             worst_table,
             write_weights,
         )
 
-        begin, data = time.monotonic(), read_frames(self.dataset)
+        data = read_frames(self.dataset)
         scores = Scores(str(self.dataset), self.reward, data, self._scores(data))
-        timings = {"scoring": time.monotonic() - begin}
         with self.output.open(self) as folder:
             write_json(folder / FILE_NAME, scores.to_json())
             write_weights(folder / WEIGHTS_FILE, scores)
-            page = folder / REPORT_FILE
-            score_report(scores, command_line("data score", self), to_plain(self), timings).write(page)
         print_table(worst_table(scores))
         say(*fact_lines(scores))
-        say(f"report: {page}")
         weights = f"--weights={folder / WEIGHTS_FILE}"
         say(f"next: manip-il train --dataset.root={self.dataset} {weights} --output_dir=runs/weighted")
 

@@ -174,9 +174,8 @@ class AnswerOptions:
 class FitOptions:
     """Learn a reward of state and action from answers about pairs (Bradley-Terry): an ensemble of small networks.
 
-    Every pair is held out by one network; agreement on those is in report.html. ANSWERS are files of
-    ask or answer, of one person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model
-    holds the reward.
+    Every pair is held out by one network; agreement on those is in fit.json. ANSWERS are files of ask or answer, of one
+    person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
     """
 
     example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
@@ -195,30 +194,24 @@ class FitOptions:
     output: Output = group(Output(Path("runs/reward")), prefix="")
 
     def run(self) -> None:
-        """Fit, measure on held-out pairs, write the reward and the page."""
+        """Fit, measure on held-out pairs, write the reward."""
         from manip_il.learn.reward import shape_for
         from manip_il.preferences.answers import Preferences, join_answers
-        from manip_il.preferences.fitting import fit_answers, fit_report, summary_lines
+        from manip_il.preferences.fitting import fit_answers, summary_lines
         from manip_il.preferences.pairs import Pairs, join_pairs, read_clips
         from manip_il.seeding import stream_base
 
         pairs = [Pairs.read(path) for path in (self.pairs, *self.more_pairs)]
         given = [Preferences.read(path, pairs) for path in self.answers]
-        begin, answers, clips = time.monotonic(), join_answers(given), read_clips(join_pairs(pairs))
+        answers, clips = join_answers(given), read_clips(join_pairs(pairs))
         with Progress(None, f"fit {len(answers.better):,} answers") as bar:
             shape = shape_for(clips.frames[0].spec, self.members)
             found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.advance)
-        timings = {"fit": time.monotonic() - begin}
-        who = [one.who or "somebody" for one in given]
         with self.output.open(self) as folder:
             self._write(folder, found, clips)
-            page = folder / REPORT_FILE
-            command = command_line("reward fit", self)
-            fit_report(found, clips, answers, who, command, to_plain(self), timings).write(page)
         say(*summary_lines(found, answers))
         if answers.contradictory:
             warn(f"{answers.contradictory:,} pairs are answered left and right: both answers count")
-        say(f"report: {page}")
         say(f"next: manip-il data score DATASET --reward={folder} --output_dir=runs/scores")
 
     def _write(self, folder: Path, found: Any, clips: Any) -> None:

@@ -1,28 +1,22 @@
-"""A reward from pairs and answers, how well it foretells what it has not learnt from, and the page that says so."""
+"""A reward from pairs and answers, and how well it foretells what it has not learnt from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.evaluation.intervals import Proportion, format_percent
-from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.reward import RewardShape
-from manip_il.learn.reward_fit import BY_CHANCE, Compared, Fit, fit_reward
+from manip_il.learn.reward_fit import Compared, Fit, fit_reward
 from manip_il.preferences.answers import Answers
 from manip_il.preferences.pairs import Clips
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+F64 = NDArray[np.float64]
 TIE = 0.01  # difference of the clips' mean progress below which none is the better one
-_MODEL = (
-    f"P(left is better) = {1 - BY_CHANCE:g} sigmoid(R(left) - R(right)) + {BY_CHANCE / 2:g}",
-    "R(clip) = Σ r(state, action)",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,39 +81,3 @@ def summary_lines(found: Fitted, answers: Answers) -> list[str]:
     if found.true is not None:
         lines.append(f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}")
     return lines
-
-
-def fit_report(
-    found: Fitted,
-    clips: Clips,
-    answers: Answers,
-    who: Sequence[str],
-    command: str,
-    config: Mapping[str, Any],
-    timings: Mapping[str, float],
-) -> Report:
-    """Return the report of a reward. who: answered, one name a file."""
-    sources = tuple((source.root, f"{source.episodes:,}", f"{source.frames:,}") for source in clips.pairs.sources)
-    first, *facts = summary_lines(found, answers)
-    best, what = (found.answered, "the answers") if found.true is None else (found.true, "true progress")
-    agreement = Section(
-        "Agreement",
-        formulas=_MODEL,
-        notes=(
-            f"{found.shape.members} networks of {found.shape.depth} x {found.shape.width}; the pairs are dealt into as "
-            "many folds. Each network leaves one fold out, from which its numbers above are; all stopped at epoch "
-            f"{found.fit.epochs}, where the loss on these was lowest. The reward is their mean, which has seen every "
-            f"pair. Pairs whose true progress differs by less than {TIE:g} are ties and left out.",
-        ),
-    )
-    from_where = Section("Where the clips are from", tables=(Table(("dataset", "episodes", "frames"), sources),))
-    return Report(
-        title=f"A reward from preferences, {clips.pairs.robot} {clips.pairs.task}",
-        verdict=f"On pairs that it did not learn from, the reward agrees with {what} in {format_percent(best.rate)} of "
-        f"{best.n:,}.",
-        facts=(f"{first}, by {', '.join(who)}.", *(f"{fact[:1].upper()}{fact[1:]}." for fact in facts)),
-        command=command,
-        config=config,
-        timings=timings,
-        sections=(agreement, from_where),
-    )

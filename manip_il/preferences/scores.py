@@ -24,7 +24,6 @@ from scipy.stats import mannwhitneyu
 
 from manip_il.data.atomic import writing
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.preferences.frames import Frames
 
@@ -162,22 +161,3 @@ def fact_lines(scores: Scores) -> list[str]:
     if scores.auc is not None:
         lines.append(f"area under the ROC curve of finding failed episodes: {scores.auc:.3f}")
     return lines
-
-
-def score_report(scores: Scores, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
-    """Return the report of a dataset's scores."""
-    low = scores.worst(1)[0]
-    meaning = (
-        "An episode's score is the mean of its last second's frames. "
-        f"One that is {BELOW:g} or more below the best quarter's has weight 0."
-    )
-    return Report(
-        title=f"Scores of {scores.root}",
-        verdict=f"Of {len(scores.episodes):,} episodes, number {scores.data.episodes[scores.data.firsts[low]]} has the "
-        f"lowest score: {scores.episodes[low]:.2f}.",
-        facts=(f"Scored by {scores.reward}.", *(f"{line[:1].upper()}{line[1:]}." for line in fact_lines(scores))),
-        command=command,
-        config=config,
-        timings=timings,
-        sections=(Section("The worst episodes", tables=(worst_table(scores),), notes=(meaning,)),),
-    )

@@ -5,7 +5,7 @@ cheapest for some taste, and its own, a demonstration takes one with a probabili
 So a demonstrator chooses between sensible paths, and the better one is for its taste the likelier; the sum over them is
 exact, and small enough for chains of tens of thousands of steps. Tastes are drawn from the prior, and then from the
 posterior, which finds the paths that nearly tie. The posterior is drawn by random-walk Metropolis in log w, whose steps
-are fitted in a warm-up, then fixed.
+are as wide as the posterior is about its mode.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from manip_il.rewards.paths import Demonstration, add_rivals, rivals
 
@@ -25,9 +26,7 @@ TASTES = 60  # of the prior, for each demonstration
 CHAINS = 4
 _ROUNDS, _MORE = 3, 30  # rounds of tastes of the posterior
 _DRAWS, _WARM_UP = 10_000, 3_000  # of a chain
-_WANTED = 0.25  # share of steps taken at which a random walk in several dimensions gets on best (Roberts et al. 1997)
-_WINDOW = 100  # steps of the warm-up after which the steps are fitted anew
-_JITTER = 1e-6
+_STEP = 2.38  # over the root of the dimensions: a random walk's step, in deviations (Roberts et al. 1997)
 
 
 @dataclass(frozen=True)
@@ -124,43 +123,30 @@ def draw_posterior(
         weights = np.exp(logs)
         return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)  # d w = w d log w
 
-    start = np.log(prior * rng.uniform(0.5, 1.5, (chains, choices.excess.shape[1])))
-    logs, accepted = sample(density, start, count, warm_up, rng)
+    size = choices.excess.shape[1]
+    found = minimize(lambda logs: -density(logs[None])[0], np.full(size, np.log(prior)), method="BFGS")
+    root = _STEP / np.sqrt(size) * np.linalg.cholesky(found.hess_inv)
+    start = found.x + rng.standard_normal((chains, size)) @ root.T
+    logs, accepted = sample(density, start, root, count, warm_up, rng)
     return Posterior(np.exp(logs), accepted)
 
 
-def sample(density: Density, start: F64, count: int, warm_up: int, rng: np.random.Generator) -> tuple[F64, float]:
+def sample(
+    density: Density, start: F64, root: F64, count: int, warm_up: int, rng: np.random.Generator
+) -> tuple[F64, float]:
     """Return `count` draws of every chain that begins at `start` (C, K), (C, count, K), and the share of steps taken.
 
-    The first `warm_up` steps are thrown away. A step's covariance is that of their second half, scaled so that a
-    quarter of the steps is taken (Haario et al. 2001, but fixed before the first draw that counts).
+    root: Cholesky root of the steps' covariance, (K, K). The first `warm_up` steps are thrown away.
     """
     chains, size = start.shape
-    now, height = start.copy(), density(start)
-    root, scale = np.eye(size), 0.3
-    seen = np.empty((chains, warm_up, size))
+    now, height = start, density(start)
     points, taken = np.empty((chains, count, size)), 0
     for step in range(-warm_up, count):
-        proposed = now + scale * rng.standard_normal((chains, size)) @ root.T
+        proposed = now + rng.standard_normal((chains, size)) @ root.T
         there = density(proposed)
         accept = np.log(rng.random(chains)) < there - height
         now, height = np.where(accept[:, None], proposed, now), np.where(accept, there, height)
         if step >= 0:
             points[:, step] = now
             taken += int(accept.sum())
-            continue
-        done = step + warm_up + 1
-        seen[:, done - 1] = now
-        scale *= float(np.exp((accept.mean() - _WANTED) / np.sqrt(done / 10 + 1)))
-        if done % _WINDOW == 0 and done < warm_up:
-            root, scale = _fit_steps(seen[:, done // 2 : done], root, scale)
     return points, taken / (chains * count)
-
-
-def _fit_steps(seen: F64, root: F64, scale: float) -> tuple[F64, float]:
-    """A Cholesky root of the points' covariance, and the scale that keeps a step's size."""
-    size = seen.shape[2]
-    covariance = np.cov(seen.reshape(-1, size).T).reshape(size, size) + _JITTER * np.eye(size)
-    found = np.linalg.cholesky(covariance).astype(np.float64)
-    same = scale * float(np.linalg.norm(root) / np.linalg.norm(found))
-    return found, min(same, 2.38 / size**0.5)

@@ -8,7 +8,6 @@ import pytest
 from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.collect.environments import make_expert
 from manip_il.collect.rollout import Turn
-from manip_il.errors import MismatchError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
@@ -38,7 +37,7 @@ def expert_action(episode: RobotEpisode) -> np.ndarray:
 
 def test_a_target_reaches_the_robot_as_the_joints_it_means():
     ours, env = lockstep(2, hold=None), env_of(ENV)
-    ours.seeds = [4, 5]
+    ours.seed(4)
     observed = ours.reset()
     env.start(5)
     for step in range(3):
@@ -54,10 +53,11 @@ def test_a_target_reaches_the_robot_as_the_joints_it_means():
 
 def test_an_episode_that_has_ended_leaves_the_others_as_they_are():
     alone, beside = lockstep(1, hold=None), lockstep(3, hold=None)
-    alone.seeds, beside.seeds = [7], [5, 6, 7]
+    alone.seed(7)
+    beside.seed(5)
     alone.reset()
     beside.reset()
-    middle = beside.episodes[1]
+    middle = beside.envs[1].episode
     assert isinstance(middle, RobotEpisode)
     middle._hold, middle._held = 0, 1  # it has ended
     one, three = np.stack([up(0.02)]), np.stack([up(0.03), up(-0.01), up(0.02)])
@@ -91,7 +91,8 @@ def test_without_a_hold_an_episode_goes_on_after_success():
 
 def test_an_episode_depends_on_its_seed_alone():
     alone, beside = lockstep(1), lockstep(3)
-    alone.seeds, beside.seeds = [7], [5, 6, 7]
+    alone.seed(7)
+    beside.seed(5)
     assert np.array_equal(alone.reset()[0], beside.reset()[2])
     for step in range(3):
         action = up(0.01 * step)
@@ -100,25 +101,18 @@ def test_an_episode_depends_on_its_seed_alone():
         assert np.array_equal(alone.step_wait()[0][0], beside.step_wait()[0][2])
 
 
-def test_all_episodes_end_together_and_time_is_the_last_number():
+def test_no_episode_says_that_it_ends_and_time_is_the_last_number():
     env = lockstep(2, hold=None)
-    env.seeds = [1, 2]
+    env.seed(1)
     env.reset()
     for step in range(1, 13):
         env.step_async(np.zeros((2, 8), np.float32))
         observations, rewards, dones, _ = env.step_wait()
         assert observations[:, -1] == pytest.approx(step / 12)
-        assert dones.tolist() == [step == 12] * 2
+        assert not dones.any()
         assert not rewards.any()
     assert env.simulated == 24
     assert np.concatenate(env.executed).shape == (24, 8)
-
-
-def test_another_number_of_seeds_than_environments_is_refused():
-    env = lockstep(2)
-    env.seeds = [1]
-    with pytest.raises(MismatchError, match="environments has 2, seeds has 1"):
-        env.reset()
 
 
 def test_normalised_actions_mean_their_targets_within_the_range():

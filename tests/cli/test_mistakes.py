@@ -108,7 +108,6 @@ MISTAKES = {
     "dagger --label=takover": "did you mean 'takeover'?",
     "dagger --query=evry": "did you mean 'every'?",
     "dagger --policy.type=act --query=one": "use label=branch or label=takeover",
-    "dagger --sampling.corrections=-1": "sampling.corrections is -1.0; expected at least 0",
     "data check": "DATASET is missing",
     "data check a b": "unexpected 'b'",
     "data render SAMPLE x --cameras=": "--cameras names none; expected any of front, side, wrist",

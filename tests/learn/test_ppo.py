@@ -20,7 +20,7 @@ def weights(one) -> dict[str, torch.Tensor]:
 
 def iterate(one, env, number: int, actor: bool = True) -> Transitions:
     with lent_generators(number):
-        env.seeds = range(number * EPISODES, (number + 1) * EPISODES)
+        env.seed(number * EPISODES)
         rows = one.collect()
         one.improve(-np.abs(rows.next_states[:, 0]), actor=actor)
     return rows
@@ -31,7 +31,7 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
     rng = np.random.default_rng(1)
     states = np.pad(rng.normal(size=(20, 3)).astype(np.float32), ((0, 0), (0, 1)))
     actions = rng.uniform(-1, 1, (20, 2)).astype(np.float32)
-    raw = torch.from_numpy(env.actions.raw(actions))
+    raw = torch.from_numpy(env.range.raw(actions))
     with torch.no_grad():
         theirs = one.network.log_prob(torch.from_numpy(states[:, :3]), raw)
         still = one.network.layers(one.network.encode(torch.from_numpy(states[:, :3])))[:, 1]
@@ -45,7 +45,7 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
 
 def test_of_the_actors_own_actions_the_density_is_at_its_mean():
     one, env = learner()
-    env.seeds = range(EPISODES)
+    env.seed(0)
     with lent_generators(0):
         rows = one.collect()
     live = one.log_prob(rows)[~rows.absorbing]
@@ -61,7 +61,7 @@ def test_in_the_absorbing_state_every_action_is_as_likely():
 
 def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_step():
     one, env = learner()
-    env.seeds = range(EPISODES)
+    env.seed(0)
     with lent_generators(0):
         rows = one.collect()
     flags = rows.absorbing.reshape(STEPS, EPISODES)
@@ -108,7 +108,7 @@ def test_noise_of_exploration_is_as_wide_as_the_actors_and_within_the_range():
     noisy = one.explored(rows, np.random.default_rng(0)).actions
     assert noisy[:, 0].std() == pytest.approx(np.exp(-0.5), rel=0.05)
     assert not noisy[:, 1].any()
-    assert noisy[:, 0].max() <= env.actions.space.high[0]
+    assert noisy[:, 0].max() <= env.range.space.high[0]
 
 
 def test_a_reward_that_is_not_finite_is_refused():

@@ -15,7 +15,7 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.reward import LearnedReward, RewardNetwork, RewardShape, joints_of, shape_for, ways_of, write_reward
 from manip_il.learn.reward_fit import Compared, answer_losses, deal, fit_reward
 from manip_il.preferences.answers import Teacher, answer_pairs, join_answers
-from manip_il.preferences.fitting import fit_answers, fit_report
+from manip_il.preferences.fitting import fit_answers
 
 SHAPE = RewardShape(members=3, width=16)
 
@@ -164,9 +164,3 @@ def test_weights_that_are_not_finite_are_refused_when_they_are_used(folder, tmp_
     save_file(tensors, tmp_path / "model.safetensors")
     with pytest.raises(ManipError, match="the reward of row 0 is nan"):
         LearnedReward.load(tmp_path).of_inputs(clips.inputs)
-
-
-def test_the_page_says_what_was_held_out_and_by_whom_it_was_answered(fitted, clips, answers):
-    page = fit_report(fitted, clips, answers, ["Ada"], "manip-il reward fit", {}, {}).render()
-    for words in ("by Ada", f"epoch {fitted.fit.epochs}", "agrees with true progress in"):
-        assert words in page

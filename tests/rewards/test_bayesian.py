@@ -32,6 +32,7 @@ def test_chains_have_the_moments_of_the_density_and_agree():
     draws, accepted = sample(
         lambda points: -0.5 * np.einsum("ci,ij,cj->c", points - mean, inverse, points - mean),
         np.zeros((4, 2)),
+        1.7 * np.linalg.cholesky(covariance),
         5_000,
         1_000,
         np.random.default_rng(0),
