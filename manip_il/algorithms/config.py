@@ -85,7 +85,9 @@ class RunConfig:
     env: EnvConfig = field(default_factory=make_config)
     method: str = "dagger"
     demonstrations: int = option(50, "successful expert episodes to begin with (round 0)", at_least=1)
-    rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more", grows=True)
+    rounds: int = option(
+        5, "DAgger rounds after round 0; a resumed run may have more", at_least=0, at_most=99, grows=True
+    )
     episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones", at_least=1)
     label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends", at_least=1)
     beta: BetaSchedule = option(
@@ -127,13 +129,9 @@ class RunConfig:
     start: Path | None = None
 
     def __post_init__(self) -> None:
-        from manip_il.seeding import MAX_ROUNDS
-
         check_bounds(self)
         if self.disturbed_share and self.env.robot == STOCK:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
-        if not 0 <= self.rounds < MAX_ROUNDS:
-            raise UsageError(f"rounds is {self.rounds}; expected 0 or more, fewer than {MAX_ROUNDS}")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
             raise UsageError("redraw is for policies on pictures, with --label=per_state")
         self._check_method()
@@ -160,10 +158,6 @@ class RunConfig:
             raise UsageError(f"ensemble is {self.ensemble}, but --policy.path is one policy to begin with")
         if (rule is not None and rule.kind == "ensemble") != (self.ensemble > 1):
             raise UsageError(f"ensemble is {self.ensemble}, query '{rule or 'every'}'; ensemble:BOUND takes 2 or more")
-
-    def episodes(self, round_: int) -> int:
-        """Return episodes of a round."""
-        return self.demonstrations if round_ == 0 else self.episodes_per_round
 
     @property
     def steps_of_branch(self) -> int:

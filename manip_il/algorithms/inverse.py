@@ -37,12 +37,6 @@ F64 = NDArray[np.float64]
 CARRY = "carry"
 _MOVED = 0.004  # from where it stood, at which an object is on its way [m]
 FILE_NAME = "reward.json"
-_ASSUMES = {
-    "max_margin": "min over w of  λ/2 |w|² + mean over demonstrations of  "
-    "[ w·f(demonstration) - min over paths (w·f - margin) ]",
-    "bayesian": "p(w) = Π exp(-w_k / m) / m;   p(demonstration | w) = exp(-w·f) / Σ over its rivals exp(-w·f)",
-    "max_entropy": "p(path) = exp(-w·f) / Z(w);   gradient = f(demonstrations) - E[f]",
-}
 _PANELS = 3
 _SIDE = 80  # points along a side of the map
 
@@ -60,11 +54,15 @@ class Carried:
 def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Carried]:
     """Return what was carried in a dataset's episodes that reached the goal, in order.
 
-    Raises `ManipError` for a dataset of another task, and if no episode reached the goal.
+    Raises `ManipError` for a dataset of another task, if no episode reached the goal, and for a path through things.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
-    places = _places(root, spec)
+    places = {name: column for column, name in enumerate(spec.environment_state_names)}
+    if f"{EDGE}.here" not in places:
+        raise ManipError(
+            f"{root} is of the task {spec.task}; expected a dataset of manip-il record --task.type={CARRY}"
+        )
     table = dataset.columns([schema.ENVIRONMENT_STATE, schema.SUCCESS, EPISODE_INDEX])
     scene = scene_of(get_robot(spec.robot).name, CARRY, spec.object)
     index = table[EPISODE_INDEX].ravel()
@@ -76,21 +74,14 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
             continue
         layout = observed_layout(scene, OBJECT, {name: float(rows[0, column]) for name, column in places.items()})
         positions = carried_stretch(rows[:, [places[f"{OBJECT}.{axis}"] for axis in "xyz"]], np.array(layout.goal))
-        found.append(follow(episode, Grid(layout, space_of(scene.robot)), positions))
+        grid = Grid(layout, space_of(scene.robot))
+        path = grid.snap(positions)
+        if len(path) < 2 or path[-1] != grid.goal:
+            raise ManipError(f"episode {episode}: the object's path does not lead through free space to the goal")
+        found.append(Carried(episode, grid, positions, Demonstration(grid.problem, path)))
     if not found:
         raise ManipError(f"{root}: in none of its {len(np.unique(index))} episodes the object gets to the goal")
     return found
-
-
-def follow(episode: int, grid: Grid, positions: F64) -> Carried:
-    """Return a path of the object's positions (T, 3) [m] as a demonstration on a grid.
-
-    Raises `ManipError` if it does not lead to the goal on the grid.
-    """
-    path = grid.snap(positions)
-    if len(path) < 2 or path[-1] != grid.goal:
-        raise ManipError(f"episode {episode}: the object's path does not lead through free space to the goal")
-    return Carried(episode, grid, positions, Demonstration(grid.problem, path))
 
 
 def carried_stretch(positions: F64, goal: F64) -> F64:
@@ -101,17 +92,6 @@ def carried_stretch(positions: F64, goal: F64) -> F64:
     there = np.flatnonzero(off < AT_GOAL)
     last = int(there[0]) if len(there) else int(np.argmin(off))
     return positions[first : max(last, first) + 1]
-
-
-def _places(root: Path, spec: schema.RobotTaskSpec) -> dict[str, int]:
-    """Columns of `environment_state` by name; all that is needed is there."""
-    needed = {f"{name}.{axis}" for name in (OBJECT, "goal", *THINGS, EDGE, f"{EDGE}.outwards") for axis in "xyz"}
-    needed |= {f"{OBJECT}.width", *(f"{name}.here" for name in (*THINGS, EDGE))}
-    if not needed <= set(spec.environment_state_names):
-        raise ManipError(
-            f"{root} is of the task {spec.task}; expected a dataset of manip-il record --task.type={CARRY}"
-        )
-    return {name: column for column, name in enumerate(spec.environment_state_names)}
 
 
 @dataclass(frozen=True)
@@ -195,11 +175,8 @@ def open_line(found: Inverse) -> str:
 
 def inverse_report(found: Inverse, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
     """Return the report of what was learnt."""
-    order = [k for k in np.argsort(-found.weights).tolist() if k != 0 and found.weights[k] > 0][:3]
-    words = ", ".join(f"{found.weights[k]:.1f} {FEATURES[k].replace('_', ' ')}" for k in order)
     weights = Section(
         "What a metre costs",
-        formulas=(_ASSUMES[found.learnt.method],),
         tables=(weight_table(found),),
         notes=tuple(one for one in (*found.learnt.facts, open_line(found)) if one),
     )
@@ -214,8 +191,7 @@ def inverse_report(found: Inverse, command: str, config: Mapping[str, Any], timi
     return Report(
         title="What the demonstrations care about",
         verdict=f"{len(found.carried)} demonstrations pay {found.excess:.1%} more than the cheapest paths for the "
-        "weights that were learnt of them; a metre that costs 1 for its length costs besides: "
-        f"{words or 'nothing'}.",
+        "weights that were learnt of them.",
         command=command,
         config=config,
         timings=timings,

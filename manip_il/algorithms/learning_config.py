@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from manip_il.errors import UsageError
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import check_bounds, option
 from manip_il.tasks.config import EnvConfig
@@ -53,10 +52,6 @@ class LearningConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.episodes % self.ppo.minibatches:
-            raise UsageError(f"episodes is {self.episodes}; expected a multiple of ppo.minibatches")
-        if self.episode_steps > self.env.horizon:
-            raise UsageError(f"episode_steps is {self.episode_steps}; expected at most the horizon, {self.env.horizon}")
 
     @property
     def discount(self) -> float:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar, override
@@ -29,8 +29,13 @@ from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
 from manip_il.errors import UsageError
-from manip_il.evaluation.results import FILE_NAME, EvalResult
+from manip_il.evaluation.eval_report import run_report
+from manip_il.evaluation.figures import CLONING, DAGGER, Curve
+from manip_il.evaluation.report import Report
+from manip_il.evaluation.results import FILE_NAME, EvalResult, compare_results
+from manip_il.evaluation.rounds import history
 from manip_il.evaluation.runner import HOLD
+from manip_il.evaluation.tables import PolicyRow
 from manip_il.learn.checkpoint import Origin, in_one_line
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork, threads
@@ -227,3 +232,30 @@ def validations(folder: Path) -> dict[int, EvalResult]:
 def best_validation(found: dict[int, EvalResult]) -> int:
     """Return the iteration with the highest validation success, the later of equals."""
     return max(found, key=lambda number: (found[number].success.rate, number))
+
+
+def learning_report(
+    title: str,
+    found: dict[int, EvalResult],
+    records: Sequence[Mapping[str, Any]],
+    command: str,
+    config: Mapping[str, Any],
+) -> Report:
+    """Return the report of a run. found: its validations by iteration, not none. records: lines of metrics.jsonl."""
+    best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "policy given"}
+    facts = ["The best policy was chosen on these episodes, so they flatter it; measure it by manip-il eval."]
+    if 0 in found and best:
+        facts.insert(0, compare_results(found[0], found[best], (names[0], names[best])).verdict)
+    return run_report(
+        [
+            PolicyRow(names[number], found[number], colour=DAGGER if number else CLONING)
+            for number in sorted({min(found), best, max(found)})
+        ],
+        curves=[Curve(title, (history(records, title),), costs=("steps", "seconds"))],
+        title=title,
+        verdict=f"Best {names[best]}: validation success {found[best].success}.",
+        facts=tuple(facts),
+        command=command,
+        config=config,
+        fingerprint=found[best].fingerprint,
+    )

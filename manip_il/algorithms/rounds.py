@@ -66,12 +66,11 @@ def fit_round(
     init_from: Path | None = None,
     on_log: Callable[[dict[str, Any]], None] | None = None,
     member: int = 0,
-    weights: F64 | None = None,
 ) -> Path:
     """Fit, or go on with fitting, a policy to datasets; return the checkpoint's `pretrained_model`.
 
     init_from: start there (see `refit`). on_log: sees the metrics, {} at a step without. member: of the ensemble,
-    each from a seed of its own. weights: how often each frame is drawn, (N,); by default once an epoch.
+    each from a seed of its own.
     """
     from manip_il.learn.sources import Sources
     from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
@@ -81,7 +80,6 @@ def fit_round(
         round_fit(config, init_from, member),
         folder,
         resume=True,
-        weights=weights,
     )
     return trainer.fit(on_log)
 

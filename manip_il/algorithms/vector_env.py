@@ -20,7 +20,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from manip_il.collect.environments import make_env
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.network import MLPNetwork
-from manip_il.mdp import Observation
 from manip_il.tasks.config import EnvConfig
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
@@ -37,17 +36,16 @@ class RobotEpisode:
         """Begin the episode of a seed."""
         self._env.start(seed)
         self._held = 0
-        self._begin()
 
     def inputs(self) -> F32:
         """Return joint and environment state, raw, (n + k,)."""
-        return np.concatenate([self._seen.state, self._seen.environment_state])
+        seen = self._env.observe()
+        return np.concatenate([seen.state, seen.environment_state])
 
     def advance(self, action: F64) -> None:
         """Apply joint targets and opening (n,)."""
         self._env.advance(action)
         self._held += self._held > 0 or self._env.solved
-        self._begin()
 
     @property
     def ended(self) -> bool:
@@ -58,10 +56,6 @@ class RobotEpisode:
     def solved(self) -> bool:
         """Whether the task has been solved at some step."""
         return self._held > 0
-
-    def _begin(self) -> None:
-        self._env.begin_step()
-        self._seen: Observation = self._env.observe()
 
 
 @dataclass(frozen=True)
@@ -99,7 +93,7 @@ class ActionRange:
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
-class Unending(gymnasium.Env[F32, F64]):
+class Unending(gymnasium.Env[F32, Any]):
     """An episode that goes on in an absorbing state once it has ended, and never says that it has.
 
     Observes (d + 2,): inputs, absorbing or not, share of `horizon` gone. Steps take actions, not targets. episode: a
@@ -110,7 +104,8 @@ class Unending(gymnasium.Env[F32, F64]):
         self.episode, self.action_space, self._horizon = episode, space, horizon
         self._steps = self.simulated = 0
         episode.start(0)
-        self.observation_space = spaces.Box(-np.inf, np.inf, (len(episode.inputs()) + 2,), np.float32)
+        self._inputs = len(episode.inputs())
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self._inputs + 2,), np.float32)
 
     @override
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[F32, dict[str, Any]]:
@@ -128,7 +123,7 @@ class Unending(gymnasium.Env[F32, F64]):
 
     def _observe(self) -> F32:
         ended = self.episode.ended
-        inputs = np.zeros(self.observation_space.shape[0] - 2) if ended else self.episode.inputs()
+        inputs = np.zeros(self._inputs) if ended else self.episode.inputs()
         return np.append(inputs, [ended, self._steps / self._horizon]).astype(np.float32)
 
 

@@ -91,12 +91,11 @@ class Learning:
                 say(f"{result.steps:,} steps: validation success {result.validated.success}")
 
     def _report(self, config: LearningConfig, folder: Path) -> None:
-        from manip_il.algorithms.adversarial_report import adversarial_report
-        from manip_il.algorithms.learning_run import validations
+        from manip_il.algorithms.learning_run import learning_report, validations
 
         title = f"{self.title} on {config.env.robot} {config.env.task}"
         records, command = read_lines(folder / METRICS_FILE), command_line(f"rl {self.method}", self)
-        report = adversarial_report(title, validations(folder), records, command, to_plain(self))
+        report = learning_report(title, validations(folder), records, command, to_plain(self))
         report.write(folder / REPORT_FILE)
 
 

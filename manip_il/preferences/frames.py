@@ -53,10 +53,6 @@ class Frames:
         """Inputs of a reward, (N, n + k + n): state, environment state and action."""
         return np.concatenate([self.states, self.environment_states, self.actions], axis=1)
 
-    def rows(self, episode: int) -> slice:
-        """Return the rows of an episode, by its place (0 to E - 1)."""
-        return slice(int(self.firsts[episode]), int(self.firsts[episode] + self.lengths[episode]))
-
 
 def read_frames(root: Path) -> Frames:
     """Return the frames of a dataset. Raises `ManipError` for one that lacks our columns, or is not finite."""

@@ -92,10 +92,9 @@ class Pairs:
 def read_file[Read](path: Path, form: str, version: int, make: Callable[[dict[str, Any]], Read]) -> Read:
     """Return what `make` makes of a JSON file of a format and version. Raises `ManipError` for any other file."""
     data = checks.read_json(path, form, _LARGEST)
-    if (data.get("format"), data.get("version")) != (form, version):
-        found = f"format is {checks.shorten(data.get('format'))}, version {checks.shorten(data.get('version'))}"
-        raise ManipError(f"{path}: {found}; expected {form!r}, version {version}")
     try:
+        if (data["format"], data["version"]) != (form, version):
+            raise ValueError(f"version {data['version']} of {data['format']}")
         return make(data)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ManipError(f"{path} holds no {form}: {error!r}") from error

@@ -25,7 +25,7 @@ PRIOR = 300.0  # mean of a weight [1/m]
 TASTES = 60  # of the prior, for each demonstration
 CHAINS = 4
 _ROUNDS, _MORE = 3, 30  # rounds of tastes of the posterior
-_DRAWS, _WARM_UP = 10_000, 3_000  # of a chain
+_DRAWS, _WARM_UP = 20_000, 3_000  # of a chain
 _STEP = 2.38  # over the root of the dimensions: a random walk's step, in deviations (Roberts et al. 1997)
 
 
@@ -104,7 +104,7 @@ def fit(
     features = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
     for _ in range(_ROUNDS):
-        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
+        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 10, _WARM_UP)
         sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
     return draw_posterior(Choices.of(sums), rng, prior), sums
 

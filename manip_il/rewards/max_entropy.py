@@ -48,7 +48,7 @@ class SoftPlan:
 
     @cached_property
     def _moves(self) -> Any:
-        return self.problem.backwards(self.chances)
+        return self.problem.matrix(self.chances).T.tocsr()
 
     def visits(self, start: int) -> F64:
         """Return how often every edge is passed on the way from a start, expected, (E,) (Ziebart et al. 2008, alg. 1).
@@ -107,21 +107,19 @@ def _sum_paths(problem: PathProblem, shares: F64) -> F64:
     )
 
 
-def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR) -> tuple[float, F64, F64]:
-    """Return the mean negative log-likelihood with the prior's share, its gradient (K,), mean expected features (K,).
+def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR) -> tuple[float, F64]:
+    """Return the mean negative log-likelihood with the prior's share, and its gradient (K,).
 
     Raises what `soft_plan` raises.
     """
     count = len(demonstrations)
     loss = 0.5 * float(weights @ weights) / (prior**2 * count)
-    gradient, expected = weights / (prior**2 * count), np.zeros_like(weights)
+    gradient = weights / (prior**2 * count)
     for one in demonstrations:
         planned = soft_plan(one.problem, weights)
         loss += (float(one.sums @ weights) - float(planned.values[one.start])) / count
-        features = planned.features(one.start)
-        expected += features / count
-        gradient = gradient + (one.sums - features) / count
-    return loss, gradient, expected
+        gradient = gradient + (one.sums - planned.features(one.start)) / count
+    return loss, gradient
 
 
 def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
@@ -136,32 +134,29 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     return found
 
 
-def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> tuple[F64, F64, int]:
+def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
     """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B; the larger, the surer. prior: [1/m].
 
-    Beside them the mean features of a path that they expect, (K,) [m], and the number of evaluations. It begins from
-    twice the least weights on a few of the demonstrations, and goes on from there on all.
+    It begins from twice the least weights on a few of the demonstrations, and goes on from there on all.
     """
     least = least_weights(demonstrations)
-    weights, evaluations = np.maximum(2 * least, least.max() / 2), 0
+    weights = np.maximum(2 * least, least.max() / 2)
     for some in stages(demonstrations):
-        weights, more = _minimise(some, weights, least, prior)
-        evaluations += more
-    *_, expected = loss_of(demonstrations, weights, prior)
-    return weights, expected, evaluations
+        weights = _minimise(some, weights, least, prior)
+    return weights
 
 
-def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, prior: float) -> tuple[F64, int]:
-    """The most likely weights (K,), and evaluations, in units of the features' deviations from what is expected."""
+def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, prior: float) -> F64:
+    """The most likely weights (K,), in units of the features' deviations from what is expected."""
     missed = [one.sums - soft_plan(one.problem, start).features(one.start) for one in demonstrations]
     units = np.sqrt(np.mean(np.square(missed), axis=0))
     units = (units / max(float(units.max()), _TINY)).clip(min=_LEAST_UNIT)
 
     def loss(scaled: F64) -> tuple[float, F64]:
-        value, gradient, _ = loss_of(demonstrations, scaled / units, prior)
+        value, gradient = loss_of(demonstrations, scaled / units, prior)
         return value, gradient / units
 
     options: Any = {"maxiter": _MOST_STEPS, "gtol": _ENOUGH, "ftol": _SAME}
     bounds = [(low, None) for low in least * units]
     found = minimize(loss, start * units, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return np.asarray(found.x / units, np.float64), int(found.nfev)
+    return np.asarray(found.x / units, np.float64)

@@ -36,22 +36,20 @@ def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) 
     return float(demonstration.sums @ weights - planned.costs[demonstration.start]), demonstration.sums - sums
 
 
-def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> tuple[F64, F64]:
+def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> F64:
     """Return the weights (K,) of maximum margin planning: the mean of the second half of projected subgradient steps.
 
     Every weight is at least 0 and length's at least 1, which sets the scale. Steps are AdaGrad's; the first ones see a
-    few of the demonstrations. Beside them the objective at every step, (n,) [m].
+    few of the demonstrations.
     """
     least = np.eye(demonstrations[0].problem.features.shape[1])[LENGTH]
-    weights, losses = least, list[float]()
+    weights = least
     for some in stages(demonstrations):
         squares, kept = np.zeros_like(least), list[F64]()
         for _ in range(_STEPS):
-            parts = [loss_of(one, weights, margin) for one in some]
-            losses.append(float(np.mean([loss for loss, _ in parts])) + 0.5 * RIDGE * float(weights @ weights))
-            gradient = np.mean([one for _, one in parts], axis=0) + RIDGE * weights
+            gradient = np.mean([loss_of(one, weights, margin)[1] for one in some], axis=0) + RIDGE * weights
             squares += gradient**2
             weights = np.maximum(weights - _RATE * gradient / np.sqrt(squares + _FLAT), least)
             kept.append(weights)
         weights = np.mean(kept[_STEPS // 2 :], axis=0)
-    return weights, np.array(losses)
+    return weights

@@ -44,22 +44,14 @@ class PathProblem:
         """Numbers of the edges, from 1 on, as a sparse matrix from -> to, (S, S)."""
         return csr_array((np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes))
 
-    @cached_property
-    def _numbers_back(self) -> Any:
-        """The same to -> from."""
-        return self._numbers.T.tocsr()
-
     def costs(self, weights: F64) -> F64:
         """Return what every edge costs, (E,), for weights (K,), 0 or more."""
         return self.features @ weights
 
     def matrix(self, values: F64) -> Any:
         """Return values of the edges (E,) as a sparse matrix from -> to, (S, S). Zeros stay entries."""
-        return _filled(self._numbers, values)
-
-    def backwards(self, values: F64) -> Any:
-        """Return values of the edges (E,) as a sparse matrix to -> from, (S, S). Zeros stay entries."""
-        return _filled(self._numbers_back, values)
+        numbers = self._numbers
+        return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
     def edges_of(self, path: I64) -> I64:
         """Return the edges along a path of nodes (n,), (n - 1,). Raises `ManipError` if two are not joined."""
@@ -72,10 +64,6 @@ class PathProblem:
     def sums(self, path: I64) -> F64:
         """Return the features of a path of nodes (n,), summed over its edges, (K,)."""
         return self.features[self.edges_of(path)].sum(axis=0)
-
-
-def _filled(numbers: Any, values: F64) -> Any:
-    return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
 
 @dataclass(frozen=True)
@@ -97,7 +85,7 @@ def plan(problem: PathProblem, weights: F64) -> Plan:
 
 def plan_edges(problem: PathProblem, costs: F64) -> Plan:
     """Return the cheapest way from every node for costs of edges (E,), 0 or more: Dijkstra backwards from the goal."""
-    found, following = dijkstra(problem.backwards(costs), indices=problem.goal, return_predecessors=True)
+    found, following = dijkstra(problem.matrix(costs).T.tocsr(), indices=problem.goal, return_predecessors=True)
     return Plan(found, np.where(following < 0, NOWHERE, following).astype(np.int64))
 
 

@@ -74,7 +74,6 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timin
     ]
     if theory.shift is not None:
         sections = [*_arm(theory.shift), *sections]
-        facts.append(_shift_fact(theory.shift))
     slopes = {key: curve.slope for key, curve in theory.by_name.items()}
     walk, rope = PROCESSES[0].name, PROCESSES[1].name
     return Report(
@@ -221,16 +220,6 @@ def _arm(shift: Shift) -> list[Section]:
             notes=("Grey: the data that the policy was fitted on. Colour: where it took the hand itself.",),
         ),
     ]
-
-
-def _shift_fact(shift: Shift) -> str:
-    first, last = shift.rounds[0], shift.rounds[-1]
-    words = "" if first.on_expert is None else f" against {format_percent(first.on_expert)} in the expert's"
-    return (
-        f"On the arm, the cloned policy errs in {format_percent(first.on_own)} of its own states{words}, "
-        f"{first.distance:.1f} times as far from its data as the expert; round {last.round} errs in "
-        f"{format_percent(last.on_own)}, {last.distance:.1f} times as far."
-    )
 
 
 def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:

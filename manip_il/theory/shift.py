@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +41,7 @@ Columns = dict[str, NDArray[Any]]
 OnEpisode = Callable[[Episode], None]
 
 
-class RoundData(NamedTuple):
-    """A round on disk: its number, its policy's `pretrained_model` folder, and the datasets that was fitted on."""
-
-    round: int
-    policy: Path
-    datasets: tuple[Path, ...]
+RoundData = tuple[int, Path, tuple[Path, ...]]  # number, `pretrained_model` folder, datasets that it was fitted on
 
 
 @dataclass(frozen=True)
@@ -112,7 +107,7 @@ def find_rounds(run: Path) -> list[RoundData]:
             datasets.append(folder / "dataset")
         policy = folder / "policy" / "checkpoints" / "last" / "pretrained_model"
         if (policy / "config.json").is_file() and datasets:
-            found.append(RoundData(int(folder.name[-3:]), policy, tuple(datasets)))
+            found.append((int(folder.name[-3:]), policy, tuple(datasets)))
     if not found:
         raise ManipError(f"{run} has no round with a policy; expected the folder of a run of manip-il dagger")
     return found
@@ -134,18 +129,15 @@ def measure_shift(
     spec, found = env_spec(env), list[RoundShift]()
     hand = [spec.environment_state_names.index(name) for name in _HAND]
     expert, expert_cost, _ = _run(engine, RolloutJob(env, hold=0), seeds, on_episode)
-    for one in rounds:
-        own, cost, success = _run(engine, RolloutJob(env, PolicyDriver((one.policy,)), hold=0), seeds, on_episode)
-        wrong, policy, data = (
-            _wrong(own[schema.EXECUTED_ACTION], own, scale),
-            LearnedPolicy.load(one.policy),
-            _data(one),
-        )
+    for number, path, datasets in rounds:
+        own, cost, success = _run(engine, RolloutJob(env, PolicyDriver((path,)), hold=0), seeds, on_episode)
+        policy, data = LearnedPolicy.load(path), _data(number, datasets)
+        wrong = _wrong(own[schema.EXECUTED_ACTION], own, scale)
         on_expert = None if policy.cameras else float(_wrong(_retraced(policy, expert), expert, scale).mean())
         mistakes = float(wrong.sum() / episodes)
         found.append(
             RoundShift(
-                round=one.round,
+                round=number,
                 success=success,
                 on_expert=on_expert,
                 on_own=float(wrong.mean()),
@@ -176,12 +168,12 @@ def _run(
     return table, cost, Proportion.of([episode.success for episode in found])
 
 
-def _data(round_: RoundData) -> Columns:
+def _data(round_: int, datasets: Sequence[Path]) -> Columns:
     """What a round's policy was fitted on, but states after success, which rollouts here end at."""
-    table = joined_columns(round_.datasets, [*_OBSERVED, schema.SUCCESS])
+    table = joined_columns(datasets, [*_OBSERVED, schema.SUCCESS])
     rows = np.flatnonzero(~table[schema.SUCCESS].ravel().astype(np.bool_))
     if len(rows) > MOST_STATES:
-        rows = np.sort(rng_for(round_.round, "states of the data").choice(rows, MOST_STATES, replace=False))
+        rows = np.sort(rng_for(round_, "states of the data").choice(rows, MOST_STATES, replace=False))
     return {key: table[key][rows] for key in _OBSERVED}
 
 

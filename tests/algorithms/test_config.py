@@ -24,7 +24,7 @@ DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})
         ({"ensemble": 3}, "ensemble is 3, query 'every'"),
         ({"label": "takeover", "beta": BetaSchedule("linear", 3)}, "learner rolls in alone"),
         ({"rounds": -1}, "rounds is -1"),
-        ({"rounds": 100}, "rounds is 100; expected 0 or more, fewer than 100"),
+        ({"rounds": 100}, "rounds is 100; expected 0 to 99"),
         ({"episodes_per_round": 0}, "episodes_per_round is 0"),
         ({"disturbed_share": 1.5}, "disturbed_share is 1.5"),
         ({"branch_steps": 0}, "branch_steps is 0"),

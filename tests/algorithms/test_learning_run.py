@@ -139,6 +139,6 @@ def test_what_cannot_begin_is_refused(config, cloned, tmp_path):
     with pytest.raises(MismatchError, match=r"joint_delta, --action_space has ee_delta"):
         LearningRun(replace(config, start=cloned, action_space="ee_delta"), tmp_path, Engine())
     with pytest.raises(UsageError, match="episodes is 5; expected a multiple"):
-        replace(config, episodes=5)
+        LearningRun(replace(config, episodes=5), tmp_path, Engine())
     with pytest.raises(UsageError, match="episode_steps is 10; expected at least"):
         LearningRun(replace(config, episode_steps=10), tmp_path, Engine())

@@ -104,7 +104,7 @@ MISTAKES = {
     "record --dataset.repo_id=name": "expected USER/NAME",
     "dagger --config_path=missing.yaml": "cannot read missing.yaml",
     "dagger --beta=lineal:5": "beta is 'lineal:5'; expected constant:B, linear:ROUNDS",
-    "dagger --rounds=-1": "rounds is -1; expected 0 or more",
+    "dagger --rounds=-1": "rounds is -1; expected 0 to 99",
     "dagger --label=takover": "did you mean 'takeover'?",
     "dagger --query=evry": "did you mean 'every'?",
     "dagger --policy.type=act --query=one": "use label=branch or label=takeover",

@@ -65,7 +65,7 @@ def test_true_progress_scores_without_a_reward(here, capsys):
         ("reward pairs good --count=0", "--count is 0; expected at least 1", 2),
         ("reward pairs good --clip=99", "the longest episode has 30", 1),
         ("reward ask nowhere.json", "nowhere.json does not exist; expected pairs.json", 2),
-        ("reward answer good/meta/info.json", "format is None, version None; expected 'manip_il pairs'", 1),
+        ("reward answer good/meta/info.json", "good/meta/info.json holds no manip_il pairs", 1),
         ("reward answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
         ("reward fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
         ("reward fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),

@@ -85,8 +85,8 @@ def test_pairs_are_the_same_from_their_file(clips, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"format": "else"}, "format is 'else', version 1; expected 'manip_il pairs', version 1"),
-        ({"version": 9}, "version 9; expected"),
+        ({"format": "else"}, "holds no manip_il pairs: ValueError('version 1 of else')"),
+        ({"version": 9}, "version 9 of manip_il pairs"),
         ({"pairs": [[[0, 0, 0]]]}, "holds no manip_il pairs"),
         ({"sources": 3}, "holds no manip_il pairs"),
     ],

@@ -47,8 +47,8 @@ def test_the_area_does_not_change_with_the_scale_of_the_scores(rows):
 
 def test_an_episode_is_scored_by_its_last_second(scored):
     data, fps = scored.data, scored.data.spec.fps
-    rows = data.rows(3)
-    assert episode_scores(scored.frames, data)[3] == pytest.approx(scored.frames[rows][-fps:].mean())
+    end = data.firsts[4]
+    assert episode_scores(scored.frames, data)[3] == pytest.approx(scored.frames[end - fps : end].mean())
 
 
 def test_failed_episodes_are_found_and_listed_first(scored):

@@ -81,7 +81,7 @@ def test_contradictions_and_skips_are_counted_and_all_answers_kept(clips):
         ({"answers": [{"pair": 0, "answer": "lefft"}]}, "'lefft' (did you mean 'left'?)"),
         ({"answers": [{"pair": 0}]}, "holds no manip_il preferences"),
         ({"pairs": "0" * 64}, "pairs (sha256) differs"),
-        ({"format": None}, "format is None"),
+        ({"format": None}, "holds no manip_il preferences"),
     ],
 )
 def test_answers_edited_into_nonsense_are_one_line(change, says, clips, tmp_path):

@@ -27,8 +27,7 @@ def test_a_demonstration_misses_no_margin_of_0_for_its_own_weights():
 
 def test_what_is_learnt_plans_as_the_demonstrator_on_unseen_grids():
     shown = demonstrations(20, TRUTH, **SIZE)
-    weights, losses = fit(shown)
-    assert losses[-1] < losses[0] / 3
+    weights = fit(shown)
     assert excess(weights, TRUTH, **SIZE) < 0.02 < excess(np.eye(3)[0], TRUTH, **SIZE)
     for one in shown:
         assert one.sums @ weights <= 1.05 * plan(one.problem, weights).costs[one.start]
