@@ -12,10 +12,9 @@ import mujoco
 
 from manip_il import checks
 from manip_il.errors import ManipError, UsageError
-from manip_il.robots.reading import place
+from manip_il.robots.reading import place, read
 
 KEYS = ("model", "includes", "meshes", "mend")  # of a YAML
-_MOST_MENDED = 10_000  # of a text that is mended [characters]
 _LARGEST = 16 * 1024**2  # of an MJCF [bytes], and of what it is mended to [characters]
 
 
@@ -36,15 +35,8 @@ class ModelFiles:
     @classmethod
     def read(cls, what: str, tree: Mapping[str, Any], folder: Path) -> Self:
         """Make it of what YAML holds in a folder; `ManipError` names what is wrong."""
-        folders = {key: place(what + key, tree[key], folder) for key in ("includes", "meshes") if key in tree}
-        mend = checks.mapping(f"{what}mend", tree.get("mend", {}))
-        texts = {
-            checks.text(f"a text in {what}mend", old, _MOST_MENDED): ""
-            if new == ""
-            else checks.text(f"{what}mend", new)
-            for old, new in mend.items()
-        }
-        return cls(place(f"{what}model", tree["model"], folder), **folders, mend=texts)
+        places = {key: place(what + key, tree[key], folder) for key in KEYS if key in tree and key != "mend"}
+        return cls(**places, mend=read(f"{what}mend", dict[str, str], tree.get("mend", {})))
 
     def load(self, robot: str) -> mujoco.MjSpec:
         """Read the model; MuJoCo finds what it includes and its meshes. Raises `UsageError` if it cannot be read.

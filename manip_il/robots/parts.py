@@ -1,18 +1,15 @@
-"""Parts of a robot as its YAML says them, checked: hand, gripper, workspace, costs of inverse kinematics."""
+"""Parts of a robot as its YAML says them: hand, gripper, workspace, table, cameras, costs of inverse kinematics."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Self
 
 import mujoco
 import numpy as np
 
-from manip_il import checks
 from manip_il.errors import ManipError
-from manip_il.robots.files import KEYS, ModelFiles
-from manip_il.robots.reading import FURTHEST, names, numbers, tree_of
+from manip_il.robots.files import ModelFiles
+from manip_il.robots.reading import require_lengths
 
 TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
@@ -31,16 +28,8 @@ class EndEffector:
     quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
     lowest: float = 0.021
 
-    @classmethod
-    def read(cls, what: str, tree: Any) -> Self:
-        """Make it of what YAML holds; `ManipError` names what is wrong."""
-        tree = tree_of(what, tree, cls)
-        quaternion = numbers(f"{what}.quaternion", tree.get("quaternion", cls.quaternion), 4, 1.0)
-        if np.linalg.norm(quaternion) < 0.1:
-            raise ManipError(f"{what}.quaternion is {quaternion}; expected one of length 1, wxyz")
-        position = numbers(f"{what}.position", tree["position"], 3, FURTHEST)
-        lowest = checks.number(f"{what}.lowest", tree.get("lowest", cls.lowest), 0.0, 0.2)
-        return cls(checks.text(f"{what}.body", tree["body"]), position, quaternion, lowest)
+    def __post_init__(self) -> None:
+        require_lengths(self, position=3, quaternion=4)
 
 
 @dataclass(frozen=True)
@@ -62,29 +51,13 @@ class GripperConfig:
     position: tuple[float, ...] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
 
-    @classmethod
-    def read(cls, what: str, tree: Any, folder: Path) -> Self:
-        """Make it of what YAML holds in a folder; `ManipError` names what is wrong."""
-        tree = tree_of(what, tree, cls, without=("files",), more=KEYS)
-        joints, fingers = (names(f"{what}.{name}", tree[name]) for name in ("joints", "fingers"))
-        if len(fingers) < 2:
-            raise ManipError(f"{what}.fingers names {len(fingers)}; expected two or more bodies")
-        closed, opened = (numbers(f"{what}.{name}", tree[name], len(joints), FURTHEST) for name in ("closed", "open"))
-        for joint, at, to in zip(joints, closed, opened, strict=True):
+    def __post_init__(self) -> None:
+        require_lengths(self, closed=len(self.joints), open=len(self.joints), position=3, quaternion=4)
+        if len(self.fingers) < 2:
+            raise ManipError(f"fingers names {len(self.fingers)}; expected two or more bodies")
+        for joint, at, to in zip(self.joints, self.closed, self.open, strict=True):
             if at == to:
-                raise ManipError(
-                    f"{what}.closed and {what}.open are both {at:g} for joint {joint!r}; expected two places"
-                )
-        mass = tree.get("finger_mass")
-        mass = None if mass is None else checks.number(f"{what}.finger_mass", mass, 1e-6, 100)
-        force = tree.get("force")
-        force = None if force is None else checks.number(f"{what}.force", force, 1e-3, 1e4)
-        files = ModelFiles.read(f"{what}.", tree, folder) if "model" in tree else None
-        if files is not None:
-            joints, fingers = (tuple(GRIPPER + name for name in several) for several in (joints, fingers))
-        position = numbers(f"{what}.position", tree.get("position", cls.position), 3, FURTHEST)
-        quaternion = numbers(f"{what}.quaternion", tree.get("quaternion", cls.quaternion), 4, 1.0)
-        return cls(joints, closed, opened, fingers, mass, force, files, position, quaternion)
+                raise ManipError(f"closed and open are both {at:g} for joint {joint!r}; expected two places")
 
 
 @dataclass(frozen=True)
@@ -95,15 +68,10 @@ class Workspace:
     half_width: float = 0.15
     height: float = 0.45
 
-    @classmethod
-    def read(cls, what: str, tree: Any) -> Self:
-        """Make it of what YAML holds; `ManipError` names what is wrong."""
-        tree = tree_of(what, tree, cls)
-        half_width, height = (
-            checks.number(f"{what}.{name}", tree.get(name, getattr(cls, name)), 0.02, 2)
-            for name in ("half_width", "height")
-        )
-        return cls(numbers(f"{what}.centre", tree["centre"], 2, FURTHEST), half_width, height)
+    def __post_init__(self) -> None:
+        require_lengths(self, centre=2)
+        if not 0.02 <= min(self.half_width, self.height) <= max(self.half_width, self.height) <= 2:
+            raise ManipError(f"half_width is {self.half_width:g}, height {self.height:g}; expected 0.02 to 2 m")
 
 
 @dataclass(frozen=True)
@@ -113,16 +81,10 @@ class Table:
     size: tuple[float, ...] = (0.9, 1.2)
     height: float = 0.4
 
-    @classmethod
-    def read(cls, what: str, tree: Any, space: Workspace) -> Self:
-        """Make it of what YAML holds; `ManipError` names what is wrong: a table smaller than the workspace, too."""
-        tree = tree_of(what, tree, cls)
-        size = numbers(f"{what}.size", tree.get("size", cls.size), 2, FURTHEST, 0.05)
-        if min(size[0] / 2 - TABLE_BEYOND, size[1] / 2) < space.half_width:
-            wide = 2 * space.half_width
-            least = f"{wide + 2 * TABLE_BEYOND:g} by {wide:g} m"
-            raise ManipError(f"{what}.size is {list(size)}; expected at least {least} for the workspace")
-        return cls(size, checks.number(f"{what}.height", tree.get("height", cls.height), 0.05, 3.0))
+    def __post_init__(self) -> None:
+        require_lengths(self, size=2)
+        if self.height <= 0:
+            raise ManipError(f"height is {self.height:g}; expected more than 0 m")
 
 
 @dataclass(frozen=True)
@@ -136,14 +98,10 @@ class CameraPose:
     target: tuple[float, ...]
     fovy: float = 42.0
 
-    @classmethod
-    def read(cls, what: str, tree: Any) -> Self:
-        """Make it of what YAML holds; `ManipError` names what is wrong."""
-        tree = tree_of(what, tree, cls)
-        position, target = (numbers(f"{what}.{name}", tree[name], 3, FURTHEST) for name in ("position", "target"))
-        if np.linalg.norm(np.subtract(position, target)) < 0.01:
-            raise ManipError(f"{what}: position and target are the same place; expected a direction to look in")
-        return cls(position, target, checks.number(f"{what}.fovy", tree.get("fovy", cls.fovy), 1.0, 170.0))
+    def __post_init__(self) -> None:
+        require_lengths(self, position=3, target=3)
+        if np.linalg.norm(np.subtract(self.position, self.target)) < 0.01:
+            raise ManipError("position and target are the same place; expected a direction to look in")
 
     @property
     def quaternion(self) -> tuple[float, ...]:
@@ -168,13 +126,3 @@ class Costs:
     orientation: float = 0.2
     leaning: float = 0.04
     posture: float = 0.01
-
-    @classmethod
-    def read(cls, what: str, tree: Any, found: Costs) -> Costs:
-        """Make it of what YAML holds, else of what was found; `ManipError` names what is wrong."""
-        tree = tree_of(what, tree, cls)
-        values = {
-            name: checks.number(f"{what}.{name}", tree.get(name, getattr(found, name)), 1e-6, 100)
-            for name in ("orientation", "leaning", "posture")
-        }
-        return cls(**values)

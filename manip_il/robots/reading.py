@@ -1,58 +1,54 @@
-"""Pieces of a robot's YAML, checked: mappings with known keys, names, numbers, paths."""
+"""Pieces of a robot's YAML as the dataclasses that they are; what is wrong is one line."""
 
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import MISSING, fields
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName
 
-FURTHEST = 10.0  # of anything from anything [m]
-_MOST_JOINTS = 100
 
+def read(what: str, kind: Any, value: Any) -> Any:
+    """Return what YAML holds as a type: a dataclass, whose fields are the keys, a tuple, a mapping, a number, text.
 
-def tree_of(
-    what: str, tree: Any, kind: type, without: tuple[str, ...] = (), more: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """Return a mapping whose keys are fields of `kind`, without some and with `more`.
-
-    Raises `UnknownName` for another key, `ManipError` for one that is missing.
+    Raises `UnknownName` for another key, `ManipError` for what is missing, of another type, or refused by the class.
     """
-    found = checks.mapping(what, tree)
-    known = {one.name: one for one in fields(kind) if one.name not in without}
-    for key in found:
-        if key not in known and key not in more:
-            raise UnknownName(f"key in {what}:", key, (*known, *more))
-    for name, one in known.items():
-        if name not in found and one.default is MISSING and one.default_factory is MISSING:
-            raise missing(what, name)
-    return found
+    import draccus  # here, as names of robots need none
+
+    if is_dataclass(kind):
+        known = [one.name for one in fields(kind)]
+        for key in checks.mapping(what, value):
+            if key not in known:
+                raise UnknownName(f"key in {what}:", key, known)
+    require_finite(what, value)
+    try:
+        decode: Any = draccus.decode
+        return decode(kind, value)
+    except ManipError as error:
+        raise ManipError(f"{what}.{error}") from None
+    except Exception as error:  # draccus raises bare ones, too
+        line = checks.one_line(error)
+        raise ManipError(f"{what} is {checks.shorten(value)}: {line}") from None
 
 
-def missing(what: str, name: str) -> ManipError:
-    """Return the error of a key that is not there."""
-    return ManipError(f"{what} has no {name!r}; a robot's YAML needs one")
+def require_finite(what: str, value: Any) -> None:
+    """Raise `ManipError` for a number that is not finite, at any depth."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ManipError(f"{what} is {value}; expected a finite number")
+    for one in value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ():
+        require_finite(what, one)
 
 
-def names(what: str, value: Any) -> tuple[str, ...]:
-    """Return names, at least one, each once; raises `ManipError`."""
-    found = tuple(
-        checks.text(f"a name in {what}", one, checks.LONGEST_NAME) for one in checks.array(what, value, _MOST_JOINTS)
-    )
-    if not found or len(set(found)) < len(found):
-        raise ManipError(f"{what} names {checks.shorten(found)}; expected at least one, each once")
-    return found
-
-
-def numbers(what: str, value: Any, count: int, most: float, least: float | None = None) -> tuple[float, ...]:
-    """Return so many numbers from `least`, by default -`most`, to `most`; raises `ManipError`."""
-    found = checks.array(what, value, _MOST_JOINTS)
-    if len(found) != count:
-        raise ManipError(f"{what} has {len(found)} numbers; expected {count}")
-    return tuple(checks.number(f"a number in {what}", one, -most if least is None else least, most) for one in found)
+def require_lengths(one: Any, **counts: int) -> None:
+    """Raise `ManipError` for a field that has not so many numbers."""
+    for name, count in counts.items():
+        if len(getattr(one, name)) != count:
+            raise ManipError(f"{name} has {len(getattr(one, name))} numbers; expected {count}")
 
 
 def place(what: str, value: Any, folder: Path) -> Path:
@@ -60,11 +56,8 @@ def place(what: str, value: Any, folder: Path) -> Path:
     package, colon, path = checks.text(what, value).partition(":")
     if not colon:
         return folder / package
-    try:
-        found = importlib.util.find_spec(package) if package.isidentifier() else None
-    except ValueError:  # of a module that was not imported from a file, as `__main__`
-        found = None
-    if found is None or not found.has_location or found.origin is None:
+    found = importlib.util.find_spec(package) if package.isidentifier() else None
+    if found is None or found.origin is None:
         distribution = package.replace("_", "-")
         raise ManipError(
             f"{what} is in {package!r}, which is not installed; run: pip install --no-deps {distribution}"

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UnknownName
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Table, Workspace
+from manip_il.robots.parts import TABLE_BEYOND, CameraPose, Costs, EndEffector, GripperConfig, Table, Workspace
+from manip_il.robots.reading import require_lengths
 from manip_il.robots.servos import RATE, LeRobotConfig
 
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
@@ -57,9 +58,20 @@ class Robot:
     lerobot: LeRobotConfig | None = None
 
     def __post_init__(self) -> None:
-        named, wanted = len(self.joint_names), len(self.joints) + 1
-        if named != wanted:
-            raise ManipError(f"lerobot.names has {named} names; expected {wanted}: the arm's joints', the gripper's")
+        count = len(self.joints)
+        require_lengths(self, home=count, gains=count, forces=count, armature=count)
+        if both := set(self.joints) & set(self.gripper.joints):
+            raise ManipError(f"joints and gripper.joints both name {min(both)!r}; expected every joint in one of them")
+        if (named := len(self.joint_names)) != count + 1:
+            raise ManipError(f"lerobot.names has {named} names; expected {count + 1}: the arm's joints', the gripper's")
+        if self.yaw not in YAWS:
+            raise UnknownName("yaw", self.yaw, YAWS)
+        if not 0 < self.max_joint_step <= 1:
+            raise ManipError(f"max_joint_step is {self.max_joint_step:g}; expected more than 0 and at most 1 rad")
+        (x, y), wide = self.table.size, 2 * self.workspace.half_width
+        if x < wide + 2 * TABLE_BEYOND or y < wide:
+            least = f"{wide + 2 * TABLE_BEYOND:g} by {wide:g} m"
+            raise ManipError(f"table.size is {x:g} by {y:g} m; expected at least {least} for the workspace")
 
     @property
     def joint_names(self) -> tuple[str, ...]:

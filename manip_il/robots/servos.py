@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.errors import ManipError
-from manip_il.robots.reading import names, numbers, tree_of
 
 F64 = NDArray[np.float64]
 RATE = 20  # control steps a second of a robot that says no other
 _MOST_HZ = 500
-_FURTHEST = 10.0  # of a gripper's joint [rad]
 
 
 @dataclass(frozen=True)
@@ -31,16 +28,11 @@ class LeRobotConfig:
     gripper: tuple[float, ...]
     fps: int = RATE
 
-    @classmethod
-    def read(cls, what: str, tree: Any) -> Self:
-        """Make it of what YAML holds; `ManipError` names what is wrong."""
-        tree = tree_of(what, tree, cls)
-        gripper = numbers(f"{what}.gripper", tree["gripper"], 2, _FURTHEST)
-        if gripper[0] == gripper[1]:
-            raise ManipError(f"{what}.gripper is {gripper[0]:g} rad at 0 and at 100; expected two places")
-        robot_type = checks.name(f"{what}.robot_type", tree["robot_type"])
-        fps = checks.whole(f"{what}.fps", tree.get("fps", cls.fps), 1, _MOST_HZ)
-        return cls(robot_type, names(f"{what}.names", tree["names"]), gripper, fps)
+    def __post_init__(self) -> None:
+        checks.name("robot_type", self.robot_type)
+        checks.whole("fps", self.fps, 1, _MOST_HZ)
+        if len(set(self.gripper)) != 2:
+            raise ManipError(f"gripper is {list(self.gripper)}; expected two places, at 0 and at 100 [rad]")
 
     def percent(self, joint: F64) -> F64:
         """Return the gripper's numbers, 0 to 100, where its driven joint stands at `joint` [rad]."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -13,10 +15,9 @@ from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles
-from manip_il.robots.parts import CameraPose, Costs, EndEffector, GripperConfig, Table, Workspace
-from manip_il.robots.reading import FURTHEST, missing, names, numbers, tree_of
-from manip_il.robots.robot import FOUND, JOINT_STEP, UPRIGHT, YAWS, Robot, costs_of, yaw_of
-from manip_il.robots.servos import LeRobotConfig
+from manip_il.robots.parts import GRIPPER, CameraPose, Costs, GripperConfig
+from manip_il.robots.reading import read
+from manip_il.robots.robot import FOUND, UPRIGHT, Robot, costs_of, yaw_of
 
 SUFFIXES = (".yaml", ".yml")
 SCENE_CAMERAS = ("front", "side")  # that a YAML may place
@@ -66,63 +67,42 @@ def read_robot(path: Path) -> Robot:
 
 def _said(path: Path, tree: Any) -> dict[str, Any]:
     """The fields that a YAML says, and the defaults of those that are not found on the model."""
-    tree = tree_of(str(path), tree, Robot, without=("name", "files", "hand", *FOUND), more=(*KEYS, "hand", *FOUND))
-    if "model" not in tree:
-        raise missing(str(path), "model")
-    gripper = GripperConfig.read("gripper", tree["gripper"], path.parent)
+    tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
+    known = (*KEYS, *(name for name in kinds if name not in ("name", "files")))
+    for key in tree:
+        if key not in known:
+            raise UnknownName(f"key in {path}:", key, known)
+    if "hand" not in tree and "ee" in tree:
+        tree["hand"] = checks.mapping("ee", tree["ee"]).get("body")
+    for name in ("model", "hand", "gripper", "workspace"):
+        if name not in tree:
+            raise ManipError(f"{path} has no {name!r}; a robot's YAML needs one")
     said: dict[str, Any] = {
         "name": checks.name("a robot's name", path.stem),
         "files": ModelFiles.read("", tree, path.parent),
-        "gripper": gripper,
-        "workspace": Workspace.read("workspace", tree["workspace"]),
-        "max_joint_step": checks.number("max_joint_step", tree.get("max_joint_step", JOINT_STEP), 1e-3, 1.0),
+        "gripper": _gripper(checks.mapping("gripper", tree["gripper"]), path.parent),
     }
-    if "ee" in tree:
-        said["ee"] = EndEffector.read("ee", tree["ee"])
-    if "hand" not in tree and "ee" not in tree:
-        raise missing(str(path), "hand")
-    said["hand"] = checks.text("hand", tree["hand"]) if "hand" in tree else said["ee"].body
-    if "wrist_camera" in tree:
-        said["wrist_camera"] = checks.text("wrist_camera", tree["wrist_camera"], checks.LONGEST_NAME)
-    cameras = checks.mapping("cameras", tree.get("cameras", {}))
+    costs, cameras = tree.pop("costs", {}), checks.mapping("cameras", tree.pop("cameras", {}))
     if unknown := [name for name in cameras if name not in SCENE_CAMERAS]:
         raise UnknownName("camera in a robot's YAML:", unknown[0], SCENE_CAMERAS)
-    said["cameras"] = {name: CameraPose.read(f"cameras.{name}", one) for name, one in cameras.items()}
-    if "table" in tree:
-        said["table"] = Table.read("table", tree["table"], said["workspace"])
-    if tree.get("base") is not None:
-        said["base"] = numbers("base", tree["base"], 3, FURTHEST)
-    if "lerobot" in tree:
-        said["lerobot"] = LeRobotConfig.read("lerobot", tree["lerobot"])
-    fixed, colours = (checks.mapping(name, tree.get(name, {})) for name in ("fixed", "colours"))
-    said["fixed"] = {name: checks.number(f"fixed: {name}", value, -100, 100) for name, value in fixed.items()}
-    said["colours"] = {name: numbers(f"colours: {name}", value, 3, 1.0, 0.0) for name, value in colours.items()}
-    return said | _joints(tree, gripper)
-
-
-def _joints(tree: Mapping[str, Any], gripper: GripperConfig) -> dict[str, Any]:
-    """Read what a YAML says of the arm's joints."""
-    said: dict[str, Any] = {}
-    if "joints" in tree:
-        joints = said["joints"] = names("joints", tree["joints"])
-        if both := set(joints) & set(gripper.joints):
-            raise ManipError(f"joints and gripper.joints both name {min(both)!r}; expected every joint in one of them")
-    limits = {"home": (100.0, None), "gains": (1e6, 0.0), "forces": (1e5, 1e-3), "armature": (100.0, 0.0)}
-    for name in [name for name in limits if name in tree]:
-        if "joints" not in said:
-            raise ManipError(f"{name} is given without joints; expected the list of the joints that it is of")
-        most, least = limits[name]
-        said[name] = numbers(name, tree[name], len(said["joints"]), most, least)
-    if "costs" in tree or "joints" in said:
-        found = costs_of(len(said["joints"])) if "joints" in said else UPRIGHT
-        said["costs"] = Costs.read("costs", tree.get("costs", {}), found)
+    said["cameras"] = {name: read(f"cameras.{name}", CameraPose, one) for name, one in cameras.items()}
+    said |= {key: read(key, kinds[key], value) for key, value in tree.items() if key not in (*KEYS, "gripper")}
     if "joints" in said:
-        said["yaw"] = yaw_of(len(said["joints"]))
-    if "yaw" in tree:
-        if tree["yaw"] not in YAWS:
-            raise UnknownName("yaw", tree["yaw"], YAWS)
-        said["yaw"] = tree["yaw"]
+        said.setdefault("yaw", yaw_of(len(said["joints"])))
+    if "joints" in said or costs:
+        found = costs_of(len(said["joints"])) if "joints" in said else UPRIGHT
+        said["costs"] = read("costs", Costs, vars(found) | checks.mapping("costs", costs))
     return said
+
+
+def _gripper(tree: Mapping[str, Any], folder: Path) -> GripperConfig:
+    """Read a gripper; the names of one that has a model of its own get that one's prefix."""
+    own = {key: value for key, value in tree.items() if key not in KEYS}
+    gripper: GripperConfig = read("gripper", GripperConfig, own)
+    if "model" not in tree:
+        return gripper
+    names = {key: tuple(GRIPPER + name for name in getattr(gripper, key)) for key in ("joints", "fingers")}
+    return replace(gripper, files=ModelFiles.read("gripper.", tree, folder), **names)
 
 
 _read = cache(read_robot)
