@@ -43,8 +43,7 @@ class RobotNewOptions:
         """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
         from manip_il.data.atomic import write_file
         from manip_il.evaluation.robot_check import advice, verdict
-        from manip_il.robots.suggest import found_lines, suggest, yaml_of
-        from manip_il.robots.table import get_robot
+        from manip_il.robots.suggest import suggest, yaml_of
 
         target = self.output or self.model.with_suffix(".yaml")
         checks.name(f"the name of {target}, which will be the robot's,", target.stem)
@@ -52,10 +51,8 @@ class RobotNewOptions:
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
         found = suggest(self.model, self.gripper)
         text = yaml_of(found, *paths)
-        say(*(f"look: {doubt}" for doubt in found.doubts))
         write_file(target, text.encode())
         try:
-            write_file(target, (text + found_lines(get_robot(str(target)))).encode())
             checked = _measure(str(target), list(NAMES), 0)
         except ManipError as error:
             raise ManipError(f"wrote {target}, which cannot be used yet: {error}") from None

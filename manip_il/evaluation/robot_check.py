@@ -27,7 +27,7 @@ from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import FILM
-from manip_il.sim.home import Pair, meeting_at
+from manip_il.sim.posture import Pair, meeting_at
 from manip_il.sim.render import Line, Overview, marked_picture
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.task import TakesShape, Task

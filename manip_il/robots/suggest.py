@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from manip_il.errors import UsageError
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import nearest
 from manip_il.robots.gripper import finger_geoms
-from manip_il.robots.robot import Robot
 from manip_il.robots.spec import load
 
 _ARM_GOES_ON = 3  # joints one after another that are more than a finger has
@@ -26,7 +25,6 @@ _JAWS = ("jaw", "finger", "grip", "claw")  # in the name of a single one's body 
 _HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # in the name of a body that carries one
 _REACHES, _HALF = 0.5, 0.18  # of the workspace's centre and half width, in lengths of the arm
 _WIDEST, _HIGHEST = 0.15, 0.45  # of a workspace: half its width, its height [m]
-_HARDLY = math.radians(2 * math.pi)  # no joint of a model turns farther: its angles may be radians [rad]
 _ROUND = 0.01  # what lengths are rounded to [m]
 
 
@@ -34,8 +32,7 @@ _ROUND = 0.01  # what lengths are rounded to [m]
 class Suggestion:
     """Words of a robot's YAML as they look on the model; names are those of the gripper's model.
 
-    closed, open: of the driven joints [m] or [rad]. centre, half_width, height: of the workspace [m]. doubts: what may
-    be meant otherwise, a sentence each.
+    closed, open: of the driven joints [m] or [rad]. centre, half_width, height: of the workspace [m].
     """
 
     hand: str
@@ -46,7 +43,6 @@ class Suggestion:
     centre: tuple[float, float]
     half_width: float
     height: float
-    doubts: tuple[str, ...] = ()
 
 
 def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
@@ -69,7 +65,7 @@ def _suggest(model: Path, gripper: Path | None) -> Suggestion:
     else:
         hand, (palm, jaws) = _flange(spec.worldbody), _palm(with_jaws, gripper)
     driven = _driven(with_jaws, jaws, gripper or model)
-    closed, opened, fingers, others = _ends(with_jaws, palm, jaws, driven)
+    closed, opened, fingers = _ends(with_jaws, palm, jaws, driven)
     if not all((hand.name, palm.name, *fingers)):
         raise UsageError(f"{gripper or model}: its hand or a finger is a body without a name; name it in the model")
     length, base = _length(spec, hand.name)
@@ -82,18 +78,7 @@ def _suggest(model: Path, gripper: Path | None) -> Suggestion:
         (_rounded(base[0] + _REACHES * length), _rounded(base[1])),
         _rounded(min(_WIDEST, _HALF * length)),
         _rounded(min(_HIGHEST, 3 * _HALF * length)),
-        (*_doubted_angles(model, spec), *(_doubted_angles(gripper, with_jaws) if gripper else ()), *others),
     )
-
-
-def _doubted_angles(path: Path, spec: mujoco.MjSpec) -> Iterator[str]:
-    """Say so if every joint that turns hardly turns: radians without a word are read as degrees."""
-    ends = [abs(end) for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE for end in joint.range]
-    if 0 < max(ends, default=0) < _HARDLY:
-        yield (
-            f"{path.name} turns no joint by more than {math.degrees(max(ends)):.2g} degrees: if its angles are radians "
-            'give it <compiler angle="radian"/>, with mend if the file is somebody else\'s (docs/robots.md)'
-        )
 
 
 def _moves(body: Any) -> bool:
@@ -156,11 +141,8 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
 
 def _ends(
     spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...], list[str]]:
-    """Find where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet.
-
-    Last comes a sentence about each finger that is left out.
-    """
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
+    """Find where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet."""
     moving = [
         jaw.name
         for jaw in jaws
@@ -189,13 +171,7 @@ def _ends(
     gap(closed)
     pads = nearest(model, data, fingers)[0]
     touching = tuple(model.body(model.geom_bodyid[pad]).name for pad in pads)
-    others = [
-        f"gripper.fingers names {' and '.join(touching)}, the two that come nearest to each other; the finger "
-        f"{bodies[place] or place} moves, too: name it there if all close on one place"
-        for place, finger in enumerate(fingers)
-        if not {*pads} & {*finger}
-    ]
-    return tuple(closed), tuple(opened), touching if len(moving) > 1 else tuple(bodies), others
+    return tuple(closed), tuple(opened), touching if len(moving) > 1 else tuple(bodies)
 
 
 def _length(spec: mujoco.MjSpec, hand: str) -> tuple[float, tuple[float, float]]:
@@ -251,16 +227,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(one) for one in value]
     return float(f"{value:.5g}") + 0.0 if isinstance(value, float) else value  # no -0
-
-
-def found_lines(robot: Robot) -> str:
-    """Return what was found on the model as lines of YAML that say nothing until their `#` is taken away."""
-    lines = [
-        _line("joints", robot.joints, "base to hand"),
-        _line("home", robot.home, "hand down, over the workspace [rad]"),
-        _line("gains", robot.gains, "kp of position control [N m/rad]"),
-        _line("forces", robot.forces, "greatest torques [N m]"),
-        _line("armature", robot.armature, "[kg m^2]"),
-        _line("ee", vars(robot.ee), "[m], wxyz"),
-    ]
-    return "# Found on the model; what is said instead holds.\n" + textwrap.indent("".join(lines), "# ", lambda _: True)

@@ -6,7 +6,7 @@ Whose values are applied where: to the model by `variation.py`, to pictures by `
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -59,7 +59,7 @@ _SEEN = (*PICTURED, "picture_delay")
 
 @dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high), both ends included; without one the world is nominal in that.
+    """Ranges (low, high), both ends included, or one number; without one the world is nominal in that.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
@@ -79,12 +79,14 @@ class Condition:
     name: str
     ranges: Mapping[str, Any] = field(hash=False)
 
-    def __init__(self, name: str = "nominal", **ranges: Range | Sequence[str]):
-        _require_name("a condition's name", name)
-        _require_known(name, ranges)
+    def __init__(self, name: str = "nominal", **ranges: Any):
+        try:
+            checks.name("a condition's name", name)
+        except ManipError as error:
+            raise UsageError(str(error)) from None
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
-        ranges = {one: _checked(name, one, range_) for one, range_ in ranges.items()}
+        ranges = {one: _range(name, one, range_) for one, range_ in ranges.items()}
         kept = {one: ranges[one] for one in _KNOWN if one in ranges and (one != "knock_step" or "knock" in ranges)}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
@@ -123,8 +125,7 @@ class Condition:
     @classmethod
     def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
         """Make a condition of ranges as YAML or JSON has them; else `UsageError`."""
-        _require_known(name, tree)
-        return cls(name, **{key: _read(f"{name}: {key}", key, value) for key, value in tree.items()})
+        return cls(name, **{str(key): value for key, value in tree.items()})
 
     def __str__(self) -> str:
         said = ", ".join(f"{name} {words(range_)}" for name, range_ in self.ranges.items())
@@ -195,40 +196,28 @@ def _vector(rng: np.random.Generator, lengths: Range) -> list[float]:
     return [float(value) for value in rng.uniform(*lengths) * direction / np.linalg.norm(direction)]
 
 
-def _require_name(what: str, name: object) -> None:
+def _range(condition: str, name: str, given: Any) -> Any:
+    """A range as a tuple, of what Python or YAML has: a pair or a number, names or one name."""
+    if name not in _KNOWN:
+        raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], _KNOWN)
+    what, several = f"{condition}: {name}", list(given) if isinstance(given, list | tuple) else [given]
+    if name in _NAMES:
+        for one in several:
+            if one not in _NAMES[name]:
+                raise UnknownName(f"{name} in {condition}:", str(one)[: checks.LONGEST_NAME], _NAMES[name])
+        if not several or len(set(several)) < len(several):
+            raise UsageError(f"{what} is {checks.shorten(given)}; expected names, each once")
+        return tuple(several)
     try:
-        checks.name(what, name)
-    except ManipError as error:
-        raise UsageError(str(error)) from None
-
-
-def _require_known(what: str, names: Iterable[object]) -> None:
-    for name in names:
-        if name not in _KNOWN:
-            raise UnknownName(f"key in {what}:", str(name)[: checks.LONGEST_NAME], _KNOWN)
-
-
-def _checked(condition: str, name: str, given: Any) -> Any:
-    what = f"{condition}: {name}"
-    if name not in _NAMES:
-        _require_range(what, given, _BOUNDS[name], whole=name in (*_WHOLE, "clutter"))
-        return given
-    if not isinstance(given, Sequence) or isinstance(given, str) or not given or len(set(map(str, given))) < len(given):
-        raise UsageError(f"{what} is {checks.shorten(given)}; expected names, each once")
-    for one in given:
-        if one not in _NAMES[name]:
-            raise UnknownName(f"{name} in {condition}:", str(one)[: checks.LONGEST_NAME], _NAMES[name])
-    return tuple(given)
-
-
-def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> None:
-    if not isinstance(given, Sequence) or len(given) != 2:
-        raise UsageError(f"{what} is {checks.shorten(given)}; expected (low, high)")
-    low, high = (_end(what, end) for end in given)
-    if not bounds[0] <= low <= high <= bounds[1]:
-        raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {bounds[0]} to {bounds[1]}")
-    if whole and (low % 1 or high % 1):
+        low, high = (checks.number(what, end) for end in (several if len(several) > 1 else 2 * several))
+    except (ManipError, ValueError):
+        raise UsageError(f"{what} is {checks.shorten(given)}; expected a number, or [low, high]") from None
+    least, most = _BOUNDS[name]
+    if not least <= low <= high <= most:
+        raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {least} to {most}")
+    if name in (*_WHOLE, "clutter") and (low % 1 or high % 1):
         raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
+    return given if isinstance(given, tuple) else (low, high)
 
 
 def _overlap(name: str, asked: Range, sizes: Range) -> Range:
@@ -238,28 +227,6 @@ def _overlap(name: str, asked: Range, sizes: Range) -> Range:
         takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"
         raise UsageError(f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose others")
     return low, high
-
-
-def _read(what: str, name: str, value: Any) -> Any:
-    """A range as YAML has it: a name or a list of names, a number or `[low, high]`."""
-    if name in _NAMES:
-        return value if isinstance(value, list) else [value]
-    return _as_range(what, value)
-
-
-def _as_range(what: str, value: Any) -> Range:
-    ends = value if isinstance(value, list) else [value, value]
-    if len(ends) != 2:
-        raise UsageError(f"{what} is {checks.shorten(value)}; expected a number, or [low, high]")
-    return _end(what, ends[0]), _end(what, ends[1])
-
-
-def _end(what: str, value: Any) -> float:
-    """One end of a range; an int beyond what a float holds is none."""
-    try:
-        return checks.number(what, value)
-    except ManipError:
-        raise UsageError(f"{what} is {checks.shorten(value)}; expected a number, or [low, high]") from None
 
 
 NOMINAL = Condition()

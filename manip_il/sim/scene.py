@@ -22,7 +22,7 @@ from manip_il.robots.spec import arm_spec, copy_options
 from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
-from manip_il.sim.home import require_free_home
+from manip_il.sim.posture import require_free_home
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene

@@ -26,7 +26,7 @@ from manip_il.robots.gripper import sweep
 from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
-from manip_il.sim.home import meeting_at
+from manip_il.sim.posture import meeting_at
 from manip_il.sim.scene import PREFIX
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import TASKS

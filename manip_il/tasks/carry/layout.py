@@ -6,8 +6,6 @@ whatever has a length, a path of points or an edge of the grid, has their line i
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -16,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError, UnknownName
 from manip_il.tasks.carry.reward import FEATURES
 
 F64 = NDArray[np.float64]
@@ -63,8 +60,7 @@ class Layout:
 
     scale: of all lengths, 1 for a workspace of `FULL`. goal: of the object's centre [m]. places: (x, y) [m] of the
     things there are, by name. edge: None where none is near. half: of the object's height [m]. parts: of object and
-    hand, as they hang on the object's centre. Raises `UnknownName` for a thing that is none, `ManipError` for a number
-    that is not finite or a length that is not above 0.
+    hand, as they hang on the object's centre.
     """
 
     scale: float
@@ -73,19 +69,6 @@ class Layout:
     edge: Edge | None
     half: float
     parts: tuple[Part, ...]
-
-    def __post_init__(self) -> None:
-        for name, _ in self.places:
-            if name not in THINGS:
-                raise UnknownName("thing", name, THINGS)
-        numbers = [*self.goal, *(number for _, place in self.places for number in place), *self._edge_numbers()]
-        if not all(map(math.isfinite, numbers)):
-            raise ManipError(f"a layout with {numbers}; expected finite numbers")
-        if not (self.scale > 0 and self.half > 0):
-            raise ManipError(f"a layout of scale {self.scale:g} for an object of {self.half:g} m; expected more than 0")
-
-    def _edge_numbers(self) -> Iterator[float]:
-        return (number for pair in self.edge or () for number in pair)
 
     @cached_property
     def boxes(self) -> tuple[tuple[str, F64, F64, float], ...]:
