@@ -22,7 +22,7 @@ from manip_il.cli.parsing import check_values, from_layers, from_yaml
 from manip_il.cli.progress import Stages, say
 from manip_il.data.json_lines import read_lines
 from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
-from manip_il.evaluation.arm import Arm, Member, require_same_env, run_member
+from manip_il.evaluation.arm import Arm, Member, read_member, require_same_env
 from manip_il.evaluation.comparison import TARGET, Study
 from manip_il.evaluation.rounds import COSTS, METRICS_FILE, At, Cost, Rule, history
 from manip_il.evaluation.runner import FOLDER, Trial
@@ -256,7 +256,7 @@ def with_start_cost(options: ArmOptions, own: Member, run: Path) -> Member:
 
 
 def _member(plan: Plan, root: Path, name: str, seed: int) -> Member:
-    run = run_member(_folder(root, name, seed), seed)
+    run = replace(read_member(_folder(root, name, seed)), training_seed=seed)
     return with_start_cost(plan.arms[name], run, _folder(root, plan.starts[name], seed))
 
 

@@ -84,11 +84,6 @@ class Arm:
     members: tuple[Member, ...]
 
     @property
-    def training_seeds(self) -> list[int | None]:
-        """Training seeds, in the order of the members."""
-        return [member.training_seed for member in self.members]
-
-    @property
     def test_rate(self) -> float:
         """Mean success over training seeds."""
         return fmean(member.test.success.rate for member in self.members)
@@ -109,15 +104,9 @@ def read_arm(path: Path) -> Arm:
     folders = [folder for folder in path.iterdir() if folder.is_dir()] if path.is_dir() else []
     seeds = {int(match[1]): folder for folder in folders if (match := _SEED_FOLDER.fullmatch(folder.name))}
     if not seeds:
-        return Arm(str(path), (_read_member(path),))
-    members = (replace(_read_member(folder), training_seed=seed) for seed, folder in sorted(seeds.items()))
+        return Arm(str(path), (read_member(path),))
+    members = (replace(read_member(folder), training_seed=seed) for seed, folder in sorted(seeds.items()))
     return Arm(str(path), tuple(members))
-
-
-def run_member(folder: Path, training_seed: int) -> Member:
-    """Return a run as a member."""
-    rounds = history(read_lines(folder / METRICS_FILE), str(folder))
-    return Member(folder, training_seed, rounds)
 
 
 def require_pair(left: Arm, right: Arm) -> None:
@@ -127,7 +116,7 @@ def require_pair(left: Arm, right: Arm) -> None:
     """
     if len({member.result is None for arm in (left, right) for member in arm.members}) > 1:
         raise UsageError(f"{left.name} and {right.name}: one is evaluated already; give two eval.json, or two policies")
-    ours, theirs = left.training_seeds, right.training_seeds
+    ours, theirs = ([member.training_seed for member in arm.members] for arm in (left, right))
     if len(ours) != len(theirs) or (len(ours) > 1 and ours != theirs):
         raise UsageError(f"training seeds differ: {left.name} has {ours}, {right.name} {theirs}; give the same ones")
 
@@ -143,7 +132,8 @@ def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
     return env
 
 
-def _read_member(path: Path) -> Member:
+def read_member(path: Path) -> Member:
+    """Return the policy, run or evaluation at `path`; `UsageError` if there is none."""
     if path.is_file():
         return Member(path, result=EvalResult.read(path))
     records = read_lines(path / METRICS_FILE)

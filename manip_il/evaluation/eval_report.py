@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from manip_il.evaluation.figures import (
@@ -19,7 +18,7 @@ from manip_il.evaluation.figures import (
 )
 from manip_il.evaluation.report import Film, Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.evaluation.tables import BASELINE, DAGGER, NO_CONDITION, PolicyRow, Table, evaluation_table, policy_table
+from manip_il.evaluation.tables import PolicyRow, Table, evaluation_table, policy_table
 from manip_il.sim.task import NO_PHASE
 from manip_il.tasks.table import TASKS
 
@@ -136,15 +135,12 @@ def evaluation_verdict(result: EvalResult) -> str:
 
 def _conditions(result: EvalResult) -> Section:
     """Success in all episodes and in every condition, and what success and the conditions mean."""
-    settings, parts = result.settings, result.by_condition
-    table = evaluation_table(result)
-    table, bars = replace(table, colours=(DAGGER,)), [Bar(result.policy, (result.success,))]
-    if len(parts) > 1:
-        (_, *total), *rows = table.rows
-        named = (("all conditions", *total), *((row[0].strip(), *row[1:]) for row in rows))
-        table = Table(("condition", *table.columns[1:]), named, (BASELINE, *[DAGGER] * len(rows)))
-        bars = [Bar("all conditions", (result.success,), BASELINE)]
-        bars += [Bar(name or NO_CONDITION, (part.success,)) for name, part in parts.items()]
+    settings, table = result.settings, evaluation_table(result)
+    successes = [result.success, *(part.success for part in result.by_condition.values())]
+    bars = [
+        Bar(row[0], (success,), colour)
+        for row, success, colour in zip(table.rows, successes, table.colours, strict=False)  # one row of one condition
+    ]
     ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
     intervals = "Intervals are Wilson's score intervals."
     if result.until_width is not None:

@@ -42,7 +42,6 @@ SOLVES = 0.9  # share of clean episodes that the expert solves, of a task that c
 STARTS = 50  # of each task that are drawn
 ENOUGH = 0.95  # share of a workspace that a robot reaches, of one that suits it
 LOW = 0.03  # height of what lies on the table [m]
-_NARROWER = 0.01  # steps in which a smaller workspace is tried [m]
 _ROOM = 0.13  # of the map around the workspace [m]
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 _AXES = ((0.85, 0.12, 0.12, 1.0), (0.10, 0.62, 0.20, 1.0), (0.10, 0.30, 0.90, 1.0))  # x red, y green, z blue
@@ -82,8 +81,7 @@ class RobotCheck:
     """A robot as it was measured. name: as it was given.
 
     opening: the widest of the gripper [m]. overlaps: pairs of links at home, and in any posture. table: share of points
-    on the table of the workspace that the hand, pointing down, gets to. half_width: the widest at which a share of
-    `ENOUGH` of the table is reached [m]; 0 if there is none.
+    on the table of the workspace that the hand, pointing down, gets to.
     """
 
     name: str
@@ -91,7 +89,6 @@ class RobotCheck:
     opening: float
     overlaps: tuple[Pair, ...]
     table: float
-    half_width: float
     tasks: tuple[TaskCheck, ...]
 
     @property
@@ -106,7 +103,7 @@ class RobotCheck:
             "hand": self.robot.hand,
             "gripper": {"joints": self.robot.gripper.joints, "opening": self.opening},
             "home_overlaps": self.overlaps,
-            "reach": {"table": self.table, "half_width": self.half_width},
+            "reach": {"table": self.table},
             "tasks": [task.to_json() for task in self.tasks],
         }
 
@@ -129,7 +126,14 @@ def check_robot(
                 seeds = stream_seeds("validation", episodes)
                 found.append(evaluate(engine, job, seeds, "expert", on_result, suite=condition.name))
             checked[place] = replace(task, clean=found[0], noisy=found[1])
-    return RobotCheck(name, robot, scene.gripper.most, overlaps, *reach_facts(robot), tasks=tuple(checked))
+    return RobotCheck(
+        name,
+        robot,
+        scene.gripper.most,
+        overlaps,
+        float(np.mean(_reached(robot, robot.workspace.half_width, 41))),
+        tuple(checked),
+    )
 
 
 def check_starts(name: str, task: str) -> TaskCheck:
@@ -156,14 +160,6 @@ def widths(task: Task) -> dict[str, float]:
         geom = int(model.body(name).geomadr[0])
         found[name] = widest_grasp(int(model.geom_type[geom]), model.geom_size[geom])
     return found
-
-
-def reach_facts(robot: Robot) -> tuple[float, float]:
-    """Return `table` and `half_width` of a `RobotCheck`; takes seconds if the map of the reach is not kept yet."""
-    half_width = robot.workspace.half_width
-    narrower = np.arange(half_width, 0.0, -_NARROWER).tolist()
-    enough = next((half for half in narrower if np.mean(_reached(robot, half, 41)) >= ENOUGH), 0.0)
-    return float(np.mean(_reached(robot, half_width, 41))), round(enough, 3)
 
 
 def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
@@ -252,9 +248,10 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML, the arm's first, then for each task that cannot be done."""
     lines, space = list[str](), check.robot.workspace
     if check.table < ENOUGH:
-        change = f"take half_width: {check.half_width:g} in place of {space.half_width:g}"
-        if not check.half_width:
-            change = f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green"
+        change = (
+            f"take a smaller half_width than {space.half_width:g}, or move workspace.centre, ({space.centre[0]:g}, "
+            f"{space.centre[1]:g}), to where the map is green"
+        )
         if not check.table and check.robot.gripper.files is not None:
             change += "; or turn the gripper on the hand by gripper.quaternion"
         lines.append(f"The hand gets to {100 * check.table:.0f} % of the workspace on the table: {change}.")

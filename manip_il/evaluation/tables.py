@@ -94,11 +94,13 @@ def policy_table(rows: Sequence[PolicyRow]) -> Table:
 
 def evaluation_table(result: EvalResult) -> Table:
     """Return success, success at the end and control steps until success: of all episodes, then of each condition."""
-    parts = [(result.policy, result)]
-    if len(result.by_condition) > 1:
-        parts += [(f"  {name or NO_CONDITION}", part) for name, part in result.by_condition.items()]
-    rows = tuple((name, f"{one.success.n:,}", *_success_cells(one)) for name, one in parts)
-    return Table(("policy", "episodes", f"success {INTERVAL}", "success at end", "steps to success"), rows)
+    parts, conditions, colours = {result.policy: result}, result.by_condition, (DAGGER,)
+    if len(conditions) > 1:
+        parts = {"all conditions": result} | {name or NO_CONDITION: part for name, part in conditions.items()}
+        colours = (BASELINE, *[DAGGER] * len(conditions))
+    rows = tuple((name, f"{one.success.n:,}", *_success_cells(one)) for name, one in parts.items())
+    head = ("condition" if len(rows) > 1 else "policy", "episodes", f"success {INTERVAL}", "success at end")
+    return Table((*head, "steps to success"), rows, colours)
 
 
 def _success_cells(result: EvalResult) -> tuple[str, str, str]:

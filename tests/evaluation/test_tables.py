@@ -45,7 +45,7 @@ def test_a_terminal_gets_colour_and_whole_numbers(width: int):
 def test_an_evaluation_has_a_row_for_each_condition_after_that_of_all():
     result = made_eval()
     table = evaluation_table(result)
-    assert [row[0] for row in table.rows] == ["runs/a/best", "  nominal", "  knocked", "  sensing"]
+    assert [row[0] for row in table.rows] == ["all conditions", "nominal", "knocked", "sensing"]
     assert table.rows[0][1:4] == ("120", str(result.success), str(result.success_at_end))
     assert table.rows[2][2] == str(result.by_condition["knocked"].success)
     assert len(evaluation_table(made_eval(conditions=("nominal",))).rows) == 1
