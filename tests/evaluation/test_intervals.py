@@ -20,8 +20,6 @@ from manip_il.evaluation.intervals import (
     wilson_interval,
 )
 
-counts = st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
-rates = st.lists(st.floats(-1, 1), min_size=2, max_size=8)
 outcomes = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=60)
 few = st.lists(st.integers(-3, 3), max_size=9)
 
@@ -37,25 +35,6 @@ few = st.lists(st.integers(-3, 3), max_size=9)
 )
 def test_wilson_agrees_with_newcombes_table(successes: int, n: int, low: float, high: float):
     assert wilson_interval(successes, n) == pytest.approx((low, high), abs=5e-5)
-
-
-@given(counts)
-def test_wilson_contains_the_rate_and_mirrors_that_of_failures(count: tuple[int, int]):
-    successes, n = count
-    low, high = wilson_interval(successes, n)
-    assert 0 <= low <= successes / n <= high <= 1
-    assert low < high
-    assert wilson_interval(n - successes, n) == pytest.approx((1 - high, 1 - low), abs=1e-12)
-
-
-@given(counts)
-def test_wilson_limits_are_where_the_score_test_just_rejects(count: tuple[int, int]):
-    """The definition, Wilson (1927): |rate - p| = z sqrt(p (1 - p) / n) at both ends."""
-    successes, n = count
-    for limit in wilson_interval(successes, n):
-        if 0 < limit < 1:
-            score = abs(successes / n - limit) / math.sqrt(limit * (1 - limit) / n)
-            assert score == pytest.approx(1.959964, abs=1e-5)
 
 
 def test_a_proportion_prints_its_interval():
@@ -87,25 +66,6 @@ def test_a_confidence_sequence_holds_at_every_look_where_wilsons_does_not():
         assert missed[False] > 30  # peeking costs so much
 
 
-@pytest.mark.parametrize("n", [1, 10, 1_000])
-def test_a_confidence_sequence_contains_the_rate_and_wilsons_interval_nearly(n):
-    for successes in {0, n // 2, n - 1, n}:
-        low, high = confidence_sequence(successes, n)
-        assert 0 <= low <= successes / n <= high <= 1
-        ours, theirs = high - low, wilson_interval(successes, n)
-        assert ours > 0.9 * (theirs[1] - theirs[0])
-    assert confidence_sequence(0, n)[0] == 0.0
-    assert confidence_sequence(n, n)[1] == 1.0
-
-
-def test_a_confidence_sequence_is_symmetric_and_narrows():
-    for successes, n in ((3, 10), (99, 100), (0, 7)):
-        low, high = confidence_sequence(successes, n)
-        assert confidence_sequence(n - successes, n) == pytest.approx((1 - high, 1 - low), abs=1e-9)
-    widths = [high - low for low, high in (confidence_sequence(9 * k, 10 * k) for k in (1, 10, 100, 1_000))]
-    assert widths == sorted(widths, reverse=True)
-
-
 def test_the_edge_of_a_confidence_sequence_is_where_the_bet_reaches_twenty():
     successes, n = 45, 50
     grid = [(i + 0.5) / 20_000 for i in range(20_000)]
@@ -120,13 +80,6 @@ def test_the_edge_of_a_confidence_sequence_is_where_the_bet_reaches_twenty():
 def test_the_interval_of_a_mean_worked_by_hand():
     half = 4.3027 * 0.01 / math.sqrt(3)
     assert mean_interval([0.01, 0.02, 0.03]) == pytest.approx((0.02 - half, 0.02 + half), 1e-4)
-
-
-@given(rates)
-def test_the_interval_contains_the_mean_and_turns_with_the_sign(values: list[float]):
-    low, high = mean_interval(values)
-    assert low <= sum(values) / len(values) + 1e-12
-    assert mean_interval([-value for value in values]) == pytest.approx((-high, -low), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -158,18 +111,6 @@ def mcnemar(only_left: int, only_right: int) -> float:
 )
 def test_mcnemar_is_the_exact_binomial(only_a: int, only_b: int, p: float):
     assert mcnemar(only_a, only_b) == pytest.approx(p, rel=1e-12)
-
-
-@given(outcomes)
-def test_mcnemar_is_a_probability_and_symmetric(pairs: list[tuple[bool, bool]]):
-    a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    assert 0 < compare_paired(a, b).p_value <= 1
-    assert compare_paired(a, b).p_value == compare_paired(b, a).p_value
-    assert compare_paired(a, a).p_value == 1
-
-
-def test_mcnemar_survives_counts_beyond_floating_point():
-    assert 0 < mcnemar(1_000, 1_100) < 1  # 2 to the 2100: a float ends at 2 to the 1024
 
 
 @given(outcomes)
@@ -214,8 +155,3 @@ def test_the_test_counts_every_way_to_flip_the_signs(differences: list[int]):
     ]
     extreme = sum(abs(total) >= abs(sum(differences)) for total in flips)
     assert sign_flip_exact(differences) == pytest.approx(extreme / len(flips), rel=1e-12)
-
-
-@given(few)
-def test_training_seeds_that_agree_in_every_episode_are_no_further_evidence(differences: list[int]):
-    assert sign_flip_exact([3 * d for d in differences]) == sign_flip_exact(differences)
