@@ -152,7 +152,7 @@ class Study:
 
     @property
     def facts(self) -> list[str]:
-        """Sentences after the verdict: comparisons with the baseline, how rounds were chosen, meaning of wall-clock."""
+        """Sentences after the verdict: comparisons with the baseline, and how rounds were chosen."""
         verdicts = [comparison.verdict for comparison in self.comparisons.values()]
         facts = verdicts if len(verdicts) > 1 else []
         if self.comparisons and (seeds := len(self.arms[0].members)) > 1:
@@ -161,7 +161,7 @@ class Study:
                 "these policies alone."
             )
         if any(member.chosen for arm in self.arms for member in arm.members):
-            facts += [self.rule.fact, "Wall-clock is what collecting and fitting took; validating is not counted."]
+            facts.append(self.rule.fact)
         return facts
 
     def result_tables(self) -> tuple[Table, ...]:

@@ -88,7 +88,7 @@ def curve_sections(
 def disturbed_note(result: EvalResult) -> str:
     """Return a sentence on the conditions, behind a blank; empty without any."""
     disturbance = result.settings.disturbance
-    return "" if disturbance == "none" else f" Disturbed: {disturbance}."
+    return "" if disturbance == "none" else f" Conditions: {disturbance}."
 
 
 def phase_table(policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: str) -> Table | None:

@@ -53,9 +53,6 @@ class Progress(Protocol):
     def step(self) -> None:
         """Count a step."""
 
-    def log(self, record: dict[str, Any]) -> None:
-        """Take a fit's metrics at a step."""
-
     def close(self) -> None:
         """End the stage."""
 

@@ -94,7 +94,7 @@ def test_the_page_says_what_conditions_draw_why_it_has_no_films_and_which_interv
     conditions = (Condition(), Condition("knocked", knock=(0.05, 0.08)))
     made = replace(RESULT, settings=replace(RESULT.settings, conditions=conditions), until_width=0.1)
     text = page_of(eval_report(made, COMMAND, no_films="no OpenGL here")).text
-    assert "Disturbed: nominal" in text
+    assert "Conditions: nominal" in text
     assert "knock 0.05 to 0.08" in text
     assert "No films: no OpenGL here" in text
     assert "confidence sequence" in text
