@@ -141,7 +141,7 @@ SETTINGS = {
     "Pendulum-v1": Settings(steps=100_000, ppo=PPOConfig(lr=2e-3, minibatches=8)),
     "CartPole-v1": Settings(steps=30_000, ppo=PPOConfig(lr=1e-3, minibatches=8)),
 }
-SHAPE = Shape(64, 2, "silu", "gaussian", 1, 2, 10.0, action_space="joint_target")
+SHAPE = Shape(width=64, depth=2, loss="gaussian", action_space="joint_target")
 _QUICK = {"steps": 1_000, "episode_steps": 20, "demonstrations": 2}
 
 

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation of the `mlp` policy's network, by stable-baselines3's `PPO`.
+"""Proximal policy optimisation of the `mlp` policy's network, with a critic of its own, by stable-baselines3's `PPO`.
 
 Schulman et al., Proximal policy optimization algorithms, 2017. An iteration is one rollout of whole episodes that all
 begin and end together, so that what is between two iterations is weights and the optimiser's state alone, and these
@@ -7,31 +7,113 @@ are saved as safetensors and JSON.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, override
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium import spaces
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
-from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor, nn
+from torch.distributions import Normal
 
 from manip_il.errors import NotFiniteError, UsageError
-from manip_il.learn.actor_critic import EXTRA, ActorCritic, set_log_std
 from manip_il.learn.adversarial_config import PPOConfig
+from manip_il.learn.losses import MIN_LOG_STD, GaussianHead, floored_log_std
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.transitions import F32, Transitions
 
+EXTRA = 2  # numbers of an observation behind the policy's inputs: flag of the absorbing state, share of time gone
 LAST_LR = 0.05  # share of the first learning rate that is left at the end
 _METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/explained_variance": "explained_variance"}
+
+
+class ActorCritic(ActorCriticPolicy):
+    """Actor and critic. Observations (B, d + 2): raw inputs, whether the state is absorbing, share of time gone.
+
+    The actor sees the inputs alone, so that it is the policy that is saved; the critic sees all: an episode has a last
+    step, before which less is to come. In the absorbing state actions do nothing, so their density is 1 there and
+    teaches the actor nothing. The same holds for a number of the action that never changed in the demonstrations.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Callable[[float], float],
+        network: MLPNetwork,
+        width: int = 256,
+        **settings: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, lr_schedule, **settings)
+        inputs = network.input_mean.shape[0] + EXTRA
+        self.actor = network
+        self.critic = nn.Sequential(
+            nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
+        )
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1), eps=1e-5, fused=True)
+
+    @override
+    def _build(self, lr_schedule: Callable[[float], float]) -> None:
+        """Build nothing: what the base class would make is not used."""
+
+    @override
+    def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Return actions (B, n), values (B, 1) and log-densities (B,)."""
+        gaussian = self._gaussian(obs)
+        actions = gaussian.mean if deterministic else gaussian.sample()
+        return actions, self.predict_values(obs), self.log_prob(obs, actions)[0]
+
+    @override
+    def evaluate_actions(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return values (B, 1), log-densities (B,) and entropies (B,) [nats]."""
+        return self.predict_values(obs), *self.log_prob(obs, actions)
+
+    def log_prob(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log-densities of actions (B, n) and entropies, (B,) both [nats]."""
+        gaussian, live = self._gaussian(obs), 1.0 - obs[:, -EXTRA]
+        log_prob, entropy = gaussian.log_prob(actions) * self._free, gaussian.entropy() * self._free
+        return log_prob.sum(1) * live, entropy.sum(1) * live
+
+    @override
+    def predict_values(self, obs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return values, (B, 1)."""
+        live = 1.0 - obs[:, -EXTRA, None]
+        return self.critic(torch.cat([self.actor.encode(obs[:, :-EXTRA]) * live, obs[:, -EXTRA:]], dim=1))
+
+    @property
+    def head(self) -> GaussianHead:
+        """The spread of the actor's actions."""
+        assert isinstance(self.actor.head, GaussianHead)
+        return self.actor.head
+
+    @property
+    def log_std(self) -> Tensor:
+        """Log-deviations of the numbers of an action that vary, (m,), in normalised units."""
+        return floored_log_std(self.head.raw_log_std)[self._free > 0]
+
+    @property
+    def spread(self) -> Tensor:
+        """Deviations of the numbers of an action, (n,), in normalised units; 0 if they never change."""
+        return floored_log_std(self.head.raw_log_std).exp().detach() * self._free
+
+    @property
+    def _free(self) -> Tensor:
+        return (self.actor.target_scale > 0).float()
+
+    def _gaussian(self, obs: Tensor) -> Normal:
+        mean = self.actor.layers(self.actor.encode(obs[:, :-EXTRA]))
+        return Normal(mean, floored_log_std(self.head.raw_log_std).exp(), validate_args=False)
 
 
 class Learner:
@@ -48,7 +130,7 @@ class Learner:
                 f"episodes is {env.num_envs}; expected a multiple of ppo.minibatches ({config.minibatches})"
             )
         self.network = network
-        set_log_std(network, log_std)
+        raw = MIN_LOG_STD + math.log(math.expm1(max(log_std - MIN_LOG_STD, 1e-3)))  # the inverse of `floored_log_std`
         lr = config.first_lr(clone=clone)
         self.ppo = PPO(
             ActorCritic,
@@ -65,6 +147,8 @@ class Learner:
             policy_kwargs={"network": network},
             device="cpu",
         )
+        with torch.no_grad():
+            self.policy.head.raw_log_std.fill_(raw)
         self._first_spread = self.policy.spread.numpy().copy()
         self.ppo.set_logger(configure(None, []))
         self.ppo.ep_info_buffer, self.ppo.ep_success_buffer = deque(maxlen=1), deque(maxlen=1)
@@ -85,20 +169,10 @@ class Learner:
         self.ppo._last_obs = np.asarray(env.reset())
         self.ppo._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         self.ppo.collect_rollouts(env, self._callback, buffer, self.ppo.n_steps)
-        self._judge(buffer)
         after = np.concatenate([buffer.observations[1:], np.asarray(self.ppo._last_obs)[None]])
         states, next_states = (rows[..., :-1].reshape(-1, rows.shape[-1] - 1) for rows in (buffer.observations, after))
         actions = np.clip(buffer.actions, *self._bounds).reshape(len(states), -1) * (1.0 - states[:, -1:])
         return Transitions(states.astype(np.float32), actions.astype(np.float32), next_states.astype(np.float32))
-
-    def _judge(self, buffer: RolloutBuffer) -> None:
-        """Give the buffer values and log-densities of all its steps, which `ActorCritic.forward` leaves out."""
-        given = (buffer.observations, buffer.actions)
-        obs, actions = (torch.from_numpy(rows.reshape(-1, rows.shape[-1])) for rows in given)
-        with torch.no_grad():
-            values, log_probs, _ = self.policy.evaluate_actions(obs, actions)
-        buffer.values[:] = values.numpy().reshape(buffer.values.shape)
-        buffer.log_probs[:] = log_probs.numpy().reshape(buffer.log_probs.shape)
 
     def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
         """Take an iteration's gradient steps on what `collect` ran; rewards: (N,) in its order. Returns metrics.
@@ -138,7 +212,7 @@ class Learner:
     @property
     def _bounds(self) -> tuple[F32, F32]:
         space = self.ppo.action_space
-        assert isinstance(space, Box)
+        assert isinstance(space, spaces.Box)
         return space.low, space.high
 
     def save(self, folder: Path, modules: Mapping[str, Any]) -> None:

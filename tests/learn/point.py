@@ -39,7 +39,7 @@ class Point:
 
 
 def network() -> MLPNetwork:
-    made = MLPNetwork(3, 2, Shape(32, 2, "silu", "gaussian", 1, 2, 10.0, action_space="joint_target"))
+    made = MLPNetwork(3, 2, Shape(width=32, depth=2, loss="gaussian", action_space="joint_target"))
     names = ("mean", "scale", "low", "high")
     made.set_statistics({f"target_{name}": torch.from_numpy(getattr(ACTIONS, name)) for name in names})
     return made
