@@ -14,7 +14,7 @@ from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
 from manip_il.cli.progress import Progress, Stages, say, set_quiet, warn
 from manip_il.errors import UsageError
-from manip_il.learn.fit_config import FitConfig, check_weights
+from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 
 if TYPE_CHECKING:  # the learner takes a second to import
@@ -63,7 +63,6 @@ class TrainOptions:
 
     def check(self) -> None:
         """Refuse what does not go together, datasets that lack what the policy looks at, and a folder that is taken."""
-        check_weights(self.dataset.root, self.dataset.weights)
         if self.weights is not None and len(self.dataset.root) > 1:
             raise UsageError("--weights is for the frames of one dataset; give one --dataset.root")
         from manip_il.data.info import read_info

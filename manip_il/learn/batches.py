@@ -1,4 +1,4 @@
-"""Batches on their way to the network: the order of the samples, batches made ahead, and pictures as floats.
+"""Batches on their way to the network: the order of the samples, and pictures as floats.
 
 Pictures may be cropped and their colours changed by chance while learning.
 """
@@ -6,10 +6,7 @@ Pictures may be cropped and their colours changed by chance while learning.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,23 +50,6 @@ class Order:
             order = torch.randperm(self.rows, generator=generator_of(self.seed, epoch))
             self._epoch, self._order = epoch, order.numpy()
         return self._order
-
-
-@contextmanager
-def prefetched[T](items: Iterator[T], depth: int = 3) -> Iterator[Iterator[T]]:
-    """Give the same items in order, up to `depth` of them made ahead by a thread, whose errors are raised here."""
-    thread = ThreadPoolExecutor(1, "prefetch")
-    ahead = deque(thread.submit(next, items, None) for _ in range(depth))  # None is the end: no item is None
-
-    def take() -> Iterator[T]:
-        while (item := ahead.popleft().result()) is not None:
-            ahead.append(thread.submit(next, items, None))
-            yield item
-
-    try:
-        yield take()
-    finally:
-        thread.shutdown(cancel_futures=True)
 
 
 def to_float(pictures: Tensor) -> Tensor:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -156,16 +155,3 @@ def check_convertible(kind: str, space: str) -> None:
             f"action_space is {space!r}, which LeRobot's processors of {kind!r} cannot carry; expected {JOINT_TARGET}, "
             f"or --policy.type={', '.join(CONVERTED[:-1])} or {CONVERTED[-1]}"
         )
-
-
-def check_weights(roots: Sequence[Path], weights: Sequence[float]) -> None:
-    """Raise `UsageError` for no dataset, for one that is given twice, and for weights that do not fit them."""
-    if not roots:
-        raise UsageError("--dataset.root names no dataset; expected at least one folder")
-    if len({root.resolve() for root in roots}) < len(roots):
-        raise UsageError("--dataset.root names one dataset twice; use --dataset.weights")
-    if weights and len(weights) != len(roots):
-        raise UsageError(f"--dataset.weights has {len(weights)} numbers, --dataset.root {len(roots)} datasets")
-    for root, weight in zip(roots, weights, strict=False):
-        if not 0 < weight < math.inf:
-            raise UsageError(f"--dataset.weights is {weight:g} for {root}; expected more than 0")

@@ -6,6 +6,7 @@ weights are then free to change without changing the units in which a policy see
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,8 +19,8 @@ from numpy.typing import NDArray
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.info import Info
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec, check_same_spec
-from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.fit_config import FitConfig, check_weights
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import CNN
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
@@ -30,14 +31,20 @@ class Sources:
     """Datasets in the order in which their frames are numbered.
 
     weights: the share of the samples drawn from each, relative to the others; none if every frame is drawn alike.
-    Raises `UsageError` for what `check_weights` refuses.
+    Raises `UsageError` for a dataset that is given twice, and for weights that do not fit them.
     """
 
     datasets: tuple[Dataset, ...]
     weights: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        check_weights(self.roots, self.weights)
+        count, roots = len(self.weights), len(self.roots)
+        if not roots or len({root.resolve() for root in self.roots}) < roots:
+            raise UsageError("--dataset.root names no dataset, or one twice; expected folders, and --dataset.weights")
+        if self.weights and count != roots:
+            raise UsageError(f"--dataset.weights has {count} numbers, --dataset.root {roots} datasets")
+        if not all(0 < weight < math.inf for weight in self.weights):
+            raise UsageError(f"--dataset.weights is {list(self.weights)}; expected more than 0 for each")
 
     @cached_property
     def roots(self) -> tuple[Path, ...]:

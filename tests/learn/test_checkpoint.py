@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from manip_il.collect.drivers import PolicyDriver
@@ -22,7 +24,7 @@ from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
 from manip_il.tasks.config import make_config
 
-from .tiny_policies import edit_config, refused, write_checkpoint
+from .tiny_policies import ACT, CNN, edit_config, observations, refused, write_checkpoint
 
 EVIL = {
     "registry_name": "action_tokenizer_processor",
@@ -81,6 +83,21 @@ def test_a_policy_for_something_else_is_refused_naming_both(change, act, spec):
     ((name, value),) = change.items()
     assert str(value) in str(error.value)
     assert str(getattr(spec, name)) in str(error.value)
+
+
+@pytest.mark.parametrize("settings", [{"type": "mlp", "width": 8}, ACT, CNN], ids=lambda one: str(one["type"]))
+def test_a_checkpoint_acts_and_is_gone_on_from_where_its_dataset_is_not(settings, write, table, pictured, tmp_path):
+    spec = replace(pictured, cameras=("front",))
+    data = write(table, "gone", spec)
+    path = Trainer(data, FitConfig(settings, steps=2, batch_size=8), tmp_path / "run").fit()
+    seen = *observations(3), {"front": np.zeros((3, 32, 48, 3), np.uint8)}
+    expected = LearnedPolicy.load(path).act(*seen)
+    elsewhere = Path(shutil.copytree(path, tmp_path / "elsewhere"))
+    shutil.rmtree(data.roots[0])
+    shutil.rmtree(tmp_path / "run")
+    assert np.array_equal(LearnedPolicy.load(elsewhere).act(*seen), expected)
+    more = FitConfig({"path": str(elsewhere)}, steps=1, batch_size=8)
+    assert Trainer(write(table, "other", spec), more, tmp_path / "more").fit().is_dir()
 
 
 class Bomb:

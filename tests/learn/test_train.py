@@ -31,10 +31,9 @@ from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import METRICS_FILE, json_lines
 
 from .conftest import LENGTH, make_table, write_table
-from .tiny_policies import ACT, DIFFUSION, observations
+from .tiny_policies import ACT, CNN, DIFFUSION, observations
 
 MLP = {"type": "mlp", "width": 16, "depth": 2, "device": "cpu"}
-CNN = {"type": "cnn", "channels": [4, 8], "keypoints": 4, "width": 8, "device": "cpu"}
 VISION = {**ACT, "pretrained_backbone_weights": None, "use_vae": False}
 CROPPED = {"crop_shape": [32, 48], "pretrained_backbone_weights": None}
 SEEING = {**DIFFUSION, **CROPPED, "spatial_softmax_num_keypoints": 4}

@@ -40,6 +40,8 @@ DIFFUSION = {  # one that draws
     "diffusion_step_embed_dim": 8,
     "num_train_timesteps": 10,
 }
+CNN = {"type": "cnn", "channels": [4, 8], "keypoints": 4, "width": 8, "device": "cpu"}
+
 TINY: dict[str, dict[str, Any]] = {
     "act": ACT | {"use_vae": False, "chunk_size": 5, "n_action_steps": 3, "pretrained_backbone_weights": None},
     "diffusion": DIFFUSION | {"num_inference_steps": 2, "pretrained_backbone_weights": None},
