@@ -78,8 +78,8 @@ class LearningRun(Run):
             self.horizon = min(self.horizon, math.ceil(LONGER * demonstrations.longest))
         hold = demonstrations.hold if demonstrations else None
         with threads(1), lent_generators(self._stream(0, "weights")):
-            seed, rows = stream_base("training", config.seed), demonstrations.stacked if demonstrations else None
-            self._policy = start_policy(config.start, self.conversion.space, spec, seed, rows)
+            rows = demonstrations.stacked if demonstrations else None
+            self._policy = start_policy(config.start, self.conversion.space, spec, rows)
             actions = ActionRange.of(self._policy.model)
             episodes = [RobotEpisode(config.env, hold) for _ in range(config.episodes)]
             self.envs = Lockstep(episodes, actions, self.horizon, self.conversion)

@@ -59,7 +59,7 @@ class DaggerOptions:
     settings: Given = given(RunConfig, prefix="")
     query: str | None = option(
         None,
-        "when it is queried: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; "
+        "when it is queried: every, one, probability:P, ensemble:BOUND or safety:BOUND; "
         "by default every, for takeover one, for branch probability:1/STEPS",
     )
     fit: Given = given(FitConfig, prefix="", only=_OF_FIT)

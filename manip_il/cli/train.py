@@ -85,7 +85,7 @@ class TrainOptions:
         sources = self._sources(config)
         weights = self._frame_weights(getattr(options.policy, "chunk_size", None), sources.datasets[0])
         with self.output.open(self) if _is_first_process() else contextlib.nullcontext():
-            path = self._fit(config, sources, weights)
+            path = self._fit(config, options.save_freq, sources, weights)
         if _is_first_process():
             own = common.own_names(sources.spec.robot, sources.spec.task)
             say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path}{own} --output_dir={folder}/eval")
@@ -123,15 +123,14 @@ class TrainOptions:
         say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         return weights
 
-    def _fit(self, config: FitConfig, sources: Sources, weights: NDArray[np.float64] | None) -> Path:
+    def _fit(self, config: FitConfig, save_freq: int, sources: Sources, weights: NDArray[np.float64] | None) -> Path:
         from manip_il.learn.train import Trainer
 
         folder, resume = self.output.output_dir, self.output.resume
         pictures = sum(len(one) * len(one.cameras) for one in sources.datasets) if config.takes_images else 0
         with Progress(pictures, "decode pictures, once") as bar:
             trainer = Trainer(sources, config, folder, resume=resume, on_frames=bar.advance, weights=weights)
-        steps = config.steps_per_checkpoint
-        with Stages(f"every finished checkpoint in {folder} (one every {steps:,} steps)") as stages:
+        with Stages(f"every finished checkpoint in {folder} (one every {save_freq:,} steps)") as stages:
             stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
             return trainer.fit(stages.log)
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.drivers import Setting, expert_actions, generators, observations, policy_actions
+from manip_il.collect.drivers import Setting, expert_actions, generators, policy_actions
 from manip_il.collect.rollout import Environment, Gate, Labeller, Rules, Turn, rollout
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import Actor, State, Transition
@@ -97,19 +97,6 @@ def _ensemble(bound: float, setting: Setting) -> Gate:
     return gate
 
 
-def _likelihood(bound: float, setting: Setting) -> Gate:
-    """Where the policy finds its own action less likely than the bound, in nats a joint."""
-    learner = setting.policies[0]
-    learner.require_likelihood()
-
-    def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
-        stacked = np.stack(actions)
-        likelihood = learner.log_prob(*observations(turns, learner.cameras), stacked)
-        return (likelihood / stacked.shape[1] < bound).tolist()
-
-    return gate
-
-
 def _safety(bound: float, setting: Setting) -> Gate:
     """Where expert and learner differ by more than the bound (Zhang & Cho 2017).
 
@@ -129,7 +116,6 @@ RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | N
     "one": (_one, None),
     "probability": (_probability, (1e-6, 1.0)),
     "ensemble": (_ensemble, (0.0, math.inf)),
-    "likelihood": (_likelihood, (-math.inf, math.inf)),
     "safety": (_safety, (0.0, math.inf)),
 }
 

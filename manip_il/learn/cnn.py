@@ -22,6 +22,7 @@ from manip_il.learn.mlp import MLPConfig, MLPPolicy
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.network import MLPNetwork, fit_statistics
 from manip_il.learn.samples import Table
+from manip_il.option import option
 
 __all__ = ["CNNConfig", "CNNPolicy", "make_cnn_pre_post_processors"]
 __path__: list[str] = []
@@ -49,9 +50,9 @@ class CNNConfig(MLPConfig):
     """
 
     channels: tuple[int, ...] = (16, 32, 32, 32)
-    keypoints: int = 32
-    aux_weight: float = 0.5
-    heatmap_weight: float = 0.0
+    keypoints: int = option(32, "a camera", at_least=1)
+    aux_weight: float = option(0.5, "of what is read off", at_least=0)
+    heatmap_weight: float = option(0.0, "of heat maps", at_least=0)
     privileged_size: int = 0  # of what is read off beside the action; taken from the dataset
     named_points: int = 0  # that have a heat map; taken from the dataset
 
@@ -63,16 +64,10 @@ class CNNConfig(MLPConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.channels = tuple(self.channels)
-        if len(self.channels) < 2 or min(self.channels) < 1 or self.keypoints < 1:
-            raise UsageError(
-                f"policy.channels is {list(self.channels)}, keypoints {self.keypoints}; expected two layers or "
-                "more, and at least 1"
-            )
+        if len(self.channels) < 2 or min(self.channels) < 1:
+            raise UsageError(f"policy.channels is {list(self.channels)}; expected two layers or more")
         if self.scales:
             raise UsageError("policy.scales is for the mlp, which is given offsets; the cnn sees them in pictures")
-        for name in ("aux_weight", "heatmap_weight"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"policy.{name} is {getattr(self, name)}; expected 0 or more")
 
     @override
     def validate_features(self) -> None:

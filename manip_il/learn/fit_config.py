@@ -137,16 +137,6 @@ class FitConfig:
         """Gradient steps."""
         return self.steps or self.defaults.steps
 
-    @property
-    def samples_per_step(self) -> int:
-        """Samples in the batch of a step."""
-        return self.batch_size or self.defaults.batch_size
-
-    @property
-    def steps_per_checkpoint(self) -> int:
-        """Steps from one checkpoint to the next."""
-        return self.save_freq or self.defaults.save_freq
-
 
 def check_convertible(kind: str, space: str) -> None:
     """Raise `UsageError` for a policy type whose processors cannot carry an action space."""

@@ -163,11 +163,11 @@ def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[Tra
         policy=policy,
         job_name=f"manip_il_{policy.type}",
         seed=fit.seed,
-        batch_size=fit.samples_per_step,
+        batch_size=fit.batch_size or fit.defaults.batch_size,
         steps=fit.total_steps,
         env_eval_freq=0,
         log_freq=fit.log_freq,
-        save_freq=fit.steps_per_checkpoint,
+        save_freq=fit.save_freq or fit.defaults.save_freq,
         optimizer=optimizer,
         scheduler=choice(LRSchedulerConfig, fit.scheduler, "scheduler")
         if fit.scheduler

@@ -21,7 +21,6 @@ from torch.nn.functional import softplus
 from manip_il.errors import UnknownName
 
 LOSSES = ("mse", "l1", "gaussian", "mixture", "categorical")
-LIKELIHOODS = ("mixture", "categorical")  # whose spread depends on the state
 
 # A deterministic expert lets the likelihood grow without bound as the deviation goes to zero. The
 # floor, 2 % of a target's own standard deviation, keeps the gradients finite.
@@ -43,10 +42,6 @@ class Head(ABC):
     @abstractmethod
     def action(self, params: Tensor) -> Tensor:
         """Return the action of each row, (B, n)."""
-
-    def log_prob(self, params: Tensor, target: Tensor) -> Tensor:
-        """Return log-density of each row's target (B, n), of `categorical` log-probability [nats], (B,)."""
-        return -self.nll(params, target)
 
 
 class MSEHead(Head):
@@ -147,20 +142,16 @@ class CategoricalHead(Head):
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
-        if not self.sigma:
-            return -self.log_prob(params, target)
-        return -(self.smeared(target) * self._logits(params).log_softmax(-1)).sum((-2, -1))
-
-    @override
-    def log_prob(self, params: Tensor, target: Tensor) -> Tensor:
-        """Return log-probability of each row's target (B, n), between two bins' centres in proportion, (B,) [nats]."""
-        log_prob, place = self._logits(params).log_softmax(-1), self._place(target)
+        log_prob = self._logits(params).log_softmax(-1)
+        if self.sigma:
+            return -(self.smeared(target) * log_prob).sum((-2, -1))
+        place = self._place(target)
         lower = place.floor().clamp(max=self.total - 2)
         upper_share = place - lower
         index = lower.long().unsqueeze(-1)
         at_lower = log_prob.gather(-1, index).squeeze(-1)
         at_upper = log_prob.gather(-1, index + 1).squeeze(-1)
-        return ((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
+        return -((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
 
     def smeared(self, target: Tensor) -> Tensor:
         """Return the share of each bin in targets (B, n), (B, n, bins and padding): `sigma`'s Gaussian over the bin."""

@@ -180,16 +180,6 @@ class MLPNetwork(nn.Module):
         """Return actions, (B, n), each the same bits whatever the other rows are."""
         return _in_blocks(self.actions, inputs)
 
-    @torch.no_grad()
-    def log_prob(self, inputs: Tensor, actions: Tensor) -> Tensor:
-        """Return the log-density of actions (B, n) in normalised units [nats], (B,); bits as in `act`."""
-
-        def log_probs(inputs: Tensor, actions: Tensor) -> Tensor:
-            targets = self.encode_targets(self.relative(actions, inputs))
-            return self.head.log_prob(self.layers(self.encode(inputs)), targets)
-
-        return _in_blocks(log_probs, inputs, actions)
-
     def actions(self, inputs: Tensor) -> Tensor:
         """Return actions, (B, n), of all rows in one product, whose last bits depend on their number."""
         y = self.head.action(self.layers(self.encode(inputs)))
@@ -214,13 +204,12 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
-    """Apply a function to `ROWS` rows of the columns (B, ...) at a time, the last ones filled up with zeros."""
-    rows = len(columns[0])
-    padded = [column.new_zeros((max(1, -(-rows // ROWS)) * ROWS, column.shape[1])) for column in columns]
-    for blocks, column in zip(padded, columns, strict=True):
-        blocks[:rows] = column
-    return torch.cat([function(*blocks) for blocks in zip(*(one.split(ROWS) for one in padded), strict=True)])[:rows]
+def _in_blocks(function: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:
+    """Apply a function to `ROWS` rows of inputs (B, d) at a time, the last ones filled up with zeros."""
+    rows = len(inputs)
+    padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
+    padded[:rows] = inputs
+    return torch.cat([function(block) for block in padded.split(ROWS)])[:rows]
 
 
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:

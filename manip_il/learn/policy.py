@@ -16,7 +16,6 @@ from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint
-from manip_il.learn.losses import LIKELIHOODS
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
 from manip_il.mdp import F32, F64, Images
@@ -25,10 +24,6 @@ if TYPE_CHECKING:  # it imports LeRobot, which takes seconds
     from manip_il.learn.episode_policy import EpisodePolicy
 
 Batch = dict[str, torch.Tensor]
-NO_LIKELIHOOD = (
-    "query=likelihood needs a policy with a likelihood: --policy.type=mlp with "
-    f"--policy.loss={' or '.join(LIKELIHOODS)}"
-)
 
 
 class LearnedPolicy:
@@ -99,23 +94,6 @@ class LearnedPolicy:
         """Take the texts of episodes that begin, by their numbers: for a policy that reads language."""
         self._policy.instruct(instructions)
 
-    @torch.inference_mode()
-    def log_prob(self, states: F32, environment_states: F32, images: Images, actions: F64) -> F64:
-        """Return how likely the policy finds absolute actions (B, n), (B,): nats, in normalised units.
-
-        Raises what `require_likelihood` raises.
-        """
-        self.require_likelihood()
-        batch, policy = self._numbers(states, environment_states), self._policy
-        assert isinstance(policy, _Perceptron)
-        with threads(1):
-            return policy.log_prob(batch, torch.from_numpy(actions)).numpy().astype(np.float64)
-
-    def require_likelihood(self) -> None:
-        """Raise `UsageError` unless the policy tells how likely it finds an action, state by state."""
-        if self.checkpoint.kind != MLP or self.checkpoint.config["loss"] not in LIKELIHOODS:
-            raise UsageError(NO_LIKELIHOOD)
-
     def _numbers(self, states: F32, environment_states: F32) -> Batch:
         given = {STATE: states, ENVIRONMENT_STATE: environment_states}
         return {
@@ -176,11 +154,6 @@ class _Perceptron:
         if self._conversion.space == JOINT_TARGET:
             return targets
         return torch.from_numpy(self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy()))
-
-    def log_prob(self, batch: Batch, actions: torch.Tensor) -> torch.Tensor:
-        """Return the log-density of absolute actions (B, n) [nats], (B,)."""
-        targets = self._conversion.encode(actions.to(torch.float32).numpy(), batch[STATE].numpy())
-        return self.module.log_prob(self._inputs(batch), torch.from_numpy(targets).to(self._device)).cpu()
 
     def forget(self, episodes: Iterable[int]) -> None:
         """Forget nothing: the mlp has no memory."""

@@ -23,7 +23,7 @@ from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, STATS, TASK_INDEX, TIMESTAMP
 from manip_il.data.schema import ACTION, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
-from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.errors import ManipError, MismatchError, NotFiniteError
 from manip_il.learn.checkpoint import in_one_line
 
 I64 = NDArray[np.int64]
@@ -79,20 +79,10 @@ class Windows:
 
 
 def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
-    """Return the windows that a policy learns from, of frames whose episodes are `episodes`, (N,).
-
-    Raises `UsageError` for a dataset shorter than one chunk of actions.
-    """
+    """Return the windows that a policy learns from, of frames whose episodes are `episodes`, (N,)."""
     actions, observations = policy.action_delta_indices, policy.observation_delta_indices
     wanted = {key: actions if key == ACTION else observations for key in columns}
-    deltas = {key: np.asarray(indices, np.int64) for key, indices in wanted.items() if indices is not None}
-    ahead = deltas.get(ACTION)
-    if ahead is not None and len(episodes) < len(ahead):
-        raise UsageError(
-            f"the dataset has {len(episodes)} frames, fewer than one chunk of {len(ahead)} actions; record more, or "
-            "ask for shorter chunks (--policy.chunk_size, for diffusion --policy.horizon)"
-        )
-    return Windows(episodes, deltas)
+    return Windows(episodes, {key: np.asarray(one, np.int64) for key, one in wanted.items() if one is not None})
 
 
 class Pictures:
@@ -146,19 +136,13 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class TrainingData:
+class TrainingData(Samples):
     """The data of one fit. train, held_out: samples; table: columns that are learnt from; digest: of all of it."""
 
-    samples: Samples
     train: I64
     held_out: I64
     table: Table
     digest: str
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """The columns that are pictures."""
-        return tuple(self.samples.pictures)
 
 
 def load_data(
@@ -174,7 +158,7 @@ def load_data(
 
     meta: of the datasets; its statistics follow the actions. encode: of actions (N, n) and states (N, n), if others
     are learnt than the datasets'. on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and
-    what `windows_of` and `Windows.usable` raise.
+    what `Windows.usable` raises.
     """
     features = [*(policy.input_features or {}), ACTION]
     cameras = [key for key in features if key in meta.camera_keys]
@@ -192,13 +176,16 @@ def load_data(
     train, held_out = split_by_episode(episodes[usable], eval_split, seed)
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
-    samples = Samples(
+    return TrainingData(
         windows,
         {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)},
         {key: Pictures.decode(meta.datasets, key, on_frames) for key in cameras},
         np.array(meta.tasks, object),
+        train=usable[train],
+        held_out=usable[held_out],
+        table=table,
+        digest=_digest(meta.roots, table),
     )
-    return TrainingData(samples, usable[train], usable[held_out], table, _digest(meta.roots, table))
 
 
 def _digest(roots: Sequence[Path], table: Table) -> str:

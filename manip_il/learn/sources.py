@@ -56,11 +56,6 @@ class Sources:
         """The first dataset's spec, with which the others agree."""
         return self.datasets[0].spec
 
-    @property
-    def looks(self) -> list[dict[str, Any] | None]:
-        """The light of each dataset's pictures, see `recorded_look`."""
-        return [recorded_look(one.provenance, one.fingerprint) for one in self.datasets]
-
     def row_weights(self, rows: I64) -> F64 | None:
         """Return how often each of the rows (S,) that are drawn from is drawn, relative to the others, (S,).
 

@@ -43,21 +43,17 @@ def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec)
     return conversion_for(checkpoint.space, spec)
 
 
-def start_policy(
-    start: Path | None, space: str, spec: RobotTaskSpec, seed: int, rows: tuple[F32, F32] | None
-) -> MLPPolicy:
+def start_policy(start: Path | None, space: str, spec: RobotTaskSpec, rows: tuple[F32, F32] | None) -> MLPPolicy:
     """Return an mlp with a Gaussian's loss. rows: raw inputs (N, d) and targets (N, n), which give a new one its units.
 
-    A clone keeps its own units, and acts as it did.
+    A clone keeps its own units, and acts as it did. Weights are drawn from torch's global generator.
     """
     options = (None if start is None else Checkpoint.open(start).mlp_options) or {}
     options |= {"loss": _GAUSSIAN, "action_space": space}
     config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
     inputs = [STATE, *([ENVIRONMENT_STATE] if spec.environment_state_names else [])]
     config.input_features, config.output_features = policy_features(features(spec), inputs)
-    with torch.random.fork_rng(devices=[]):  # torch initialises layers from its global generator: lend it one
-        torch.manual_seed(seed)
-        policy = MLPPolicy(config)
+    policy = MLPPolicy(config)
     if start is not None:
         policy.model.load_state_dict({**policy.model.state_dict(), **read_weights(start)})
     elif rows is not None:

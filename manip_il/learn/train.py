@@ -41,7 +41,7 @@ from manip_il.learn.lerobot_policy import build_policy, build_processors, load_p
 from manip_il.learn.names import OWN_SPACE
 from manip_il.learn.network import threads
 from manip_il.learn.samples import I64, Batch, load_data
-from manip_il.learn.sources import Sources, input_columns
+from manip_il.learn.sources import Sources, input_columns, recorded_look
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
     Writer,
@@ -112,13 +112,13 @@ class Trainer:
             first.fingerprint,
             options,
             config.observes,
-            sources.looks[0],
+            recorded_look(first.provenance, first.fingerprint),
             datasets=sources.to_json(),
             action_space=space,
         )
         self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(sources.roots[-1])))
         self.pipeline.output_dir = output_dir
-        self.steps, self.batch_size, self.step = config.total_steps, config.samples_per_step, 0
+        self.steps, self.batch_size, self.step = self.pipeline.steps, self.pipeline.batch_size, 0
         with threads(config.threads):
             self._build(policy, checkpoint)
         world = self.accelerator.num_processes
@@ -157,7 +157,7 @@ class Trainer:
             for record in self.run():
                 for write in writers if record else []:
                     write(record)
-                saved = self.step % self.config.steps_per_checkpoint == 0 or self.step == self.steps
+                saved = self.step % self.pipeline.save_freq == 0 or self.step == self.steps
                 if saved:
                     self.save()
                 try:
@@ -204,14 +204,14 @@ class Trainer:
         """Return the samples of this process at a step, as they are stored."""
         size, place = self.batch_size, self.accelerator.process_index
         rows = self._order.batch(step)[place * size : (place + 1) * size]
-        return self.data.samples.batch(self.data.train[rows])
+        return self.data.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:
         """Return mean loss on samples of the held-out episodes, without touching the training's random state.
 
         Beside `val_loss`, the numbers that the policy gives with it. Every process looks at all of them.
         """
-        held_out, size = self.data.held_out, self.config.samples_per_step
+        held_out, size = self.data.held_out, self.batch_size
         policy = self.unwrapped
         policy.eval()
         sums = defaultdict[str, float](float)
@@ -219,7 +219,7 @@ class Trainer:
             torch.manual_seed(self.config.seed)  # a policy that draws (diffusion) draws the same every time
             for start in range(0, len(held_out), size):
                 rows: I64 = held_out[start : start + size]
-                batch = pictures_to_float(self.data.samples.batch(rows), self.data.cameras)
+                batch = pictures_to_float(self.data.batch(rows), self.data.pictures)
                 loss, outputs = policy.forward(self.preprocessor(batch))
                 numbers = {name: value for name, value in (outputs or {}).items() if isinstance(value, int | float)}
                 for name, value in (numbers | {"loss": loss.item()}).items():
@@ -240,7 +240,7 @@ class Trainer:
 
     def _augmented(self, batch: Batch) -> Batch:
         """Put pictures on the device, shifted and recoloured by draws that depend on seed, step and process alone."""
-        cameras, augment = self.data.cameras, self._augment
+        cameras, augment = self.data.pictures, self._augment
         batch = batch | {key: batch[key].to(self.accelerator.device, non_blocking=True) for key in cameras}
         if augment is None:
             return pictures_to_float(batch, cameras)

@@ -53,18 +53,6 @@ class Diary:
         self.notes.append(("told", dict(instructions)))
 
 
-class Doubtful:
-    """Finds an action the less likely, the larger the state."""
-
-    cameras = ()
-
-    def require_likelihood(self) -> None:
-        """It has one."""
-
-    def log_prob(self, states, environment_states, images, actions):
-        return -actions.shape[1] * states[:, 0].astype(np.float64)
-
-
 def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | None = None) -> Turn:
     images = {name: np.full((2, 2, 3), seed + step, np.uint8) for name in ("front", "wrist")}
     observation = Observation(np.full(3, value, np.float32), np.zeros(2, np.float32), images, f"do {seed}")
@@ -105,7 +93,7 @@ def test_a_learner_is_told_whose_turn_it_is_and_of_what_and_sees_the_pictures_of
     ]
 
 
-@pytest.mark.parametrize("text", ["every", "one", "probability:0.1", "ensemble:0.2", "likelihood:-2", "safety:0.5"])
+@pytest.mark.parametrize("text", ["every", "one", "probability:0.1", "ensemble:0.2", "safety:0.5"])
 def test_a_rule_is_written_as_it_is_read(text: str):
     assert str(parse_query(text)) == text
 
@@ -129,11 +117,6 @@ def test_an_ensemble_queries_where_its_members_spread():
     agreed, alone = np.array([0.0, 0.0, 0.08]), np.array([0.09, 0.0, 0.08])
     assert gate([turn(7), turn(8, step=3)], [agreed, alone]) == [False, True]
     assert [member.notes[0] for member in others] == [("begin", [7])] * 2  # a memory must know who begins
-
-
-def test_an_unsure_learner_queries():
-    gate = Query("likelihood", -1.0).start(setting(Doubtful()))
-    assert gate([turn(value=0.5), turn(value=2.0)], [np.zeros(3)] * 2) == [False, True]
 
 
 def test_chance_queries_in_its_share_of_the_steps_and_the_same_for_a_seed():

@@ -142,7 +142,6 @@ def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJo
     [
         ({"driver": ExpertDriver(), "label": "takeover"}, "takes over from a policy; this .* driven by 'expert'"),
         ({"query": Query("ensemble", 0.1)}, "needs other policies to disagree with"),
-        ({"query": Query("likelihood", 0.0)}, "needs a policy with a likelihood"),
     ],
 )
 def test_what_a_job_lacks_is_said_before_it_runs(job: RolloutJob, changes, words: str):

@@ -155,7 +155,7 @@ def test_lerobots_own_code_carries_each_space(table, sources, tmp_path, space, s
 def test_every_action_of_a_plan_is_measured_from_its_own_frame(table, sources, tmp_path, space):
     trainer = trainer_of(sources, tmp_path / "run", ACT, space)
     targets = Conversion(space, "panda").encode(table[ACTION], table[STATE])
-    batch = trainer.data.samples.batch(np.array([3, 10]))
+    batch = trainer.data.batch(np.array([3, 10]))
     np.testing.assert_array_equal(batch[ACTION][0], targets[3:7])
     np.testing.assert_array_equal(batch[ACTION][1], targets[[10, 11, 11, 11]])  # the episode ends
 

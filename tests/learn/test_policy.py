@@ -18,7 +18,7 @@ from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
-from manip_il.learn.losses import LIKELIHOODS, LOSSES
+from manip_il.learn.losses import LOSSES
 from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.network import threads
 from manip_il.learn.policy import LearnedPolicy
@@ -116,23 +116,6 @@ def test_pictures_go_in_as_lerobot_feeds_them():
     assert inner.episodes == [40, 30]
     with pytest.raises(MismatchError, match="pictures of front"):
         policy.act(states, environments, {"wrist": picture})
-
-
-@pytest.mark.parametrize("loss", LIKELIHOODS)
-def test_a_policys_own_action_is_likelier_than_one_far_off_whatever_is_beside_it(loss, dataset, tmp_path):
-    policy = LearnedPolicy.load(make_checkpoint(dataset, tmp_path, loss))
-    states, environments = observations(5)
-    own = policy.act(states, environments)
-    near, far = (policy.log_prob(states, environments, {}, own + off) for off in (0.0, 0.5))
-    assert (near > far).all()
-    one = policy.log_prob(states[3:4], environments[3:4], {}, own[3:4])
-    assert np.array_equal(one, near[3:4])
-
-
-def test_a_policy_without_a_likelihood_says_so_in_one_line(checkpoint, act):
-    for path in (checkpoint, act):
-        with pytest.raises(UsageError, match=r"needs a policy with a likelihood: .*mixture or categorical"):
-            LearnedPolicy.load(path).require_likelihood()
 
 
 def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, spec, tmp_path):

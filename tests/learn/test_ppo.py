@@ -33,8 +33,8 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
     actions = rng.uniform(-1, 1, (20, 2)).astype(np.float32)
     raw = torch.from_numpy(env.range.raw(actions))
     with torch.no_grad():
-        theirs = one.network.log_prob(torch.from_numpy(states[:, :3]), raw)
-        still = one.network.layers(one.network.encode(torch.from_numpy(states[:, :3])))[:, 1]
+        mean = one.network.layers(one.network.encode(torch.from_numpy(states[:, :3])))
+        theirs, still = -one.network.head.nll(mean, one.network.encode_targets(raw)), mean[:, 1]
         spread = one.policy.log_std[0]
         constant = -0.5 * (still / spread.exp()) ** 2 - spread - 0.5 * np.log(2 * np.pi)
     assert len(one.policy.log_std) == 1, "the number that never changes is left out"

@@ -15,7 +15,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 from manip_il.data.joined import JoinedDatasets
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.samples import Pictures, Windows, windows_of
@@ -78,11 +78,6 @@ def test_the_windows_are_those_that_the_policy_asks_for() -> None:
     assert diffusion.deltas["action"].tolist() == list(range(-1, 7))
 
 
-def test_a_dataset_shorter_than_one_chunk_is_named() -> None:
-    with pytest.raises(UsageError, match=r"11 frames, fewer than one chunk of 12 actions"):
-        windows_of(ACTConfig(chunk_size=12, n_action_steps=4, device="cpu"), ["action"], EPISODES)
-
-
 @pytest.mark.parametrize("shape", [(7,), (3, 4)])
 def test_joined_frames_are_those_of_the_concatenation(shape):
     rng = np.random.default_rng(0)
@@ -99,7 +94,7 @@ def test_joined_frames_are_those_of_the_concatenation(shape):
 def test_a_batch_is_that_of_lerobots_loader(settings, observation, write, table, pictured, tmp_path):
     sources = write(table, spec=pictured)
     config = FitConfig({**settings, "pretrained_backbone_weights": None}, observation=observation, batch_size=8)
-    samples = Trainer(sources, config, tmp_path / "run").data.samples
+    samples = Trainer(sources, config, tmp_path / "run").data
     meta = JoinedDatasets(sources.roots)
     ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in samples.windows.deltas.items()}
     lerobots: Any = LeRobotDataset(meta.repo_id, root=sources.roots[0], delta_timestamps=ahead or None)
@@ -117,7 +112,7 @@ def test_a_batch_is_that_of_lerobots_loader(settings, observation, write, table,
 def test_tasks_of_several_datasets_are_numbered_together(spec, tmp_path):
     texts = [replace(spec, instruction=text) for text in ("reach", "touch")]
     made = [write_table(make_table(), tmp_path / one.instruction, one).datasets[0] for one in texts]
-    samples = Trainer(Sources(tuple(made)), FitConfig(ACT, batch_size=8), tmp_path / "run").data.samples
+    samples = Trainer(Sources(tuple(made)), FitConfig(ACT, batch_size=8), tmp_path / "run").data
     batch = samples.batch(np.array([0, 239, 240, 479]))
     assert batch["task"] == ["reach", "reach", "touch", "touch"]
     assert batch["index"].tolist() == [0, 239, 240, 479]

@@ -301,7 +301,7 @@ def test_several_datasets_are_one_in_the_units_of_all_and_the_shares_asked_for(s
         assert (drawn < 240).mean() == pytest.approx(0.75 if weights else 0.5, abs=0.02)
         assert trainer.fit().is_dir()
     chunks = Trainer(Sources(tuple(roots)), config(ACT, eval_split=0.0), tmp_path / "act")
-    assert chunks.data.samples.batch(np.array([239]))["action_is_pad"][0].tolist() == [False, True, True, True]
+    assert chunks.data.batch(np.array([239]))["action_is_pad"][0].tolist() == [False, True, True, True]
     trainer = Trainer(Sources(tuple(roots)), config(), tmp_path / "few", weights=(np.arange(480) < 20).astype(float))
     assert max(int(trainer.batch(step)["index"].max()) for step in range(50)) < 20
     with pytest.raises(ManipError, match="b has no sample to learn from"):
