@@ -32,6 +32,7 @@ _CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras 
 CAMERAS_HELP = "any of front, side, wrist"
 OWN_ROBOT_HELP = "its YAML, if the dataset's robot does not ship"
 OWN_TASK_HELP = "its Python file, if the dataset's task does not ship"
+OWN_OBJECT_HELP = "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh"
 
 
 def env_given(*, of_policy: bool = False) -> Any:
@@ -134,12 +135,14 @@ def _require_suite(suite: str) -> None:
     require_suite(suite)
 
 
-def own_names(robot: str, task: str) -> str:
-    """Return the options, after a space, that a next command needs for a robot and a task that do not ship."""
+def own_names(robot: str, task: str, shape: str = "") -> str:
+    """Return the options, after a space, that a next command needs for a robot, a task and a mesh that do not ship."""
+    from manip_il.sim.mesh import mesh_path, nameable  # here, as help needs no numpy
+
     given = [] if robot in (*ROBOTS, stock.ROBOT) else [f"--robot.type={_arm(robot)}"]
     ships = task.partition(":")[0] in (*NAMES, *stock.STOCK, "unknown")
     given += [] if ships else [f"--task.type={_file(task, '.py')}"]
-
+    given += [f"--task.object={nameable(shape)}"] if mesh_path(shape) else []
     return "".join(f" {one}" for one in given)
 
 

@@ -85,7 +85,7 @@ class DaggerOptions:
         if (folder / "dataset").is_dir():
             say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}")
-        own = common.own_names(config.env.robot, config.env.task)
+        own = common.own_names(config.env.robot, config.env.task, config.env.object)
         test = f"manip-il eval --policy.path={best}{own} --output_dir={folder}/test"
         remedies = f"more --steps ({config.fit.total_steps:,} a round now), or more --demonstrations"
         say_policy(best, best_result(results).validation, test, remedies)

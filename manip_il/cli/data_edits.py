@@ -103,6 +103,7 @@ class EditGroup:
 
     robot: str | None = option(None, common.OWN_ROBOT_HELP, flag="robot.type")
     task: str | None = option(None, common.OWN_TASK_HELP, flag="task.type")
+    object: str | None = option(None, common.OWN_OBJECT_HELP, flag="task.object")
     workers: int | None = common.processes_option()
     overwrite: bool = option(False, "replace an existing dataset")
 
@@ -116,7 +117,7 @@ class EditGroup:
         from manip_il.collect.workers import default_workers
 
         _require_target(root, folder, overwrite=self.overwrite)
-        source = open_source(root, self.robot, self.task)
+        source = open_source(root, self.robot, self.task, self.object)
         warn(*source.warnings)
         with exclusive(folder), Progress(pieces or source.dataset.info.episodes, what) as bar:
             yield source, Target(folder, self.workers or default_workers(), self.overwrite, bar.advance)

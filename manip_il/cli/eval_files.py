@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from manip_il.cli.inputs import open_driver
@@ -23,19 +24,19 @@ NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing i
 
 
 def replay(
-    file: Path, seed: int, policy: Path | None, video: Path | None, *, task: str | None = None, trust: bool = False
+    file: Path, seed: int, policy: Path | None, video: Path | None, *, own: Mapping[str, str], trust: bool = False
 ) -> None:
     """Run one episode of an evaluation again: the same policy, seed and conditions. Prints what was drawn.
 
-    policy: its current path, by default the one in the evaluation. video: an MP4 to write. task: its file, if it does
-    not ship. Raises `ManipError` if the outcome is not that of the evaluation, `UsageError` for a seed or a policy that
-    is not there.
+    policy: its current path, by default the one in the evaluation. video: an MP4 to write. own: the files of its task
+    and its object's mesh, as its settings name them, if they do not ship. Raises `ManipError` if the outcome is not
+    that of the evaluation, `UsageError` for a seed or a policy that is not there.
     """
     result = EvalResult.read(file)
     by_seed = {episode.seed: episode for episode in result.episodes}
     if seed not in by_seed:
         raise UsageError(f"--replay is {seed}; {file} has the seeds {min(by_seed)} to {max(by_seed)}")
-    before, job = by_seed[seed], _job(result, file, policy, task, trust)
+    before, job = by_seed[seed], _job(result, file, policy, own, trust)
     episode = run_states(job, seed)
     say(*_lines(before))
     if video is not None:
@@ -59,10 +60,10 @@ def merge(files: Sequence[Path]) -> EvalResult:
     return merged
 
 
-def _job(result: EvalResult, file: Path, policy: Path | None, task: str | None, trust: bool) -> RolloutJob:
+def _job(result: EvalResult, file: Path, policy: Path | None, own: Mapping[str, str], trust: bool) -> RolloutJob:
     """Return the rollouts of the evaluation; warn if policy or program have changed since."""
-    settings = result.settings
-    env = settings.env(result.robot, task or result.task)
+    settings = replace(result.settings, object=own.get("object", result.settings.object))
+    env = settings.env(result.robot, own.get("task", result.task))
     if (given := env_spec(env).task) != result.task:
         raise MismatchError("task", str(file), result.task, "--task.type", given)
     is_policy = result.policy not in NO_FILES or bool(result.policy_sha256) or policy is not None

@@ -105,8 +105,8 @@ class EvalOptions:
         if self.health:
             say(f"healthy: {health.healthy()}")
         elif self.replay is not None:
-            policy, task = self.policy.path, self.env.get("task")
-            eval_files.replay(self.evaluation[0], self.replay, policy, self.video, task=task, trust=self.trust)
+            own = {name: self.env[name] for name in ("task", "object") if self.env.get(name) is not None}
+            eval_files.replay(self.evaluation[0], self.replay, self.policy.path, self.video, own=own, trust=self.trust)
         elif self.evaluation:
             merged = eval_files.merge(self.evaluation)
             with self.output.open(self) as folder:
@@ -137,7 +137,9 @@ class EvalOptions:
             self._report(result, folder, *films)
         failed = [episode.seed for episode in result.episodes if not episode.success]
         seed = (failed or [result.episodes[0].seed])[0]
-        own = common.own_names("panda", job.env.task)  # a robot's file is in eval.json; a task's is given each time
+        own = common.own_names(
+            "panda", job.env.task, job.env.object
+        )  # a robot's file is in eval.json; a task's is given each time
         say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed}{own} --video=replay.mp4")
 
     def _job(self) -> RolloutJob:

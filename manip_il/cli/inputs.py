@@ -114,7 +114,7 @@ def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.schema import check_same_spec
 
-    if not is_known(spec.robot, spec.task):
+    if not is_known(spec.robot, spec.task, spec.object):
         return []
     env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
     check_same_spec(name, spec, "this program", env_spec(env))

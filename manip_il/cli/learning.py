@@ -64,7 +64,7 @@ class Learning:
                 self._learn(config, folder, engine, stages)
             self._report(config, folder)
         say(f"report: {folder / REPORT_FILE}")
-        robot = common.own_names(config.env.robot, config.env.task)
+        robot = common.own_names(config.env.robot, config.env.task, config.env.object)
         test = f"manip-il eval --policy.path={folder}{robot} --output_dir={folder}/test"
         remedies = f"more --steps ({config.steps:,} now){'' if config.start else ', a clone to begin with (--init)'}"
         found = validations(folder)
@@ -188,6 +188,6 @@ def _known_env(name: str, spec: RobotTaskSpec | Origin) -> EnvConfig:
     """Return the environment that a dataset or reward is for; `UsageError` if it cannot be simulated here."""
     from manip_il.collect.environments import is_known
 
-    if not is_known(spec.robot, spec.task):
-        raise UsageError(f"{name} is for {spec.robot} {spec.task}, which cannot be simulated here")
+    if not is_known(spec.robot, spec.task, spec.object):
+        raise UsageError(f"{name} is for {spec.robot} {spec.task} {spec.object}, which cannot be simulated here")
     return make_config(spec.robot, spec.task, spec.fps, object=spec.object)

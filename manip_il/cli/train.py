@@ -87,7 +87,7 @@ class TrainOptions:
         with self.output.open(self) if _is_first_process() else contextlib.nullcontext():
             path = self._fit(config, options.save_freq, sources, weights)
         if _is_first_process():
-            own = common.own_names(sources.spec.robot, sources.spec.task)
+            own = common.own_names(sources.spec.robot, sources.spec.task, sources.spec.object)
             say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path}{own} --output_dir={folder}/eval")
 
     def _fit_config(self) -> FitConfig:

@@ -31,6 +31,7 @@ from manip_il.errors import ManipError, MismatchError, NothingToLearnError, Rend
 from manip_il.mdp import Episode, State
 from manip_il.robots.table import get_robot, is_robot
 from manip_il.sim.config import CameraConfig
+from manip_il.sim.mesh import is_stored, nameable
 from manip_il.sim.variation import OLDER
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of
@@ -54,9 +55,10 @@ class Source:
     warnings: tuple[str, ...] = ()
 
 
-def open_source(root: Path, robot: str | None = None, task: str | None = None) -> Source:
-    """Read what is needed to restore a dataset's states; robot, task: their files, if they do not ship.
+def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> Source:
+    """Read what is needed to restore a dataset's states.
 
+    robot, task: their files, if they do not ship. shape: of its object, if that is a mesh.
     Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
     a robot and task that are known here, `MismatchError` if its states do not fit them.
     """
@@ -68,16 +70,20 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None) -
         )
     lacking = [] if robot or is_robot(spec.robot) or spec.robot == STOCK else [f"--robot.type=PATH/{spec.robot}.yaml"]
     lacking += [] if task or is_task(spec.task) or spec.robot == STOCK else [f"--task.type=PATH/{spec.task}.py"]
+    lacking += [] if shape or not is_stored(spec.object) else [f"--task.object={nameable(spec.object)}"]
     if lacking:
+        what = f"the robot {spec.robot!r} and the task {spec.task!r}" + (f" with {spec.object}" if spec.object else "")
         raise ManipError(
-            f"{root} is for the robot {spec.robot!r} and the task {spec.task!r}, which are not both known here, so its "
+            f"{root} is for {what}, of which not all is known here, so its "
             f"states cannot be restored; give {' and '.join(lacking)}"
         )
     given = get_robot(robot).name if robot else spec.robot, get_task(task).name if task else spec.task
     for what, ours, theirs in zip(("robot", "task"), given, (spec.robot, spec.task), strict=True):
         if ours != theirs:
             raise MismatchError(what, str(root), theirs, f"--{what}.type", ours)
-    env = make_config(robot or spec.robot, task or spec.task, object=spec.object)
+    env = make_config(robot or spec.robot, task or spec.task, object=shape or spec.object)
+    if shape and (ours := env_spec(env).object) != spec.object:
+        raise MismatchError("object", str(root), spec.object, "--task.object", ours)
     size = env_spec(env).sim_state_size
     lacks = size - spec.sim_state_size  # of states from before they held all draws
     if lacks not in (0, *OLDER):

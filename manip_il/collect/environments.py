@@ -21,9 +21,11 @@ from manip_il.robots.table import is_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import environment_state_names
+from manip_il.sim.mesh import is_stored
 from manip_il.sim.points import point_names
 from manip_il.sim.props import VERSION as DRAWN
 from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.shape import Shape, stored
 from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
@@ -36,9 +38,9 @@ from manip_il.tasks.stock.table import STOCK as STOCK_TASKS
 from manip_il.tasks.table import TASKS, get_task, is_task
 
 
-def is_known(robot: str, task: str) -> bool:
-    """Return whether there is an environment of this robot and task here."""
-    return task in STOCK_TASKS if robot == STOCK else is_robot(robot) and is_task(task)
+def is_known(robot: str, task: str, shape: str = "") -> bool:
+    """Return whether there is an environment of this robot, task and object here."""
+    return task in STOCK_TASKS if robot == STOCK else is_robot(robot) and is_task(task) and not is_stored(shape)
 
 
 def make_env(
@@ -84,7 +86,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
         sim_state_size=scene.state_size + len(scene.nominal) + STATE_EXTRAS,
         instruction=task.instruction,
         phases=phases(task),
-        object=config.object,
+        object=stored(config.object),
         action_meaning=SERVOS if servos else OPENINGS,
         robot_type=servos.robot_type if servos else "",
         cameras=cameras.names if cameras else (),
@@ -114,6 +116,8 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         settings["task"], _, argument = task.name.partition(":")
         settings |= {"reward": argument} if argument else {}  # as it was called when carry alone had one
         own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
+        mesh = Shape.parse(config.object).mesh if config.object else None
+        settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
     if not config.object:  # as before there was any
         del settings["object"]
     model = described_stock(config.task).model_bytes if config.robot == STOCK else config_scene(config).model_bytes()

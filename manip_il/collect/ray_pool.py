@@ -1,7 +1,7 @@
 """Workers of a Ray cluster: of `RAY_ADDRESS` or one that runs on this machine, else a local one that is started.
 
-They send what is to be stored to this process, and get files from it, once a node: the policies', and that of a task of
-one's own. Nodes need no shared disk.
+They send what is to be stored to this process, and get files from it, once a node: the policies', those of a task of
+one's own and of a mesh. Nodes need no shared disk.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
+from manip_il.sim.mesh import mesh_path, moved
 from manip_il.tasks.own import SUFFIX
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
@@ -67,7 +68,8 @@ class RayPool:
         """Send some seeds of a job to the cluster."""
         files = [self._ship(folder) for folder in job.driver.policies]
         task = self._ship(Path(job.env.task)) if job.env.task.endswith(SUFFIX) else None
-        reference = _run_remote.remote(__version__, job, seeds, journal, task, *files)
+        mesh = self._ship(Path(path)) if (path := mesh_path(job.env.object)) else None
+        reference = _run_remote.remote(__version__, job, seeds, journal, task, mesh, *files)
         future: Future[list[Episode]] = Future()
         self._running[future] = reference
         reference.future().add_done_callback(lambda answer: self._settle(future, answer, journal))
@@ -111,6 +113,7 @@ def run_there(
     seeds: tuple[int, ...],
     journal: Journal | None,
     task: Files | None,
+    mesh: Files | None,
     *policies: Files,
 ) -> bytes:
     """Return the packed answer of a task on a node. Raises `ManipError` if it has another version of the program."""
@@ -121,6 +124,10 @@ def run_there(
         if task is not None:
             file = _unpack(task, Path(folder) / "task") / Path(job.env.task).name
             job = replace(job, env=replace(job.env, task=str(file)))
+        if mesh is not None:
+            name = Path(mesh_path(job.env.object) or "").name
+            at = _unpack(mesh, Path(folder) / "mesh") / name
+            job = replace(job, env=replace(job.env, object=moved(job.env.object, at)))
         if isinstance(job.driver, PolicyDriver):
             here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
             job = replace(job, driver=replace(job.driver, policies=here))

@@ -23,6 +23,7 @@ _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 _MEANING = {
     "model_sha256": "compiled MuJoCo model",
     "task_sha256": "the task's file",
+    "object_sha256": "the object's mesh",
     "config_sha256": "config",
     "cameras_sha256": "pictures' size and look",
 }

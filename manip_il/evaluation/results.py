@@ -14,6 +14,7 @@ from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import CONFIDENCE, PairedComparison, Proportion, compare_paired
 from manip_il.sim.conditions import NOMINAL, Condition
+from manip_il.sim.shape import stored
 from manip_il.tasks.config import make_config
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ class EvalSettings:
         """Return those of a job whose conditions are called `suite`."""
         env, conditions = job.env, job.conditions or (NOMINAL,)
         steps, hz = env.success_steps, env.control_hz
-        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, env.object)
+        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, stored(env.object))
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """Return the environment that was evaluated in."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -23,6 +24,7 @@ from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.posture import require_free_home
+from manip_il.sim.rests import LEAST_ROOM, Hull
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
@@ -94,7 +96,12 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
     joints = [model.joint(PREFIX + name) for name in robot.joints]
     objects = _objects(model)
     gripper = Gripper(robot, model, PREFIX)
-    _check_objects(robot, task, model, objects, gripper)
+    hulls = {
+        name: Hull(model, one.body, one.geoms, robot.ee.lowest, gripper.most)
+        for name, one in objects.items()
+        if _is_mesh(model, one.geom)
+    }
+    _check_objects(robot, task, model, objects, gripper, hulls)
     require_free_home(robot, model, PREFIX)
     return Scene(
         robot=robot,
@@ -109,6 +116,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         shoulder=joints[0].id,
         yaws=_yaws(robot, model, joints[-1]),
         nominal=variation.nominal(model, objects),
+        hulls=hulls,
     )
 
 
@@ -137,18 +145,32 @@ def _objects(model: mujoco.MjModel) -> dict[str, Object]:
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             body = int(model.jnt_bodyid[joint])
             name, geom = model.body(body).name, int(model.body_geomadr[body])
-            objects[name] = Object(name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+            parts = range(geom, geom + (model.body_geomnum[body] if _is_mesh(model, geom) else 1))
+            geoms = tuple(one for one in parts if model.geom_contype[one])
+            objects[name] = Object(name, body, geom, geoms, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
     return objects
 
 
+def _is_mesh(model: mujoco.MjModel, geom: int) -> bool:
+    return int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_MESH)
+
+
 def _check_objects(
-    robot: Robot, task: Task, model: mujoco.MjModel, objects: dict[str, Object], gripper: Gripper
+    robot: Robot,
+    task: Task,
+    model: mujoco.MjModel,
+    objects: dict[str, Object],
+    gripper: Gripper,
+    hulls: Mapping[str, Hull],
 ) -> None:
     """Raise `UsageError` for an object that the gripper cannot go around."""
     for name in task.grasped:
         one = objects[name]
-        width = variation.widest_grasp(int(model.geom_type[one.geom]), model.geom_size[one.geom])
-        if width >= gripper.most:
+        if name in hulls:
+            width = min(width for width, _ in hulls[name].rest(0).sizes)
+        else:
+            width = variation.widest_grasp(int(model.geom_type[one.geom]), model.geom_size[one.geom])
+        if width >= gripper.most - (LEAST_ROOM if name in hulls else 0.0):
             raise UsageError(
                 f"task {task.name}: {name!r} is {width:.3f} m wide, and the gripper of {robot.name} opens to "
                 f"{gripper.most:.3f} m; choose another object, task or robot"

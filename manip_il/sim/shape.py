@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from manip_il.errors import UnknownName, UsageError, shorten
+
+if TYPE_CHECKING:
+    from manip_il.sim.mesh import Mesh
 
 SHORTEST, LONGEST = 0.02, 0.12  # of an object's lengths [m]
 DEFAULT_WIDTH = 0.05  # where none is said [m]
@@ -21,20 +25,17 @@ _SIZES = {
 KINDS = tuple(_SIZES)
 ANY = "any"  # of those kinds, one for each episode
 _SIZES[ANY] = "WIDTH"
-_MESHES = (".stl", ".obj", ".msh", ".ply", ".dae", ".glb")
-NO_MESH = (
-    "expected a box, cylinder, sphere or capsule; in a task of your own a visual mesh may cover one, a second geom of "
-    "the body with contype=0, conaffinity=0 and mass=0"
-)
+MESH = "mesh"
+LONGEST_MESH = 0.2  # [m]
 SHAPE_HELP = (
     "box, cylinder, sphere, capsule or any (one of these in each episode), with lengths [m] as in "
-    "cylinder:0.04x0.08, box:0.06x0.03x0.03"
+    "cylinder:0.04x0.08, box:0.06x0.03x0.03; or a mesh by its file and longest side, mesh:mug.obj:0.1"
 )
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A solid of wood. kind: box, cylinder, sphere or capsule; lengths: along its own axes x, y and z [m].
+    """A solid of wood. kind: box, cylinder, sphere, capsule or mesh; lengths: along its own axes x, y and z [m].
 
     any: what a world draws of these, as wide; a cube where nothing is drawn.
     Cylinders and capsules have their axis along z, and a capsule's length is that between the tips of its round ends.
@@ -43,8 +44,16 @@ class Shape:
 
     kind: str
     lengths: tuple[float, float, float]
+    mesh: Mesh | None = None
 
     def __post_init__(self) -> None:
+        if self.mesh is not None:
+            if not SHORTEST <= max(self.lengths) <= LONGEST_MESH:
+                raise UsageError(
+                    f"{self.mesh.text} is {max(self.lengths):.3g} m long; expected {SHORTEST} to {LONGEST_MESH} m: "
+                    "say how long its longest side is, as in mesh:mug.obj:0.1"
+                )
+            return
         for length in self.lengths:
             if not SHORTEST <= length <= LONGEST:
                 raise UsageError(f"a {self.kind} of {length:g} m; expected lengths from {SHORTEST} to {LONGEST} m")
@@ -57,8 +66,11 @@ class Shape:
     def parse(cls, text: str) -> Shape:
         """Return the shape that a text means; raises `UnknownName` or `UsageError`."""
         kind, colon, size = text.partition(":")
-        if kind == "mesh" or kind.lower().endswith(_MESHES):
-            raise UsageError(f"{shorten(text)} is a mesh; {NO_MESH}")
+        if kind == MESH or kind.lower().endswith((".stl", ".obj")):
+            from manip_il.sim.mesh import parse_mesh  # here, as help needs no numpy
+
+            mesh = parse_mesh(text)
+            return cls(MESH, mesh.lengths, mesh)
         if kind not in _SIZES:
             raise UnknownName("shape", kind, _SIZES)
         try:
@@ -74,6 +86,8 @@ class Shape:
 
     def __str__(self) -> str:
         """Text that means it, as short as can be."""
+        if self.mesh is not None:
+            return self.mesh.text
         ways = ((self.lengths[0],), (self.lengths[0], self.lengths[2]), self.lengths)
         fitting = (way for way in ways if (len(way) == 3) <= (self.kind == "box") and self._is(way))
         return f"{self.kind}:{'x'.join(f'{length:.12g}' for length in next(fitting))}"
@@ -97,6 +111,8 @@ class Shape:
     @property
     def mass(self) -> float:
         """Mass [kg]."""
+        if self.mesh is not None:
+            return max(LIGHTEST, DENSITY * self.mesh.volume)
         width, depth, length = self.lengths
         round_, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
         volumes = {
@@ -110,13 +126,15 @@ class Shape:
     @property
     def word(self) -> str:
         """Name of it in an instruction."""
-        if self.kind == ANY:
+        if self.kind in (ANY, MESH):
             return "object"
         return "cube" if self.kind == "box" and len(set(self.lengths)) == 1 else self.kind
 
     @property
     def sizes(self) -> tuple[float, float] | None:
         """Greatest lengths between which it may be scaled and still be grasped, however it lies [m]; None for none."""
+        if self.mesh is not None:
+            return None
         least, between, most = sorted(self.lengths)
         low, high = most * _THINNEST / least, most * min(_WIDEST / between, LONGEST / most)
         return (low, high) if low < high else None
@@ -137,11 +155,20 @@ def draws_shape(text: str) -> bool:
     return text.partition(":")[0] == ANY
 
 
+def stored(text: str) -> str:
+    """Return the text of an object as data have it: that of a mesh names its file and hash, and no folder."""
+    mesh = Shape.parse(text).mesh if text else None
+    return text if mesh is None else mesh.stored
+
+
 ROLLING = 0.005  # of what is round, as on a cloth: what falls from the hand stays within reach [m]
+ROLLING_MESH = 0.001  # of a mesh, which with more stays on an edge that it comes to stand on [m]
 
 
 def contact(kind: str) -> tuple[int, float]:
     """Return MuJoCo's `condim` of an object and its rolling friction [m]."""
+    if kind == MESH:
+        return 6, ROLLING_MESH
     return (4, 0.0001) if kind in ("box", ANY) else (6, ROLLING)
 
 

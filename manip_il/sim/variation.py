@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError
 from manip_il.sim.config import CAMERAS
-from manip_il.sim.shape import NO_MESH, Shape, contact
+from manip_il.sim.shape import Shape, contact
 
 F64 = NDArray[np.float64]
 GEOMS = {
@@ -26,6 +26,7 @@ GEOMS = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 _KINDS = {float(geom): kind for kind, geom in GEOMS.items()}
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 PER_OBJECT = 5
 _SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
 _OWN = -1.0  # a shape or colour that is not drawn: everything has its own
@@ -55,11 +56,16 @@ _NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # how the episode began, a
 
 @dataclass(frozen=True)
 class Object:
-    """A free body of a compiled model and its one geom. q, v: starts of its free joint in qpos and qvel."""
+    """A free body of a compiled model, and its first geom: what shows its shape.
+
+    geoms: those of its geoms that touch others; of primitives the first. q, v: starts of its free joint in qpos and
+    qvel.
+    """
 
     name: str
     body: int
     geom: int
+    geoms: tuple[int, ...]
     q: int
     v: int
 
@@ -223,12 +229,8 @@ def _apply_objects(
     for one, row in zip(objects.values(), rows, strict=True):
         size, mass, friction = row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
         kind, own = int(model.geom_type[one.geom]), int(plain.geom_type[one.geom])
-        changed.geom_size[one.geom] = size
-        extent = extents(kind, size)
-        changed.geom_rbound[one.geom] = _bound(kind, size)
-        changed.geom_aabb[one.geom, 3:] = extent / 2
-        for node in range(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body]):
-            changed.bvh_aabb[node, 3:] = extent / 2
+        if kind != _MESH:
+            _apply_size(changed, plain, one, kind, size)
         if kind == own and np.array_equal(size, plain.geom_size[one.geom]):
             inertia = plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
         else:
@@ -236,14 +238,24 @@ def _apply_objects(
         changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
         # Of two geoms that touch, the larger friction counts unless one has priority: here the drawn one counts.
         drawn = friction != plain.geom_friction[one.geom, 0]
-        changed.geom_friction[one.geom, 0] = friction
-        changed.geom_priority[one.geom] = 1 if drawn else plain.geom_priority[one.geom]
+        for geom in one.geoms:
+            changed.geom_friction[geom, 0] = friction
+            changed.geom_priority[geom] = 1 if drawn else plain.geom_priority[geom]
+
+
+def _apply_size(changed: Any, plain: mujoco.MjModel, one: Object, kind: int, size: F64) -> None:
+    extent = extents(kind, size)
+    changed.geom_size[one.geom] = size
+    changed.geom_rbound[one.geom] = _bound(kind, size)
+    changed.geom_aabb[one.geom, 3:] = extent / 2
+    for node in range(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body]):
+        changed.bvh_aabb[node, 3:] = extent / 2
 
 
 def extents(kind: int, size: F64) -> F64:
-    """Return the lengths of a geom along its own axes [m], (3,), from MuJoCo's `geom_size`."""
+    """Return the lengths of a geom along its own axes [m], (3,), from MuJoCo's `geom_size`; of a mesh of its box."""
     geom = mujoco.mjtGeom
-    if kind == int(geom.mjGEOM_BOX):
+    if kind in (int(geom.mjGEOM_BOX), _MESH):
         return 2 * size
     if kind == int(geom.mjGEOM_SPHERE):
         return np.full(3, 2 * size[0])
@@ -251,8 +263,9 @@ def extents(kind: int, size: F64) -> F64:
         return 2 * np.array([size[0], size[0], size[1]])
     if kind == int(geom.mjGEOM_CAPSULE):
         return 2 * np.array([size[0], size[0], size[1] + size[0]])
-    what = "mesh" if kind == int(geom.mjGEOM_MESH) else f"geom of MuJoCo's type {kind}"
-    raise ManipError(f"the first geom of an object is a {what}; {NO_MESH}")
+    raise ManipError(
+        f"the first geom of an object is of MuJoCo's type {kind}; expected a box, cylinder, sphere, capsule or mesh"
+    )
 
 
 def widest_grasp(kind: int, size: F64) -> float:

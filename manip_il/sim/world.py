@@ -23,6 +23,7 @@ from manip_il.robots.reach import Reach, reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_across, angle_ahead, angle_from_down, off_yaw, yaw_ahead
 from manip_il.sim import variation as variations
+from manip_il.sim.rests import Hull
 from manip_il.sim.shape import ANY
 from manip_il.sim.variation import Object
 
@@ -47,6 +48,7 @@ class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of what is named in it.
 
     task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies by name.
+    hulls: of those that are meshes.
     ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest of the hand,
     off the one that counts as none [rad]. nominal: the variation that the model has as compiled, (v,).
     """
@@ -63,6 +65,7 @@ class Scene:
     shoulder: int
     yaws: tuple[float, float]
     nominal: F64
+    hulls: Mapping[str, Hull]
 
     @cached_property
     def state_size(self) -> int:
@@ -268,18 +271,22 @@ class World:
         return off_yaw(hand, yaw) if self.scene.robot.leans else angle_from_down(hand, yaw)
 
     def extents(self, name: str) -> tuple[float, ...]:
-        """Return lengths of an object along its own axes x, y and z."""
+        """Return lengths of an object along its own axes x, y and z; of a mesh those of a box about its origin."""
         return self._shape(name)[1]
 
     def kind(self, name: str) -> int:
         """Return MuJoCo's geom type of an object."""
         return self._shape(name)[0]
 
+    def hull(self, name: str) -> Hull | None:
+        """Return the hull of an object that is a mesh, None for another."""
+        return self.scene.hulls.get(name)
+
     def _shape(self, name: str) -> tuple[int, tuple[float, ...]]:
         if name not in self._shapes:
             geom = self.scene.objects[name].geom
-            kind, size = int(self.model.geom_type[geom]), self.model.geom_size[geom]
-            self._shapes[name] = kind, tuple(variations.extents(kind, size).tolist())
+            kind, size, hull = int(self.model.geom_type[geom]), self.model.geom_size[geom], self.hull(name)
+            self._shapes[name] = kind, hull.extents if hull else tuple(variations.extents(kind, size).tolist())
         return self._shapes[name]
 
     def at_rest(self, name: str) -> bool:
@@ -290,7 +297,7 @@ class World:
 
     def touched(self, name: str) -> bool:
         """Return whether every finger touches an object."""
-        geoms = (self.scene.objects[name].geom,)
+        geoms = self.scene.objects[name].geoms
         return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geoms))
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:

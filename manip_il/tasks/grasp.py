@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.sim.rests import DEEPEST, LEAST_ROOM, Hull
 from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]
@@ -21,7 +22,6 @@ FUNNEL_SLOPE = 2.0  # height the hand gains per misalignment beyond it
 ANGLE_AS_LENGTH = 0.05  # how much misalignment a radian of wrong orientation counts for [m/rad]
 ANGLE_FREE = 0.1  # orientation error that counts for nothing [rad]
 TIGHT = 0.35  # share of the room beside an object that fills the hand which misalignment may take
-DEEPEST = 0.035  # of the ee site under an object's top: the palm just clears it [m]
 OPEN_SLACK = 0.016  # opening beyond the object's width at which the hand may descend, where there is so much [m]
 OPEN_SHARE = 0.6  # of what the gripper opens beyond the object's width
 PREFER_ZERO = 0.3  # weight of a grasp's own yaw against its distance from the hand's
@@ -36,24 +36,32 @@ CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have 
 MAX_TILT = 0.3  # of the object off a face: wait over it until it rests [rad]
 CLOSING = (0.022, 0.015, 0.022)  # object's centre in the ee frame, x y z, once the fingers have begun to close [m]
 LEAN = 0.5  # of a hand that reaches as far as it can [rad]
-_LEAST_ROOM = 0.002  # of an open gripper around an object [m]
+_MIDDLE = (0.0, 0.0, 0.0)
 _QUARTER = math.pi / 2
+_HALF_TURNS = (0.0, -math.pi, math.pi)
 _BOX, _SPHERE = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_SPHERE)
+
+
+Way = tuple[float, float, float]
 
 
 class Lie(NamedTuple):
     """Ways to grasp an object as it lies.
 
-    grasps: yaw of a hand that points down [rad], and the object's width between its fingers and length across them [m],
-    for each way it can be grasped. tall: its height [m]. tilt: off the nearest way in which it rests [rad]. folds: how
-    many of its yaws look alike, 0 for all. level: of the grasps those whose fingers meet upright sides.
+    grasps: yaw of a hand that points down [rad], the object's width between its fingers and length across them [m], and
+    the way from its centre to the middle between them, (3,) [m], for each way it can be grasped. tall: its height [m].
+    tilt: off the nearest way in which it rests [rad]. folds: how many of its yaws look alike, 0 for all. level: of the
+    grasps those whose fingers meet upright sides. above: its top over that middle, half its height unless said [m].
+    fits: the gripper goes around it, as far as that was looked at.
     """
 
-    grasps: tuple[tuple[float, float, float], ...]
+    grasps: tuple[tuple[float, float, float, Way], ...]
     tall: float
     tilt: float
     folds: int
     level: slice = slice(None)
+    above: float | None = None
+    fits: bool = True
 
     @property
     def yaw(self) -> float:
@@ -102,14 +110,22 @@ def is_cube(world: World, name: str) -> bool:
 
 def lie_of(world: World, name: str) -> Lie:
     """Return how an object lies; computed once a state."""
-    return world.remember(("lie", name), lambda: _lie(world.kind(name), world.pose(name).rotation, world.extents(name)))
+    return world.remember(("lie", name), partial(_lie_in, world, name))
+
+
+def _lie_in(world: World, name: str) -> Lie:
+    rotation, hull = world.pose(name).rotation, world.hull(name)
+    return _lie(world.kind(name), rotation, world.extents(name)) if hull is None else _hull_lie(hull, rotation)
 
 
 def _grasp(world: World, name: str) -> Grasp:
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
     neighbours = world.neighbours(name)
-    yaw, width, length = _nearest(lie, world, position, world.most_opening - _LEAST_ROOM, neighbours)
+    yaw, width, length, (off_x, off_y, off_z) = _nearest(
+        lie, world, position, world.most_opening - LEAST_ROOM, neighbours
+    )
     x, y, z = position.tolist()
+    x, y, z = x + off_x, y + off_y, z + off_z
     lean = 0.0 if world.leans else world.reach.lean((x, y, z))
     angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
     ee_x, ee_y, ee_z = ee.position.tolist()
@@ -119,11 +135,11 @@ def _grasp(world: World, name: str) -> Grasp:
     room = max(0.0, world.most_opening - width)  # what the open gripper leaves beside it [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
     way = at_x - ee_x, at_y - ee_y
-    away = math.hypot(*(_beside_jaw(*way, yaw, -dz < lie.tall / 2) if world.lopsided else way))
+    half = lie.tall / 2 if lie.above is None else lie.above
+    away = math.hypot(*(_beside_jaw(*way, yaw, -dz < half) if world.lopsided else way))
     off = away + ANGLE_AS_LENGTH * max(0.0, angle - free)
     slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
     funnel = slope * max(0.0, off - min(BY_JAW if world.lopsided else FUNNEL_RADIUS, TIGHT * room))
-    half = lie.tall / 2
     crowding = 1.0 if world.lopsided else _crowding(yaw, world.most_opening, neighbours)
     narrower = max(0.0, room - NARROW) * crowding
     across, along, ahead = (a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist())
@@ -159,7 +175,7 @@ def _beside_jaw(x: float, y: float, yaw: float, around: bool) -> tuple[float, fl
 
 def _nearest(
     lie: Lie, world: World, position: F64, widest: float, neighbours: Sequence[tuple[float, float]]
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, Way]:
     """The grasp whose yaw is nearest to the hand's, with a small preference for none and for a narrow one.
 
     Nearest to the hand, not to none: a learner that averages both sides of the boundary between two grasps then leaves
@@ -170,13 +186,13 @@ def _nearest(
     if world.faces_ahead:
         at = world.turned(position)
         grasps = [
-            (way, width, length)
-            for yaw, width, length in grasps
+            (way, width, length, centre)
+            for yaw, width, length, centre in grasps
             for way in (world.turns(yaw, math.pi, position) if lie.folds else (0.0,))
         ]
-    narrowest = min([width for _, width, _ in grasps])
+    narrowest = min([width for _, width, _, _ in grasps])
     widest_fitting = max(widest, narrowest)
-    _, yaw, width, length = min(
+    _, yaw, width, length, centre = min(
         [
             (
                 abs(yaw - at)
@@ -186,12 +202,13 @@ def _nearest(
                 yaw,
                 width,
                 length,
+                centre,
             )
-            for yaw, width, length in grasps
+            for yaw, width, length, centre in grasps
             if width <= widest_fitting
         ]
     )
-    return yaw + ahead, width, length
+    return yaw + ahead, width, length, centre
 
 
 def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
@@ -212,14 +229,31 @@ def _lie(kind: int, rotation: F64, extents: Sequence[float]) -> Lie:
         return _box_lie(rotation, extents)
     width, _, length = extents
     if kind == _SPHERE:
-        return Lie(((0.0, width, width),), width, 0.0, 0)
+        return Lie(((0.0, width, width, _MIDDLE),), width, 0.0, 0)
     ahead, left, up = rotation[:, 2].tolist()
     if abs(up) > math.sqrt(0.5):
-        return Lie(((0.0, width, width),), length, math.acos(min(1.0, abs(up))), 0)
+        return Lie(((0.0, width, width, _MIDDLE),), length, math.acos(min(1.0, abs(up))), 0)
     yaw = math.atan2(left, ahead)
     yaw -= math.pi * round(yaw / math.pi)
-    grasps = tuple((yaw + turn, width, length) for turn in (0.0, -math.pi, math.pi))
+    grasps = tuple((yaw + turn, width, length, _MIDDLE) for turn in _HALF_TURNS)
     return Lie(grasps, width, math.asin(abs(up)), 2)
+
+
+def _hull_lie(hull: Hull, rotation: F64) -> Lie:
+    """A mesh lies on the nearest side of its hull on which it can rest."""
+    cosines = hull.downs.dot(-rotation[2])
+    nearest = int(cosines.argmax())
+    rest, tilt = hull.rest(nearest), math.acos(min(1.0, float(cosines[nearest])))
+    centres = [(x, y, z) for x, y, z in rest.centre.dot(rotation.T).tolist()]
+    if rest.round:
+        grasps = tuple((0.0, *size, centre) for size, centre in zip(rest.sizes, centres, strict=True))
+        return Lie(grasps, rest.tall, tilt, 0, above=rest.above, fits=rest.fits)
+    grasps = []
+    for (ahead, left, _), size, centre in zip(rest.across.dot(rotation.T).tolist(), rest.sizes, centres, strict=True):
+        yaw = math.atan2(left, ahead) + _QUARTER
+        yaw -= math.pi * round(yaw / math.pi)
+        grasps += [(yaw + turn, *size, centre) for turn in _HALF_TURNS]
+    return Lie(tuple(grasps), rest.tall, tilt, 2, above=rest.above, fits=rest.fits)
 
 
 def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
@@ -234,7 +268,11 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
     length, width = extents[side], extents[other]
     if quarters % 2:
         length, width = width, length
-    grasps = ((yaw, width, length), (yaw - _QUARTER, length, width), (yaw + _QUARTER, length, width))
+    grasps = (
+        (yaw, width, length, _MIDDLE),
+        (yaw - _QUARTER, length, width, _MIDDLE),
+        (yaw + _QUARTER, length, width, _MIDDLE),
+    )
     folds, tilt, level = 4 if length == width else 2, math.acos(min(1.0, heights[up])), slice(None)
     if tilt >= MAX_TILT:  # it stands on an edge: the fingers meet the two sides that are upright
         level = slice(0, 1) if (heights[side] > heights[other]) != bool(quarters % 2) else slice(1, 3)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside
+from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside, lie_of
 
 F64 = NDArray[np.float64]
 Which = Callable[[World], str]  # the object that it is about now
@@ -27,6 +27,8 @@ CLEAR = 0.03  # of the hand over the object's top: the fingertips are above it [
 RISE_FIRST = 0.03  # this far under the funnel, the hand only rises [m]
 AT_GRASP = (0.015, 0.015, 0.015)  # object's centre in the ee frame, x y z: start to close [m]
 AT_GRASP_ANGLE = 0.3  # [rad]
+EMPTY = 0.4  # of a mesh's width: fingers so near to each other have nothing between them
+LEAST_DEEP, DEEP_SHARE = 0.004, 0.15  # of the hand over where it grasps a mesh [m], and in heights of that
 IN_HAND = (0.009, 0.020, 0.011)  # object's centre in the ee frame, in x and z beyond half its size: in the hand [m]
 RELEASE = 0.03  # how far the fingers open about an object to let it go, beyond its width, where there is so much [m]
 FREED = 0.4  # share of that at which it is free
@@ -63,14 +65,29 @@ def held(world: World, name: str) -> bool:
     half = max(world.extents(name)) / 2
     if math.dist(world.pose(name).position.tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
         return False  # without the work of how it could be grasped
+    if world.hull(name) is not None:  # however it has turned in the hand
+        return _is_between(world, name, half) and world.touched(name)
     g = grasp_of(world, name)
     return is_inside(g.offset, (g.length / 2 + x, y, g.half + z)) and world.touched(name)
+
+
+def _is_between(world: World, name: str, half: float) -> bool:
+    """Whether the centre of a mesh as long as 2 `half` [m] is between the fingers."""
+    (x, y, z), ee = IN_HAND, world.ee
+    across, along, ahead = (world.pose(name).position - ee.position).dot(ee.rotation).tolist()
+    return is_inside((across, along - world.middle(world.opening), ahead), (half + x, y, half + z))
 
 
 def at_grasp(world: World, name: str) -> bool:
     """Return whether closing the fingers now would hold the object; with hysteresis once they have begun to close."""
     g = grasp_of(world, name)
     box = AT_GRASP if g.open_enough else CLOSING
+    if world.hull(name) is not None:
+        if world.opening < EMPTY * g.width:
+            return False
+        # Its sides may be round: higher up they let the fingers slip off.
+        deep = max(LEAST_DEEP, DEEP_SHARE * lie_of(world, name).tall)
+        box = (*box[:2], min(box[2], deep if g.open_enough else 2 * deep))
     return is_inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.settled
 
 

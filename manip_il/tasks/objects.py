@@ -7,13 +7,17 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from manip_il.sim.shape import ANY, contact
+from manip_il.sim.mesh import Mesh
+from manip_il.sim.shape import ANY, MESH, contact
 from manip_il.sim.variation import GEOMS
 from manip_il.sim.world import GOAL
 
+F64 = NDArray[np.float64]
 CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
+MOST_HULL = 500  # points of a mesh's hull that touch: finer ones compile for seconds
 FRICTION = 1.0  # sliding, against anything
 RED = (0.86, 0.24, 0.16)
 BLUE = (0.16, 0.40, 0.80)
@@ -21,7 +25,7 @@ YELLOW = (0.93, 0.72, 0.16)
 WOOD = (0.52, 0.37, 0.25)
 GREY = (0.45, 0.47, 0.50)
 _GREEN = (0.12, 0.72, 0.35, 0.55)
-SHAPES = {**GEOMS, ANY: GEOMS["box"]}
+SHAPES = {**GEOMS, ANY: GEOMS["box"], MESH: mujoco.mjtGeom.mjGEOM_MESH}
 
 
 def add_cube(
@@ -32,24 +36,45 @@ def add_cube(
 
 
 def add_object(
-    spec: mujoco.MjSpec, name: str, shape: str, size: Sequence[float], mass: float, colour: tuple[float, ...]
+    spec: mujoco.MjSpec,
+    name: str,
+    shape: str,
+    size: Sequence[float],
+    mass: float,
+    colour: tuple[float, ...],
+    mesh: Mesh | None = None,
 ) -> None:
-    """Add an object that lies free. shape: of `SHAPES`; size: MuJoCo's for it [m]; mass [kg]; red, green and blue."""
+    """Add an object that lies free. shape: of `SHAPES`; size: MuJoCo's for it [m]; mass [kg]; red, green and blue.
+
+    mesh: in place of a size.
+    """
     material = spec.add_material(name=name, rgba=[*colour, 1], specular=0.3, shininess=0.5)
     body = spec.worldbody.add_body(name=name, pos=[0.5, 0, max(size)])
     body.add_freejoint(name=name)
     condim, rolling = contact(shape)
-    body.add_geom(
-        name=name,
-        type=SHAPES[shape],
-        size=[*size, *[0.0] * (3 - len(size))],
-        mass=mass,
-        material=material.name,
-        condim=condim,
-        friction=[FRICTION, 0.02, rolling],
-        solimp=[0.95, 0.99, 0.001, 0.5, 2],
-        solref=[0.01, 1],
-    )
+    touching: Any = {
+        "condim": condim,
+        "friction": [FRICTION, 0.02, rolling],
+        "solimp": [0.95, 0.99, 0.001, 0.5, 2],
+        "solref": [0.01, 1],
+    }
+    seen: Any = {"name": name, "type": SHAPES[shape], "mass": mass, "material": material.name}
+    if mesh is None:
+        body.add_geom(**seen, size=[*size, *[0.0] * (3 - len(size))], **touching)
+        return
+    _add_mesh(spec, name, mesh.vertices, mesh.faces)
+    body.add_geom(**seen, meshname=name, **({"contype": 0, "conaffinity": 0} if mesh.pieces else touching))
+    for number, piece in enumerate(mesh.pieces):
+        _add_mesh(spec, f"{name}_{number}", piece)
+        body.add_geom(
+            name=f"{name}_{number}", type=SHAPES[MESH], meshname=f"{name}_{number}", mass=0, group=3, **touching
+        )
+
+
+def _add_mesh(spec: mujoco.MjSpec, name: str, vertices: F64, faces: NDArray[np.int64] | None = None) -> None:
+    mesh = spec.add_mesh(name=name, uservert=vertices.ravel(), maxhullvert=MOST_HULL)
+    if faces is not None:
+        mesh.userface, mesh.inertia = faces.ravel(), mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
 
 
 def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:

@@ -14,7 +14,7 @@ from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import Lie, is_cube, lie_of
-from manip_il.tasks.ladder import pick_progress, pick_rungs
+from manip_il.tasks.ladder import held, pick_progress, pick_rungs
 from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_lying
@@ -52,7 +52,8 @@ class PickPlace:
         if self.shape == CUBE:
             add_cube(spec, OBJECT)
         else:
-            add_object(spec, OBJECT, self.shape.kind, self.shape.size, self.shape.mass, RED)
+            shape = self.shape
+            add_object(spec, OBJECT, shape.kind, shape.size, shape.mass, RED, shape.mesh)
         add_goal(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
@@ -73,6 +74,13 @@ class PickPlace:
         """Return the distance of the cube's centre from the goal [m]."""
         return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
 
+    def unsound(self, world: World) -> str:
+        """Return why there is no sound label: a mesh lies on a side on which it is too wide for the gripper."""
+        if world.hull(OBJECT) is None or lie_of(world, OBJECT).fits or held(world, OBJECT):
+            return ""
+        width = min(width for _, width, _, _ in lie_of(world, OBJECT).grasps)
+        return f"{OBJECT} lies on a side on which it is {width:.3f} m wide, more than the gripper goes around"
+
     def progress(self, world: World) -> float:
         """Return progress by the way that is left along the ladder's path."""
         return pick_progress(world, OBJECT)
@@ -89,7 +97,8 @@ def observe_object(world: World, name: str) -> Observed:
     """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the way to it from the hand."""
     position, lie = world.pose(name).position, lie_of(world, name)
     if world.scene.draws_shape or not is_cube(world, name):
-        return {name: position, **_observe_lie(name, lie), f"{name}_from_ee": position - world.ee.position}
+        seen = _observe_lie(name, lie, mesh=world.hull(name) is not None)
+        return {name: position, **seen, f"{name}_from_ee": position - world.ee.position}
     return {
         name: position,
         f"{name}.cos4yaw": math.cos(4 * lie.yaw),
@@ -100,9 +109,13 @@ def observe_object(world: World, name: str) -> Observed:
     }
 
 
-def _observe_lie(name: str, lie: Lie) -> Observed:
-    """Return how anything but a cube lies, by its narrowest grasp, so that numbers change steadily as it turns."""
-    yaw, width, length = min(lie.grasps, key=lambda grasp: grasp[1])
+def _observe_lie(name: str, lie: Lie, *, mesh: bool) -> Observed:
+    """Return how anything but a cube lies, by its narrowest grasp, so that numbers change steadily as it turns.
+
+    mesh: with the way from its centre of mass to the middle of that grasp.
+    """
+    yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
+    of_mesh = {f"{name}.grasp": np.array(centre)} if mesh else {}
     return {
         f"{name}.folds": float(lie.folds),
         f"{name}.cosyaw": math.cos(lie.folds * yaw),
@@ -111,4 +124,5 @@ def _observe_lie(name: str, lie: Lie) -> Observed:
         f"{name}.width": width,
         f"{name}.length": length,
         f"{name}.height": lie.tall,
+        **of_mesh,
     }

@@ -129,7 +129,7 @@ def _approach(world: World) -> Target:
         return target
     ee, g = world.ee, grasp_of(world, asked(world))
     hand = math.atan2(ee.rotation[1, 0], ee.rotation[0, 0])
-    yaw = min((one for one, _, _ in lie_of(world, asked(world)).grasps),
+    yaw = min((one for one, _, _, _ in lie_of(world, asked(world)).grasps),
               key=lambda one: (round(abs(math.sin(one - free)), 6), abs(one - hand)))  # fmt: skip
     low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
     position = np.array([*target.position[:2], max(target.position[2], low)])

@@ -30,9 +30,15 @@ _UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
     """Draw on which side an object lies or stands, where, and its yaw: (3,) [m] and wxyz (4,).
 
-    Sides that look alike count once; a capsule lies. A cube turns within an eighth of a turn, as its faces are alike.
+    Sides that look alike count once; a capsule lies; a mesh is as it was made, or on the nearest side. A cube turns
+    within an eighth of a turn, as its faces are alike.
     """
     lengths = world.extents(name)
+    if (hull := world.hull(name)) is not None:
+        turn, upright = np.empty(4), _upright(hull.downs[0])
+        at = draw_resting_place(rng, world, name, hull.rest(0).height)
+        mujoco.mju_mulQuat(turn, draw_yaw(rng, np.pi), upright)
+        return at, turn
     if is_cube(world, name):
         return draw_resting(rng, world, name), draw_yaw(rng)
     sides = _sides(world.kind(name), lengths)
@@ -41,6 +47,14 @@ def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, 
     turn = np.empty(4)
     mujoco.mju_mulQuat(turn, draw_yaw(rng, np.pi), _UPWARDS[up])
     return at, turn
+
+
+def _upright(down: F64) -> F64:
+    """Return the least turn that gets a direction (3,) of an object to point down: wxyz."""
+    turn, upright = np.empty(4), np.empty(4)
+    mujoco.mju_quatZ2Vec(turn, -down)
+    mujoco.mju_negQuat(upright, turn)
+    return upright
 
 
 def _sides(kind: int, lengths: Sequence[float]) -> list[int]:

@@ -140,7 +140,7 @@ def test_nodes_come_and_go(cluster, tmp_path, expected):
 @pytest.mark.slow
 def test_a_node_with_another_version_is_one_line(cluster):
     with pytest.raises(ManipError, match=r"has manip_il .*, not 0\.0\.0"):
-        run_there("0.0.0", JOB, SEEDS[:1], None, None)
+        run_there("0.0.0", JOB, SEEDS[:1], None, None, None)
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ SHAPES = {
 def free_body(shape: str, size: str, mass: float = 0.2) -> tuple[mujoco.MjModel, dict[str, Object]]:
     xml = f"""<mujoco><worldbody><body name="thing"><freejoint name="thing"/>
     <geom type="{shape}" size="{size}" mass="{mass}"/></body></worldbody></mujoco>"""
-    return mujoco.MjSpec.from_string(xml).compile(), {"thing": Object("thing", 1, 0, 0, 0)}
+    return mujoco.MjSpec.from_string(xml).compile(), {"thing": Object("thing", 1, 0, (0,), 0, 0)}
 
 
 def inertia_tensor(model: mujoco.MjModel) -> np.ndarray:
@@ -152,8 +152,8 @@ def test_extents_are_the_lengths_along_a_things_own_axes(shape: str):
 
 
 def test_a_shape_that_nobody_grasps_is_refused():
-    with pytest.raises(ManipError, match="expected a box, cylinder, sphere or capsule"):
-        extents(int(mujoco.mjtGeom.mjGEOM_MESH), np.ones(3))
+    with pytest.raises(ManipError, match="expected a box, cylinder, sphere, capsule or mesh"):
+        extents(int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), np.ones(3))
 
 
 @pytest.mark.parametrize("shape", SHAPES)

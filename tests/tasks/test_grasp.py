@@ -62,7 +62,7 @@ def test_a_grasps_width_is_the_objects_between_the_fingers(shape: str, yaw: floa
     lie = turned(world, yaw, up)
     assert lie.tilt == pytest.approx(0, abs=1e-6)
     assert lie.tall == pytest.approx(span(world, np.array([0.0, 0.0, 1.0])))
-    for turn, width, length in lie.grasps:
+    for turn, width, length, _ in lie.grasps:
         hand = hand_down(turn)
         assert width == pytest.approx(span(world, hand[:, 1]), abs=1e-6)
         assert length == pytest.approx(span(world, hand[:, 0]), abs=1e-6)

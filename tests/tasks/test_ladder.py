@@ -80,6 +80,9 @@ class Placed:
     def extents(self, name: str) -> tuple[float, ...]:
         return (self.edge,) * 3
 
+    def hull(self, name: str) -> None:
+        return None
+
     def kind(self, name: str) -> int:
         return int(mujoco.mjtGeom.mjGEOM_BOX)
 

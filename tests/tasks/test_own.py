@@ -101,7 +101,7 @@ def test_a_node_gets_the_file(touch):
     job = RolloutJob(make_config("panda", str(touch)), hold=0)
     files, [here] = {"touch.py": touch.read_bytes()}, list(job.run([5]))
     touch.unlink()
-    answer = run_there(manip_il.__version__, job, (5,), None, files)
+    answer = run_there(manip_il.__version__, job, (5,), None, files, None)
     [(there, _)] = pickle.loads(zstandard.decompress(answer))
     for name, column in here.without_pictures().columns.items():
         np.testing.assert_array_equal(there.columns[name], column)

@@ -1,0 +1,220 @@
+"""How an object of any shape rests on the table, and where a hand that points down gets its fingers around it.
+
+All of it is about the object's convex hull, in the object's own frame, and computed once a process.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from manip_il.sim.shape import ROLLING_MESH
+
+F64 = NDArray[np.float64]
+DEEPEST = 0.035  # of the ee site under an object's top: the palm just clears it [m]
+LEAST_ROOM = 0.002  # of an open gripper around an object [m]
+_DIRECTIONS = 500  # in which the points of a fine hull are looked for
+_ALIKE, _COPLANAR = 0.2, 0.01  # between sides that count as one, and of one side [rad]
+_FINGER = 0.012  # half a finger's width, and how far it may be off [m]
+_LEVEL = 0.004  # between the heights at which widths are measured [m]
+_TIP = 0.001  # of the fingertips over the table [m]
+_APART = math.radians(25)  # of two ways to grasp it
+_SLOPE = 0.1  # of sides at the fingertips, in height, from which on the object is grasped as low as can be
+_STEEP = 0.2  # more of slope under the fingertips than the best way has, in height, at which a way is none
+_WIDER = 0.02  # than the narrowest way, at which a way is none [m]
+_ROUND = 0.03  # share of the width by which something round may differ
+
+
+class Rest(NamedTuple):
+    """A side on which an object rests.
+
+    down: unit vector, (3,). height: of the body's origin, tall: of the object, above: of its top over where it is
+    grasped [m]. For each way to grasp it: across (w, 3), unit vector along the fingers' motion; centre (w, 3), between
+    the fingers; width between them and length across them [m]. fits: they go around it. round: any yaw will do.
+    """
+
+    down: F64
+    height: float
+    tall: float
+    above: float
+    across: F64
+    centre: F64
+    sizes: tuple[tuple[float, float], ...]
+    fits: bool
+    round: bool
+
+
+class Hull:
+    """An object's convex hull, and the sides on which it rests, for one gripper.
+
+    extents: lengths of the box about the body's origin that holds it [m]. downs: directions (n, 3) that point down
+    where it rests; the first is that in which it lies as it was made, or the nearest to that.
+    """
+
+    def __init__(self, model: mujoco.MjModel, body: int, geoms: Sequence[int], lowest: float, widest: float):
+        """Take the meshes of a body, and a gripper that opens to `widest` [m], with `ee` no lower than `lowest` [m]."""
+        points = _few(np.concatenate([_vertices(model, geom) for geom in geoms]))
+        self._hull, self._centre, self._gripper = ConvexHull(points), model.body_ipos[body].copy(), (lowest, widest)
+        self._rests: dict[int, Rest] = {}
+        self.downs = _resting(self._hull, self._centre)
+        x, y, z = (2 * np.abs(points).max(axis=0)).tolist()
+        self.extents: tuple[float, float, float] = x, y, z
+
+    def rest(self, number: int) -> Rest:
+        """Return how it lies on one of its sides, computed when that is first asked for."""
+        if number not in self._rests:
+            self._rests[number] = _rest(self._hull, self._centre, self.downs[number], *self._gripper)
+        return self._rests[number]
+
+
+def _vertices(model: mujoco.MjModel, geom: int) -> F64:
+    """Vertices of a geom's mesh in its body's frame, (n, 3) [m]."""
+    mesh, rotation = int(model.geom_dataid[geom]), np.empty(9)
+    start = model.mesh_vertadr[mesh]
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]].astype(np.float64)
+    return vertices @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+
+
+def _few(points: F64) -> F64:
+    """The outermost of points in many directions, where there are more."""
+    if len(points) <= _DIRECTIONS:
+        return points
+    number = np.arange(_DIRECTIONS) + 0.5
+    z, turn = 1 - 2 * number / _DIRECTIONS, number * math.pi * (1 + math.sqrt(5))  # evenly on a ball, by Fibonacci
+    ways = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
+    return points[np.unique((points @ ways).argmax(axis=0))]
+
+
+def _resting(hull: ConvexHull, centre: F64) -> F64:
+    """Outward normals (n, 3) of the sides on which the hull does not topple, most stable first, but for the first.
+
+    It rests on a side if the centre of mass is over it, and rolling friction lets it rest where that is nearly so.
+    """
+    normals = hull.equations[:, :3]
+    heights = -(hull.equations[:, 3] + normals @ centre)
+    cosines = normals @ normals.T
+    apart = cosines < math.cos(_COPLANAR)
+    sines = np.sqrt(np.maximum(1 - cosines**2, 1e-12))
+    room = np.where(apart, (heights - cosines * heights[:, None]) / sines, np.inf).min(axis=1)  # to the side's edges
+    stable = np.flatnonzero((room > 0) | (heights == heights.min()))
+    order = np.argsort(-room / heights, kind="stable")
+    downs = [normals[stable[np.argmin(normals[stable, 2])]]]
+    for down in normals[order[room[order] > -ROLLING_MESH]]:
+        if max(down @ one for one in downs) < math.cos(_ALIKE):
+            downs.append(down)
+    return np.array(downs)
+
+
+def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float) -> Rest:
+    first = np.cross(down, np.eye(3)[np.abs(down).argmin()])
+    first /= np.linalg.norm(first)
+    axes = np.array([first, np.cross(-down, first)])  # horizontal
+    heights = -(hull.points - centre) @ down
+    height, tall = float(-heights.min()), float(np.ptp(heights))
+    at = max(lowest, tall - DEEPEST, min(height, tall / 2))  # of the hand over the table
+    flat, turns = (hull.points - centre) @ axes.T, _turns(hull, axes)
+    ways, any_yaw = _ways(_all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM)
+    if min(way.slope for way in ways) > _SLOPE and at > max(lowest, tall - DEEPEST):  # it narrows: lower down
+        at = max(lowest, tall - DEEPEST)
+        ways, any_yaw = _ways(_all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM)
+    turned = np.array([[math.cos(way.turn), math.sin(way.turn)] for way in ways])
+    across = turned @ axes
+    middle = centre + (at - height) * -down + np.array([way.middle for way in ways])[:, None] * across
+    return Rest(
+        down=down,
+        height=float((hull.points @ down).max()),
+        tall=tall,
+        above=max(tall - at, _LEVEL),
+        across=across,
+        centre=middle,
+        sizes=tuple((way.width, way.length) for way in ways),
+        fits=min(way.width for way in ways) <= widest - LEAST_ROOM,
+        round=any_yaw,
+    )
+
+
+def _all_ways(hull: ConvexHull, heights: F64, flat: F64, tips: float, turns: F64) -> list[_Way]:
+    """Every way by its turn, with the fingertips at a height over the table [m]."""
+    levels = np.arange(tips + _TIP, heights.max() - _TIP / 2, _LEVEL).tolist()
+    cuts = [_cut(hull, heights, flat, level) for level in levels]
+    return [_way(cuts, turn) for turn in turns]
+
+
+def _cut(hull: ConvexHull, heights: F64, flat: F64, level: float) -> F64:
+    """Segments (n, 2, 2) [m] of the outline at a height."""
+    z, xy = heights[hull.simplices], flat[hull.simplices]
+    after_z, after_xy = np.roll(z, -1, axis=1), np.roll(xy, -1, axis=1)
+    crossing = (z > level) != (after_z > level)  # two edges of a triangle, or none
+    share = (level - z[crossing]) / (after_z - z)[crossing]
+    return (xy[crossing] + share[:, None] * (after_xy - xy)[crossing]).reshape(-1, 2, 2)
+
+
+def _turns(hull: ConvexHull, axes: F64) -> F64:
+    """Directions of the fingers' motion to look at [rad]: flush with upright sides, or all around where it has many."""
+    sides = hull.equations[:, :3] @ axes.T
+    upright = sides[np.hypot(*sides.T) > 0.7]
+    flush = np.unique(np.degrees(np.arctan2(upright[:, 1], upright[:, 0])).round(1) % 180)
+    around = np.arange(0, 180, 5.0)
+    return np.radians(np.unique(np.concatenate([around, flush])) if len(flush) < len(around) else around)
+
+
+class _Way(NamedTuple):
+    """turn: of the fingers' motion [rad]; middle: between the fingers along it, off the centre of mass [m]."""
+
+    turn: float
+    width: float
+    length: float
+    middle: float
+    slope: float
+
+
+def _ways(ways: Sequence[_Way], widest: float) -> tuple[list[_Way], bool]:
+    """The narrowest ways, each narrower than those beside it, or one that does not fit; and whether all will do."""
+    narrowest = min(ways, key=lambda way: way.width)
+    fitting = [way for way in ways if way.width <= min(widest, narrowest.width + _WIDER)]
+    if max(way.width for way in ways) - narrowest.width < _ROUND * narrowest.width:
+        return [narrowest], True
+    if not fitting:
+        return [narrowest], False
+    steepest = min(way.slope for way in fitting) + _STEEP
+    kept: list[_Way] = []
+    for way in sorted((way for way in fitting if way.slope <= steepest), key=lambda way: way.width):
+        beside = [one for one in ways if _between(one.turn, way.turn) < _APART / 2]
+        if way.width <= min(one.width for one in beside) + 1e-4 and all(
+            _between(one.turn, way.turn) >= _APART for one in kept
+        ):
+            kept.append(way)
+    return kept or [min(fitting, key=lambda way: way.slope)], False
+
+
+def _way(cuts: Sequence[F64], turn: float) -> _Way:
+    c, s = math.cos(turn), math.sin(turn)
+    ends, lengths = [], []
+    for cut in cuts:
+        along, across = cut @ (c, s), cut @ (-s, c)
+        lengths.append((across.min(), across.max()))
+        there = (across.min(axis=1) <= _FINGER) & (across.max(axis=1) >= -_FINGER)
+        if there.any():
+            (a, b), (p, q) = across[there].T, along[there].T
+            way = np.where(a == b, 1e-12, b - a)
+            shares = [np.clip((end - a) / way, 0, 1) for end in (-_FINGER, _FINGER)]
+            met = np.concatenate([p + share * (q - p) for share in shares])
+            ends.append((met.min(), met.max()))
+    low, high = np.array(ends).T
+    up = min(2, len(ends) - 1)
+    rise = max(up * _LEVEL, _LEVEL)
+    steep = max((low[up] - low[0]) * (low.argmin() == 0), (high[0] - high[up]) * (high.argmax() == 0)) / rise
+    length = float(np.max(lengths) - np.min(lengths))
+    return _Way(turn, float(high.max() - low.min()), length, float(high.max() + low.min()) / 2, max(0.0, float(steep)))
+
+
+def _between(one: float, other: float) -> float:
+    """Between two lines [rad]."""
+    return abs(math.remainder(one - other, math.pi))

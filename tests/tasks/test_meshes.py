@@ -1,0 +1,267 @@
+"""Objects that are meshes: read from a file, grasped on any side that they rest on, named in data without a path."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+import zstandard
+
+import manip_il
+from manip_il.cli.main import main
+from manip_il.collect.edits import open_source
+from manip_il.collect.environments import env_fingerprint, env_spec, is_known
+from manip_il.collect.expert import Expert
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.ray_pool import run_there
+from manip_il.errors import ManipError, UsageError
+from manip_il.sim.conditions import Condition
+from manip_il.sim.rests import LEAST_ROOM
+from manip_il.sim.shape import DENSITY, LIGHTEST, Shape
+from manip_il.sim.world import World
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import make_env, scene_of
+from manip_il.tasks.grasp import lie_of
+from tests.meshes import MESHES, write_mesh
+
+OBJECT = "object"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("meshes")
+    for name in MESHES:
+        write_mesh(name, folder)
+    return folder
+
+
+def text(folder: Path, name: str) -> str:
+    return f"mesh:{folder / name}.obj"
+
+
+@pytest.mark.parametrize("robot", ["panda", "so101"])
+@pytest.mark.parametrize("name", MESHES)
+def test_the_expert_brings_it_to_its_goal(name, robot, folder):
+    episodes = RolloutJob(make_config(robot, object=text(folder, name)), hold=0).run(range(3_000_000, 3_000_003))
+    assert all(episode.success for episode in episodes)
+
+
+@pytest.mark.parametrize("task", ["lift", "carry"])
+def test_other_tasks_take_it_too(task, folder):
+    config = make_config("panda", task, object=text(folder, "mug"))
+    assert sum(episode.success for episode in RolloutJob(config, hold=0).run(range(3_000_000, 3_000_003))) >= 2
+
+
+@pytest.mark.parametrize("ending", [".stl", ".obj", ".ascii.stl"])
+def test_every_kind_of_file_is_the_same_solid(ending, tmp_path):
+    path, solid = tmp_path / f"angle{ending}", MESHES["angle"]()
+    solid.export(path, file_type="stl_ascii" if "ascii" in ending else None)
+    shape = Shape.parse(f"mesh:{path}:0.05")
+    assert max(shape.lengths) == pytest.approx(0.05)
+    assert shape.mass == pytest.approx(max(LIGHTEST, DENSITY * solid.volume * (0.05 / 0.07) ** 3), rel=1e-5)
+    np.testing.assert_allclose(shape.mesh.vertices.min(axis=0), np.array((-0.0275, -0.0225, -0.0125)) / 1.4, atol=1e-6)
+
+
+def test_the_model_has_its_mass_its_centre_of_mass_and_its_picture(folder):
+    shape, scene = Shape.parse(text(folder, "bottle")), scene_of("panda", "pick_place", text(folder, "bottle"))
+    one, model = scene.objects[OBJECT], scene.model
+    assert model.body_mass[one.body] == pytest.approx(shape.mass) == pytest.approx(DENSITY * MESHES["bottle"]().volume)
+    np.testing.assert_allclose(model.body_ipos[one.body], 0, atol=1e-5)
+    assert model.mesh_facenum[model.geom_dataid[one.geom]] == len(MESHES["bottle"]().faces)
+
+
+def settled(world: World, quaternion: np.ndarray, seconds: float = 1.5) -> None:
+    """Drop the object from 10 cm in an attitude, and wait."""
+    world.place(OBJECT, np.array([0.45, 0.0, 0.1]), quaternion / np.linalg.norm(quaternion))
+    world.update()
+    for _ in range(round(seconds / world.model.opt.timestep)):
+        mujoco.mj_step(world.model, world.data)
+    world.update()
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_however_it_falls_it_rests_on_a_known_side_with_grasps(name, folder):
+    env, rng = make_env("panda", object=text(folder, name)), np.random.default_rng(1)
+    expert, world = Expert(env.scene), env.world
+    for _ in range(4):
+        env.reset(seed=0)
+        settled(world, rng.normal(size=4))
+        lie = lie_of(world, OBJECT)
+        assert lie.tilt < 0.3 or not world.at_rest(OBJECT)  # or it still rocks
+        assert lie.fits
+        assert all(width <= world.most_opening - LEAST_ROOM for _, width, _, _ in lie.grasps)
+        assert expert.label(env.get_state()).valid
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_it_starts_as_the_file_has_it_or_on_the_nearest_side(name, folder):
+    env = make_env("panda", object=text(folder, name))
+    env.reset(seed=4)
+    world, before = env.world, env.world.pose(OBJECT).rotation.copy()
+    for _ in range(500):
+        mujoco.mj_step(world.model, world.data)
+    world.update()
+    after = world.pose(OBJECT).rotation
+    assert before[2, 2] > (0.99 if name != "banana" else 0.9)
+    assert before[2] @ after[2] > 0.98  # it does not fall over
+
+
+def test_a_cone_on_its_tip_starts_on_a_side(tmp_path):
+    solid = MESHES["cone"]()
+    solid.apply_scale((1, 1, -1)).export(tmp_path / "cone.stl")
+    downs = scene_of("panda", "pick_place", f"mesh:{tmp_path / 'cone.stl'}").hulls[OBJECT].downs
+    assert abs(downs[0][2]) < 0.7
+
+
+def test_grasps_are_flush_and_around_the_centre_of_mass(folder):
+    rest = scene_of("panda", "pick_place", text(folder, "wedge")).hulls[OBJECT].rest(0)
+    [(width, _)] = rest.sizes
+    assert width == pytest.approx(0.035, abs=1e-3)  # across its upright sides, not down its slope
+    np.testing.assert_allclose(np.abs(rest.across[0]), (0, 1, 0), atol=0.01)
+    np.testing.assert_allclose(rest.centre[0, :2], 0, atol=1e-3)
+    assert scene_of("panda", "pick_place", text(folder, "bottle")).hulls[OBJECT].rest(0).round
+
+
+def test_a_side_that_is_too_wide_has_no_label_and_says_why(tmp_path):
+    trimesh.creation.box((0.1, 0.03, 0.09)).export(tmp_path / "board.stl")
+    env = make_env("panda", object=f"mesh:{tmp_path / 'board.stl'}")
+    expert = Expert(env.scene)
+    env.reset(seed=0)
+    assert expert.label(env.get_state()).valid
+    settled(env.world, np.array([1.0, 1.0, 0.0, 0.0]))
+    label = expert.label(env.get_state())
+    assert not label.valid
+    assert "object lies on a side on which it is 0.090 m wide" in label.reason
+
+
+def test_labels_are_those_of_another_process_and_order(folder):
+    config = make_config("panda", object=text(folder, "mug"))
+    [episode] = RolloutJob(config, hold=0).run([5])
+    env = make_env("panda", object=text(folder, "mug"))
+    env.reset(seed=5)
+    states = [env.get_state()]
+    for action in episode.columns["executed_action"][:20]:
+        env.step(action)
+        states.append(env.get_state())
+    one, other = Expert(env.scene), Expert(scene_of("panda", "pick_place", text(folder, "mug")))
+    backwards = [other.label(state).action for state in states[::-1]][::-1]
+    for state, action in zip(states, backwards, strict=True):
+        np.testing.assert_array_equal(one.label(state).action, action)
+
+
+def test_mass_and_friction_vary_and_the_hull_stays(folder):
+    env = make_env("panda", object=text(folder, "star"), conditions=[Condition("heavy", mass=(0.2, 0.2))])
+    env.reset(seed=0)
+    one, plain = env.scene.objects[OBJECT], env.scene.model
+    assert env.world.model.body_mass[one.body] == pytest.approx(0.2)
+    np.testing.assert_array_equal(env.world.model.geom_aabb, plain.geom_aabb)
+    assert env.scene.task.sizes is None
+
+
+def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
+    config = make_config("panda", object=f"{text(folder, 'mug')}:0.06")
+    before, spec = env_fingerprint(config), env_spec(config)
+    assert spec.object.startswith("mesh:mug.obj#")
+    assert spec.object.endswith(":0.06")
+    assert str(folder) not in f"{spec} {before}"
+    moved = tmp_path / "mug.obj"
+    moved.write_bytes((folder / "mug.obj").read_bytes())
+    assert env_fingerprint(make_config("panda", object=f"mesh:{moved}:0.06")) == before
+    assert not is_known("panda", "pick_place", spec.object)
+    with pytest.raises(UsageError, match=r"name alone is known here; give --task\.object=mesh:PATH/mug\.obj:0\.06"):
+        make_config("panda", object=spec.object)
+
+
+def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    mesh, few = text(folder, "bowl"), ["--workers=1", "--eval.n_episodes=2", "--eval.films=0", "--output_dir=e"]
+    words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
+    assert main(["record", f"--task.object={mesh}", *words]) == 0
+    assert main(["data", "check", "data"]) == 0
+    with pytest.raises(ManipError, match=r"give --task\.object=mesh:PATH/bowl\.obj$"):
+        open_source(tmp_path / "data")
+    assert main(["data", "relabel", "data", f"--task.object={mesh}", "--workers=1"]) == 0
+    assert (
+        main(["data", "relabel", "data", f"--task.object={text(folder, 'mug')}", "--workers=1", "--overwrite=true"])
+        == 1
+    )
+    assert main(["eval", "--policy.type=expert", f"--task.object={mesh}", *few]) == 0
+    capsys.readouterr()
+    assert main(["eval", "e", "--replay=4000000"]) in (1, 2)
+    assert "--task.object=mesh:PATH/bowl.obj" in capsys.readouterr().err
+    assert main(["eval", "e", "--replay=4000000", f"--task.object={mesh}"]) == 0
+
+
+def test_a_node_gets_the_file(folder, tmp_path):
+    path = write_mesh("wedge", tmp_path)
+    job = RolloutJob(make_config("panda", object=f"mesh:{path}"), hold=0)
+    [here], files = list(job.run([5])), {"wedge.obj": path.read_bytes()}
+    path.unlink()
+    away = replace(job, env=replace(job.env, object=f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}"))
+    [(there, _)] = pickle.loads(zstandard.decompress(run_there(manip_il.__version__, away, (5,), None, None, files)))
+    for name, column in here.without_pictures().columns.items():
+        np.testing.assert_array_equal(there.columns[name], column)
+
+
+def test_several_pieces_touch_in_place_of_the_hull(folder, monkeypatch):
+    """Stands in for `coacd`, which is not installed: two boxes of an L."""
+
+    class Coacd:
+        Mesh = staticmethod(lambda vertices, faces: vertices)
+        set_log_level = staticmethod(lambda level: None)
+
+        @staticmethod
+        def run_coacd(vertices, seed):
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+            for far in ((1.0, 0.025 / 0.06, 1.0), (0.025 / 0.07, 1.0, 1.0)):
+                yield trimesh.creation.box(bounds=[low, low + far * (high - low)]).vertices, None
+
+    monkeypatch.setitem(__import__("sys").modules, "coacd", Coacd)
+    config = make_config("panda", object=f"{text(folder, 'angle')}:coacd")
+    scene = scene_of("panda", "pick_place", config.object)
+    assert len(scene.objects[OBJECT].geoms) == 2
+    assert scene.model.geom_contype[scene.objects[OBJECT].geom] == 0
+    assert env_fingerprint(config) != env_fingerprint(make_config("panda", object=text(folder, "angle")))
+    assert all(episode.success for episode in RolloutJob(config, hold=0).run(range(3_000_000, 3_000_003)))
+
+
+def open_box(path: Path) -> None:
+    solid = trimesh.creation.box((0.05, 0.05, 0.05))
+    solid.update_faces(np.arange(len(solid.faces)) > 1)
+    solid.export(path)
+
+
+MISTAKES = {
+    "is not closed": (open_box, "own.obj", "own.obj is not closed: 4 of its edges are not shared by two faces"),
+    "is too wide": (
+        trimesh.creation.box((0.1, 0.09, 0.08)).export,
+        "own.stl",
+        "m wide, and the gripper of panda opens",
+    ),
+    "is in millimetres": (trimesh.creation.box((50, 40, 30)).export, "own.stl", "is 50 m long; expected 0.02 to 0.2 m"),
+    "has too many faces": (lambda path: path.write_bytes(b"\nf 1 2 3" * 1_000_000), "own.obj", "has 1,000,000 faces"),
+    "is not there": (lambda path: None, "own.obj", "own.obj does not exist; expected a mesh"),
+    "is no mesh": (lambda path: path.write_text("hello\n" * 20), "own.stl", "own.stl is no mesh"),
+    "is no file that is read": (lambda path: path.write_text("ply"), "own.ply", "FILE an STL or OBJ"),
+    "is flat": (
+        lambda path: path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n"),
+        "own.obj",
+        "has a volume of 0; expected a solid",
+    ),
+    "wants a package": (trimesh.creation.box((0.05, 0.05, 0.05)).export, "own.stl:coacd", "pip install coacd"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_mesh_that_cannot_be_used_is_one_line(case, tmp_path, capsys):
+    write, name, says = MISTAKES[case]
+    write(tmp_path / name.removesuffix(":coacd"))
+    mesh = f"--task.object=mesh:{tmp_path / name}"
+    assert main(["eval", "--policy.type=expert", mesh, f"--output_dir={tmp_path / 'e'}"]) == 2
+    error = capsys.readouterr().err
+    assert (error.count("\n"), says in error) == (1, True), error
