@@ -10,9 +10,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.robots.servos import ServoUnits
 
 F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ServoUnits:
+    """The way from [rad] and [m] to degrees and 0 to 100, and back.
+
+    openings: of the gripper [m], rising, (c,). percents: its servo's numbers there, 0 to 100, (c,).
+    """
+
+    openings: F64
+    percents: F64
+
+    def of(self, arm: F64, opening: float) -> tuple[F64, float]:
+        """Return degrees (n - 1,) and the gripper's number, 0 to 100, of joints (n - 1,) [rad] and an opening [m]."""
+        return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
+
+    def back(self, arm: F64, percent: float) -> tuple[F64, float]:
+        """Return joints (n - 1,) [rad] and opening [m] of degrees (n - 1,) and the gripper's number, 0 to 100."""
+        order = slice(None, None, 1 if self.percents[0] < self.percents[-1] else -1)  # as `interp` takes them
+        return np.radians(arm), float(np.interp(percent, self.percents[order], self.openings[order]))
 
 
 @dataclass(frozen=True, eq=False)

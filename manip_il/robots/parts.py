@@ -6,12 +6,17 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.errors import ManipError
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.reading import require_lengths
 
+F64 = NDArray[np.float64]
 TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
+RATE = 20  # control steps a second of a robot that says no other
+_MOST_HZ = 500
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 
 
@@ -126,3 +131,28 @@ class Costs:
     orientation: float = 0.2
     leaning: float = 0.04
     posture: float = 0.01
+
+
+@dataclass(frozen=True)
+class LeRobotConfig:
+    """A robot as LeRobot's recorder knows it.
+
+    robot_type: in `meta/info.json`. names: of its servos, the arm's from base to hand, then the gripper's. gripper:
+    where the gripper's driven joint stands at 0 and at 100 [rad]. fps: frames a second.
+    """
+
+    robot_type: str
+    names: tuple[str, ...]
+    gripper: tuple[float, ...]
+    fps: int = RATE
+
+    def __post_init__(self) -> None:
+        checks.name("robot_type", self.robot_type)
+        checks.whole("fps", self.fps, 1, _MOST_HZ)
+        if len(set(self.gripper)) != 2:
+            raise ManipError(f"gripper is {list(self.gripper)}; expected two places, at 0 and at 100 [rad]")
+
+    def percent(self, joint: F64) -> F64:
+        """Return the gripper's numbers, 0 to 100, where its driven joint stands at `joint` [rad]."""
+        at_0, at_100 = self.gripper
+        return 100 * (joint - at_0) / (at_100 - at_0)

@@ -7,9 +7,18 @@ from dataclasses import dataclass, field
 
 from manip_il.errors import ManipError, UnknownName
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.parts import TABLE_BEYOND, CameraPose, Costs, EndEffector, GripperConfig, Table, Workspace
+from manip_il.robots.parts import (
+    RATE,
+    TABLE_BEYOND,
+    CameraPose,
+    Costs,
+    EndEffector,
+    GripperConfig,
+    LeRobotConfig,
+    Table,
+    Workspace,
+)
 from manip_il.robots.reading import require_lengths
-from manip_il.robots.servos import RATE, LeRobotConfig
 
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
 FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # on the model, where the YAML does not say them

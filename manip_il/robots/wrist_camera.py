@@ -8,9 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.robots.motors import PLAIN
 from manip_il.robots.robot import Robot
-from manip_il.robots.spec import WRIST
+from manip_il.robots.spec import PLAIN, WRIST
 
 F64 = NDArray[np.float64]
 # In the `ee` frame, beside the hand and behind the fingertips, the first that sees is taken: side, and offset [m].

@@ -46,16 +46,10 @@ def context_class() -> Any:
 
 
 def remedy() -> str:
-    """Return what to do if no picture can be drawn: unset the variables that are in the way, else install OpenGL."""
-    backend, installed = _backend(), _installed()
-    in_the_way = {
-        "MUJOCO_GL": installed is not None and backend != installed,
-        "PYOPENGL_PLATFORM": os.environ.get("PYOPENGL_PLATFORM", "").lower() not in ("", backend),
-        "MUJOCO_EGL_DEVICE_ID": backend == "egl",
-        "__EGL_VENDOR_LIBRARY_FILENAMES": backend == "egl",
-    }
-    found = [f"{name}={os.environ[name]}" for name, is_wrong in in_the_way.items() if is_wrong and os.environ.get(name)]
-    return f"unset {' and '.join(found)}" if found else f"on Debian: apt-get install -y {PACKAGES}"
+    """Return what to do if no picture can be drawn: leave the choice to this program, else install OpenGL."""
+    if _backend() and _installed() not in (None, _backend()):
+        return f"unset MUJOCO_GL={os.environ['MUJOCO_GL']}"
+    return f"on Debian: apt-get install -y {PACKAGES}"
 
 
 def _backend() -> str:

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.action_space import ActionSpace, ServoUnits
 from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.parts import TABLE_BEYOND, CameraPose
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
-from manip_il.robots.servos import ServoUnits
 from manip_il.robots.spec import arm_spec, copy_options
 from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
