@@ -173,7 +173,7 @@ def open_line(found: Inverse) -> str:
     )
 
 
-def inverse_report(found: Inverse, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
+def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> Report:
     """Return the report of what was learnt."""
     weights = Section(
         "What a metre costs",
@@ -194,7 +194,6 @@ def inverse_report(found: Inverse, command: str, config: Mapping[str, Any], timi
         "weights that were learnt of them.",
         command=command,
         config=config,
-        timings=timings,
         sections=(weights, costs),
     )
 

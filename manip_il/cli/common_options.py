@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from manip_il.cli.options import Given, given
+from manip_il.cli.options import Given, Open, given
 from manip_il.errors import UsageError
-from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.policy_folder import find_policy, hub_hint
 from manip_il.option import option
 from manip_il.robots import ROBOTS
-from manip_il.sim.config import CameraConfig, Look
+from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.tasks import NAMES
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.stock import table as stock
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
     from manip_il.learn.checkpoint import Origin
 
+REWARD = "a reward of manip-il reward fit"
 SMALL_SIDE = 96  # of a picture that a policy learns from [pixels]
 SMALL = {"height": SMALL_SIDE, "width": SMALL_SIDE}
 _POLICYS = ("robot", "task", "control_hz", "object")  # what a policy says of its environment
@@ -54,23 +56,51 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
         values = of_policy | values
         if values.get("task") == origin.task:
             values.setdefault("object", origin.object)
-    robot, task = values.get("robot", EnvConfig.robot), values.get("task")
-    if robot != stock.ROBOT and task in stock.STOCK:
-        raise UsageError(f"--task.type={task} is with --robot.type={robot}; expected {stock.ROBOT}")
     return make_config(**values)
 
 
-def camera_config(
-    names: Iterable[str], sizes: Given, look: Look | None = None, *, small: bool = False
-) -> CameraConfig | None:
-    """Return the cameras of `--cameras` and `--image.*`, None for none; `UsageError` for a wrong value."""
-    chosen, sizes = tuple(names), (SMALL if small else {}) | sizes
-    return CameraConfig(chosen, **sizes, look=look or Look()) if chosen else None
+def camera_config(names: Iterable[str], sizes: Given, look: Look | None = None, *, small: bool = False) -> CameraConfig:
+    """Return the cameras of `--cameras`, by default all, and `--image.*`; `UsageError` for a wrong value."""
+    sizes = (SMALL if small else {}) | sizes
+    return CameraConfig(tuple(names) or CAMERAS, **sizes, look=look or Look())
 
 
 def image_given(*, small: bool = False) -> Any:
     """Return the field of `--image.*`. small: as a policy learns from pictures."""
     return given(CameraConfig, only=("height", "width"), defaults=SMALL if small else None)
+
+
+def exists(what: str) -> Callable[[Path], None]:
+    """Return the check of a path's option: it raises `UsageError` if nothing is there. what: is expected."""
+
+    def check(path: Path) -> None:
+        if not path.exists():
+            raise UsageError(f"{path} does not exist; expected {what}")
+
+    return check
+
+
+def require_dataset(root: Path) -> None:
+    """Raise `UsageError` unless `root` is a folder with a LeRobot dataset's `meta/info.json`."""
+    if not root.exists():
+        hint = hub_hint(root, "datasets/")
+        raise UsageError(f"{root} does not exist; expected the folder of a LeRobot dataset{hint}")
+    if not (root / "meta" / "info.json").is_file():
+        raise UsageError(f"{root} is not a LeRobot dataset: it has no meta/info.json")
+
+
+def require_eval(path: Path) -> None:
+    """Raise `UsageError` unless `path` is a file, an `eval.json`, or a folder that holds one."""
+    if not path.is_file() and not (path / "eval.json").is_file():
+        problem = "holds no eval.json" if path.exists() else "does not exist; expected an eval.json"
+        raise UsageError(f"{path} {problem} of manip-il eval; a policy to measure is given as --policy.path={path}")
+
+
+def start_policy(settings: Open) -> Open:
+    """Return `--policy.*` of what is fitted, with the `pretrained_model` folder that its `path` means."""
+    if "path" not in settings:
+        return settings
+    return settings | {"path": str(find_policy(Path(str(settings["path"])).expanduser()))}
 
 
 @dataclass
@@ -98,61 +128,34 @@ class TrialGroup:
     n_episodes: int = option(500, "test episodes, the same for both sides", at_least=1)
 
 
-def seed_option() -> Any:
-    """Return the field of `--seed`."""
-    return option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
-
-
-def processes_option() -> Any:
-    """Return the field of `--workers` of commands that run on this machine alone."""
-    return option(None, "processes; by default one per core", at_least=1, free=True)
-
-
-def trust_option() -> Any:
-    """Return the field of `--trust`, which only the command line may set."""
-    return option(False, _TRUST, command_line_only=True, free=True)
-
-
-def vary_option() -> Any:
-    """Return the field of `--vary`."""
-    return option(list, f"how worlds differ from episode to episode: {_CONDITIONS}, or YAMLs of ranges")
-
-
-def suite_option() -> Any:
-    """Return the field of `--suite`."""
-    names = f"nominal, disturbed, randomised, all; one condition of {_CONDITIONS}; or a YAML of ranges"
-    return option("nominal", names, check=_require_suite)
-
-
-def policy_option() -> Any:
-    """Return the field of a policy's path."""
-    return option(None, "a checkpoint or a run", check=find_policy)
-
-
 def _require_suite(suite: str) -> None:
     from manip_il.evaluation.suites import require_suite  # here, as help needs no numpy
 
     require_suite(suite)
 
 
+seed_option = partial(option, 0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
+processes_option = partial(option, None, "processes; by default one per core", at_least=1, free=True)
+trust_option = partial(option, False, _TRUST, command_line_only=True, free=True)
+vary_option = partial(option, list, f"how worlds differ from episode to episode: {_CONDITIONS}, or YAMLs of ranges")
+suite_option = partial(
+    option,
+    "nominal",
+    f"nominal, disturbed, randomised, all; one condition of {_CONDITIONS}; or a YAML of ranges",
+    check=_require_suite,
+)
+policy_option = partial(option, None, "a checkpoint or a run", check=find_policy)
+
+
 def own_names(robot: str, task: str, shape: str = "") -> str:
     """Return the options, after a space, that a next command needs for a robot, a task and a mesh that do not ship."""
-    from manip_il.sim.mesh import mesh_path, nameable  # here, as help needs no numpy
+    from manip_il.robots.table import get_robot  # here, as help needs no robot and no numpy
+    from manip_il.sim.mesh import mesh_path, nameable
 
-    given = [] if robot in (*ROBOTS, stock.ROBOT) else [f"--robot.type={_arm(robot)}"]
-    ships = task.partition(":")[0] in (*NAMES, *stock.STOCK, "unknown")
-    given += [] if ships else [f"--task.type={_file(task, '.py')}"]
-    given += [f"--task.object={nameable(shape)}"] if mesh_path(shape) else []
-    return "".join(f" {one}" for one in given)
-
-
-def _arm(robot: str) -> str:
-    """Return the robot that LeRobot records under this type, else the robot's file."""
-    from manip_il.robots.table import get_robot  # here, as help needs no robot
-
-    types = {servos.robot_type: name for name in ROBOTS if (servos := get_robot(name).lerobot) is not None}
-    return types.get(robot) or _file(robot, ".yaml")
-
-
-def _file(name: str, suffix: str) -> str:
-    return name if Path(name).suffix else name + suffix
+    own = ""
+    if robot not in (*ROBOTS, stock.ROBOT):
+        arms = {servos.robot_type: name for name in ROBOTS if (servos := get_robot(name).lerobot) is not None}
+        own = f" --robot.type={arms.get(robot) or Path(robot).with_suffix('.yaml')}"  # LeRobot has names of its own
+    if task.partition(":")[0] not in (*NAMES, *stock.STOCK, "unknown"):
+        own += f" --task.type={Path(task).with_suffix('.py')}"
+    return own + (f" --task.object={nameable(shape)}" if mesh_path(shape) else "")

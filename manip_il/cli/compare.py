@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import check_policies
 from manip_il.cli.options import Given, command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
@@ -112,6 +111,7 @@ class CompareOptions:
         both = tuple(arm.map(lambda one: one.select(rule)) for arm in both)
         trial = None
         if members[0].result is None:
+            from manip_il.cli.inputs import check_policies
             from manip_il.evaluation.runner import Trial
 
             policies = {one.name: one.policy for arm in both for one in arm.members if one.policy is not None}

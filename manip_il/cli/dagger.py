@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, check_labels
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import check_given, require_dataset, round_policy
+from manip_il.cli.common_options import require_dataset
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
-from manip_il.cli.progress import Stages, say, say_policy
+from manip_il.cli.progress import Stages, say
 from manip_il.data.json_lines import append_line, read_lines
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
-from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
     from manip_il.algorithms.run import Result
@@ -27,15 +25,6 @@ if TYPE_CHECKING:
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
 _OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
-
-
-@dataclass
-class GivenGroup:
-    """`--dataset.*` of what a run begins with."""
-
-    root: list[Path] = option(
-        list, "recorded demonstrations to begin with, in place of recording round 0's", check=require_dataset
-    )
 
 
 @dataclass
@@ -55,7 +44,12 @@ class DaggerOptions:
         "dagger",
         "who drives after round 0: the learner, the expert, the expert with noise like the learner's errors",
     )
-    dataset: GivenGroup = field(default_factory=GivenGroup)
+    datasets: list[Path] = option(
+        list,
+        "recorded demonstrations to begin with, in place of recording round 0's",
+        flag="dataset.root",
+        check=require_dataset,
+    )
     settings: Given = given(RunConfig, prefix="")
     query: str | None = option(
         None,
@@ -72,8 +66,6 @@ class DaggerOptions:
 
     def run(self) -> None:
         """Run, or go on with, all rounds."""
-        from manip_il.algorithms.run import best_result
-
         config = self.config()
         with self.output.open(self) as folder:
             kept = f"every finished episode and round, in {folder}"
@@ -86,12 +78,11 @@ class DaggerOptions:
             say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}")
         own = common.own_names(config.env.robot, config.env.task, config.env.object)
-        test = f"manip-il eval --policy.path={best}{own} --output_dir={folder}/test"
-        remedies = f"more --steps ({config.fit.total_steps:,} a round now), or more --demonstrations"
-        say_policy(best, best_result(results).validation, test, remedies)
+        say(f"best policy: {best}", f"next: manip-il eval --policy.path={best}{own} --output_dir={folder}/test")
 
     def config(self) -> RunConfig:
         """Return what `ImitationRun` takes; raises for what does not go together, or does not fit what is given."""
+        from manip_il.cli.inputs import check_given, round_policy
         from manip_il.collect.query import parse_query  # which imports numpy
         from manip_il.evaluation.suites import varied
 
@@ -105,7 +96,7 @@ class DaggerOptions:
             conditions=varied(self.vary, env, sees=cameras is not None),
             fit=FitConfig(**self.fit | of_fit),
             cameras=cameras,
-            datasets=tuple(self.dataset.root),
+            datasets=tuple(self.datasets),
             start=start,
             query_rule=None if self.query is None else parse_query(self.query),
             **self.settings,
@@ -118,12 +109,14 @@ class DaggerOptions:
         """Return observation and cameras: those given, else those of the policy to begin with."""
         observation = self.fit.get("observation")
         sees = self.fit.get("policy", {}).get("type") == "cnn" and observation != "state"
-        cameras = common.camera_config(self.cameras or CAMERAS if sees else self.cameras, self.image, small=True)
-        if start is None:
-            return observation, cameras
-        from manip_il.learn.checkpoint import Checkpoint, policy_cameras
+        given = self.cameras or sees
+        cameras = common.camera_config(self.cameras, self.image, small=True) if given else None
+        if start is not None:
+            from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 
-        return observation or Checkpoint.open(start).observation, cameras or policy_cameras(start)
+            observation = observation or Checkpoint.open(start).observation
+            cameras = cameras or policy_cameras(start)
+        return observation, cameras
 
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Result]:
@@ -134,15 +127,13 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
 
     fingerprint = env_fingerprint(config.env, config.cameras)
     write_json(folder / FINGERPRINT_FILE, fingerprint)
-    results: list[Result] = []
+    results, there = list[Result](), {record["round"] for record in read_lines(folder / METRICS_FILE)}
     for result in ImitationRun(config, folder, engine, stages.watch()).results():
         stages.close()
-        # Unless it is there from before an interruption, with the seconds of then.
-        if all(record.get("round") != result.number for record in read_lines(folder / METRICS_FILE)):
+        if result.number not in there:  # else from before an interruption, with the seconds of then
             append_line(folder / METRICS_FILE, result.to_json())
         results.append(result)
-        took = f"{sum(result.seconds.values()):.0f} s"
-        success = f"validation success {result.validation.success}"
+        success, took = f"validation success {result.validation.success}", f"{sum(result.seconds.values()):.0f} s"
         say(f"round {result.number}: {result.labels:,} labels, {success}, {took}")
         stages.check()
     return results
@@ -154,40 +145,29 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[Result]) ->
     from manip_il.evaluation.results import compare_results
     from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
 
-    best, folder = best_result(results), options.output.output_dir
-    kind = ALGORITHMS[config.method]
+    best, folder, kind = best_result(results), options.output.output_dir, ALGORITHMS[config.method]
     first = "cloning" if config.start is None else "the policy given"
     names = [f"{first} (round 0)", *(f"{kind}, round {result.number}" for result in results[1:])]
     rows = [
         PolicyRow(name, result.validation, result.labels, colour=DAGGER if result.number else CLONING)
         for name, result in zip(names, results, strict=True)
     ]
-    facts = []
+    success, facts = best.validation.success, tuple[str, ...]()
     if best.number > 0:
         comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.number]))
-        facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
+        facts = (f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.",)
     return run_report(
         rows,
         curves=[learning_curve(folder, kind)],
         title=f"{kind} on {config.env.robot} {config.env.task}",
-        verdict=best_verdict(names, results),
+        verdict=f"{names[best.number]} is chosen of {len(results)}: {success} success on {success.n:,} validation "
+        "episodes.",
         command=command_line("dagger", options),
-        facts=tuple(facts),
+        facts=facts,
         config=to_plain(options),
         fingerprint=best.validation.fingerprint,
         timings=round_timings(folder),
     )
-
-
-def best_verdict(names: Sequence[str], results: Sequence[Result]) -> str:
-    """Return which round is chosen, and its validation success. names: of the rounds."""
-    from manip_il.algorithms.run import best_result
-
-    best = best_result(results)
-    success = best.validation.success
-    if not success.successes:
-        return f"No round of {len(results)} succeeds in any of {success.n:,} validation episodes."
-    return f"{names[best.number]} is chosen of {len(results)}: {success} success on {success.n:,} validation episodes."
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> Curve:

@@ -9,29 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import exists, require_dataset
+from manip_il.cli.common_options import exists, require_dataset
 from manip_il.cli.options import Given, group
 from manip_il.cli.outputs import check_output, prepare_output
-from manip_il.cli.progress import Progress, say, warn
+from manip_il.cli.progress import progress, say, warn
 from manip_il.cli.record import left_out, require_repo_id
 from manip_il.data.atomic import exclusive
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
-from manip_il.sim.config import CAMERAS, Look
+from manip_il.sim.config import Look
 
 if TYPE_CHECKING:
     from manip_il.collect.edits import Source, Target
-    from manip_il.sim.config import CameraConfig
 
 _RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
-
-
-def _require_target(source: Path, target: Path, *, overwrite: bool) -> None:
-    """Raise `UsageError` unless TARGET is a new folder that neither holds the source nor lies in it."""
-    inside, outside = source.resolve(), target.resolve()
-    if inside.is_relative_to(outside) or outside.is_relative_to(inside):
-        raise UsageError(f"TARGET {target} overlaps SOURCE {source}; expected a folder of its own")
-    check_output(target, overwrite=overwrite)
 
 
 @dataclass
@@ -61,10 +52,8 @@ class BuildOptions:
         say(f"dataset: {self.dataset}")
         warn(*result.damaged)
         if result.damaged:
-            raise ManipError(
-                f"{len(result.damaged)} journal{'s' if len(result.damaged) > 1 else ''} could not be read: the dataset "
-                "lacks them; record them again by `manip-il record ... --resume=true`"
-            )
+            lacks = "the dataset lacks them; record them again by `manip-il record ... --resume=true`"
+            raise ManipError(f"journals that could not be read: {len(result.damaged)}; {lacks}")
 
 
 @dataclass
@@ -79,22 +68,18 @@ class MergeOptions:
     output: Path = option(MISSING, "folder of the new dataset")
     overwrite: bool = option(False, "replace an existing dataset")
 
-    def check(self) -> None:
-        """Refuse what the paths show to be wrong."""
-        if len(self.datasets) < 2:
-            raise UsageError(f"{self.datasets[0]} is the only one; expected two or more datasets to merge")
-        for path in self.datasets:
-            _require_target(path, self.output, overwrite=self.overwrite)
-
     def run(self) -> None:
         """Merge; the new dataset appears when it is whole."""
         from manip_il.data.build import local_id, merge_datasets
 
+        if len(self.datasets) < 2:
+            raise UsageError(f"{self.datasets[0]} is the only one; expected two or more datasets to merge")
+        for path in self.datasets:
+            check_output(self.output, path, overwrite=self.overwrite)
         with exclusive(self.output):
             prepare_output(self.output, overwrite=self.overwrite)
             info = merge_datasets(self.datasets, self.output, repo_id=local_id(self.output.absolute().name))
-        say(f"merged {info.episodes:,} episodes, {info.frames:,} frames")
-        say(f"dataset: {self.output}")
+        say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.output}")
 
 
 @dataclass
@@ -116,11 +101,11 @@ class EditGroup:
         from manip_il.collect.edits import Target, open_source
         from manip_il.collect.workers import default_workers
 
-        _require_target(root, folder, overwrite=self.overwrite)
+        check_output(folder, root, overwrite=self.overwrite)
         source = open_source(root, self.robot, self.task, self.object)
         warn(*source.warnings)
-        with exclusive(folder), Progress(pieces or source.dataset.info.episodes, what) as bar:
-            yield source, Target(folder, self.workers or default_workers(), self.overwrite, bar.advance)
+        with exclusive(folder), progress(pieces or source.dataset.info.episodes, what) as bar:
+            yield source, Target(folder, self.workers or default_workers(), self.overwrite, bar.step)
 
 
 @dataclass
@@ -132,7 +117,7 @@ class RenderOptions:
         MISSING, "a dataset of this program, with or without pictures", positional=True, check=require_dataset
     )
     target: Path = option(MISSING, "folder of the new dataset", positional=True)
-    cameras: list[str] = option(lambda: list(CAMERAS), common.CAMERAS_HELP)
+    cameras: list[str] = option(list, f"{common.CAMERAS_HELP}; by default all")
     image: Given = common.image_given()
     look: Look = field(default_factory=Look)
     edit: EditGroup = group(EditGroup(), prefix="")
@@ -141,11 +126,10 @@ class RenderOptions:
         """Render every episode; TARGET appears when all are there."""
         from manip_il.collect.edits import render_dataset
 
-        cameras = _cameras(self.cameras, self.image, self.look)
+        cameras = common.camera_config(self.cameras, self.image, self.look)
         with self.edit.open(self.source, self.target, f"render {self.source}") as (source, target):
             info = render_dataset(source, cameras, target)
-        say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames: {_pictures_text(cameras)}")
-        say(f"dataset: {self.target}")
+        say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.target}")
 
 
 @dataclass
@@ -193,7 +177,7 @@ class RedrawOptions:
     branch_steps: int = option(
         1, "control steps that the expert drives on from every scene, for act and diffusion", at_least=1
     )
-    cameras: list[str] = option(lambda: list(CAMERAS), common.CAMERAS_HELP)
+    cameras: list[str] = option(list, f"{common.CAMERAS_HELP}; by default all")
     image: Given = common.image_given(small=True)
     vary: list[str] = option(list, "how every frame looks: view, clutter, object (its colour), or YAMLs of ranges")
     seed: int = common.seed_option()
@@ -205,7 +189,7 @@ class RedrawOptions:
         from manip_il.collect.scenes import CHUNK, Scenes
         from manip_il.evaluation.suites import varied
 
-        cameras = _cameras(self.cameras, self.image, small=True)
+        cameras = common.camera_config(self.cameras, self.image, small=True)
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
         require_dataset(root)
         with self.edit.open(root, self.target, f"redraw {root}", -(-self.frames // CHUNK)) as (source, target):
@@ -213,18 +197,7 @@ class RedrawOptions:
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)
         left, drawn = self.frames - info.episodes, f"{info.episodes:,} scenes, {info.frames:,} frames"
-        say(f"redrew {drawn}: {_pictures_text(cameras)}; {left:,} left out, without a sound label")
-        say(f"dataset: {self.target}")
+        say(f"redrew {drawn}; {left:,} left out, without a sound label", f"dataset: {self.target}")
         policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
         train = f"manip-il train --dataset.root={self.target} --policy.type={policy}"
         say(f"next: {train} --output_dir=runs/{self.target.name}")
-
-
-def _cameras(names: list[str], sizes: Given, look: Look | None = None, *, small: bool = False) -> CameraConfig:
-    if (cameras := common.camera_config(names, sizes, look, small=small)) is None:
-        raise UsageError(f"--cameras names none; expected any of {', '.join(CAMERAS)}")
-    return cameras
-
-
-def _pictures_text(cameras: CameraConfig) -> str:
-    return f"{', '.join(cameras.names)}, {cameras.height} x {cameras.width} pixels"

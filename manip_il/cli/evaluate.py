@@ -6,11 +6,10 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import mean, pstdev
+from statistics import mean
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import open_driver, require_eval
 from manip_il.cli.options import Given, command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EvalResult
 
 EPISODES, MOST_EPISODES = 100, 10_000
-FILMS = "films"
 
 
 @dataclass
@@ -69,7 +67,7 @@ class EvalOptions:
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     first: ClassVar[str] = "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay resume"
     evaluation: list[Path] = option(
-        list, "evaluations that are there: one, with --replay, or several to merge", positional=True, check=require_eval
+        list, "evaluations: one, with --replay, or several to merge", positional=True, check=common.require_eval
     )
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
     env: Given = common.env_given(of_policy=True)
@@ -86,12 +84,12 @@ class EvalOptions:
 
     def check(self) -> None:
         """Refuse what does not go together."""
+        if self.replay is not None and len(self.evaluation) != 1:
+            raise UsageError("--replay is for an episode of one evaluation; give its EVALUATION first")
         if self.health or self.replay is not None:
-            if self.replay is not None and len(self.evaluation) != 1:
-                raise UsageError("--replay is for an episode of one evaluation; give its EVALUATION first")
             return
-        if self.evaluation and (len(self.evaluation) < 2 or len({*self.evaluation}) < len(self.evaluation)):
-            raise UsageError("expected two or more different evaluations to merge, or one and --replay=SEED")
+        if len(self.evaluation) == 1:
+            raise UsageError("expected two or more evaluations to merge, or one and --replay=SEED")
         if not self.evaluation and (self.policy.path is None) == (self.policy.type is None):
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
         if self.until_width is not None and not 0 < self.until_width < 1:
@@ -100,18 +98,16 @@ class EvalOptions:
 
     def run(self) -> None:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
-        from manip_il.cli import eval_files, health
+        from manip_il.cli import eval_files
 
         if self.health:
-            say(f"healthy: {health.healthy()}")
+            say(f"healthy: {eval_files.machine()}")
         elif self.replay is not None:
             own = {name: self.env[name] for name in ("task", "object") if self.env.get(name) is not None}
-            eval_files.replay(self.evaluation[0], self.replay, self.policy.path, self.video, own=own, trust=self.trust)
+            eval_files.replay(self.evaluation[0], self.replay, self.policy.path, self.video, own, trust=self.trust)
         elif self.evaluation:
             merged = eval_files.merge(self.evaluation)
             with self.output.open(self) as folder:
-                merged.write(folder / "eval.json")
-                self._print(merged)
                 self._report(merged, folder)
         else:
             self._evaluate()
@@ -132,17 +128,15 @@ class EvalOptions:
             finished_episodes(folder, job, suite)  # refuses another policy before anything runs
             with Stages(f"finished episodes, in {folder}") as stages, engine:
                 result = measure(engine, job, seeds, name, folder, stages, suite=suite, until_width=width)
-                self._print(result)
-                films = film_outcomes(engine, job, result, self.eval.films, folder / FILMS, stages)
+                films = film_outcomes(engine, job, result, self.eval.films, folder / "films", stages)
             self._report(result, folder, *films)
-        failed = [episode.seed for episode in result.episodes if not episode.success]
-        seed = (failed or [result.episodes[0].seed])[0]
-        own = common.own_names(
-            "panda", job.env.task, job.env.object
-        )  # a robot's file is in eval.json; a task's is given each time
+        seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
+        # a robot's file is in eval.json; a task's is given each time
+        own = common.own_names("panda", job.env.task, job.env.object)
         say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed}{own} --video=replay.mp4")
 
     def _job(self) -> RolloutJob:
+        from manip_il.cli.inputs import open_driver
         from manip_il.collect.job import RolloutJob
         from manip_il.evaluation.runner import episode_hold
         from manip_il.evaluation.suites import suite_conditions
@@ -153,24 +147,19 @@ class EvalOptions:
         hold, batch = episode_hold(env, self.eval.hold), self.eval.batch_size
         return RolloutJob(env, driver, hold, label="last", conditions=conditions, batch=batch)
 
-    def _print(self, result: EvalResult) -> None:
+    def _report(self, result: EvalResult, folder: Path, films: Sequence[Film] = (), no_films: str = "") -> None:
+        """Write the result and its page, and print its tables."""
+        from manip_il.evaluation.eval_report import eval_report
+        from manip_il.evaluation.results import FILE_NAME
         from manip_il.evaluation.tables import evaluation_table, print_table
 
+        result.write(folder / FILE_NAME)
+        page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films)
+        page.write(folder / REPORT_FILE)
         print_table(evaluation_table(result))
         if result.failures:
             phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
             say(f"failures by the phase that they ended in: {phases}")
         if result.robot == ROBOT:
-            returns = [episode.ret for episode in result.episodes]
-            say(f"return: {mean(returns):.2f}, standard deviation {pstdev(returns):.2f}")
-        if self.until_width is not None:
-            low, high = result.success.interval
-            width = f"the interval is {100 * (high - low):.2f} points wide"
-            say(f"stopped after {len(result.episodes):,} episodes: {width}")
-
-    def _report(self, result: EvalResult, folder: Path, films: Sequence[Film] = (), no_films: str = "") -> None:
-        from manip_il.evaluation.eval_report import eval_report
-
-        page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films)
-        page.write(folder / REPORT_FILE)
-        say(f"result: {folder / 'eval.json'}", f"report: {folder / REPORT_FILE}")
+            say(f"return: {mean(episode.ret for episode in result.episodes):.2f}")
+        say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

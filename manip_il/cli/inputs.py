@@ -1,66 +1,32 @@
-"""Datasets, policies and evaluations that a command is given, checked against this program."""
+"""Datasets, policies and rewards that a command is given, checked against this program.
+
+Commands import this module when they run, as it imports the environment and the learner.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from manip_il.cli.common_options import env_config
+from manip_il.algorithms.config import RunConfig
+from manip_il.cli.common_options import env_config, start_policy
 from manip_il.cli.options import Given, Open
 from manip_il.cli.progress import warn
+from manip_il.collect.drivers import Driver, PolicyDriver, driver_of
+from manip_il.collect.environments import env_fingerprint, env_spec, is_known
+from manip_il.data.dataset import Dataset
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.schema import SIM_STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.policy_folder import find_policy, hub_hint
-from manip_il.tasks.config import make_config
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.runner import Trial
+from manip_il.learn.checkpoint import Checkpoint, policy_cameras
+from manip_il.learn.sources import check_same_sources
+from manip_il.sim.config import CameraConfig
+from manip_il.tasks.config import EnvConfig, make_config
 
-if TYPE_CHECKING:  # the environment and the learner take a second to import
-    from manip_il.algorithms.config import RunConfig
-    from manip_il.collect.drivers import Driver
-    from manip_il.data.schema import RobotTaskSpec
-    from manip_il.evaluation.runner import Trial
-    from manip_il.learn.checkpoint import Checkpoint
-    from manip_il.learn.reward import LearnedReward
-    from manip_il.sim.config import CameraConfig
-    from manip_il.tasks.config import EnvConfig
-
-REWARD = "a reward of manip-il reward fit"
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
-
-
-def exists(what: str) -> Callable[[Path], None]:
-    """Return the check of a path's option: it raises `UsageError` if nothing is there. what: is expected."""
-
-    def check(path: Path) -> None:
-        if not path.exists():
-            raise UsageError(f"{path} does not exist; expected {what}")
-
-    return check
-
-
-def require_dataset(root: Path) -> None:
-    """Raise `UsageError` unless `root` is a folder with a LeRobot dataset's `meta/info.json`."""
-    if not root.exists():
-        hint = hub_hint(root, "datasets/")
-        raise UsageError(f"{root} does not exist; expected the folder of a LeRobot dataset{hint}")
-    if not (root / "meta" / "info.json").is_file():
-        raise UsageError(f"{root} is not a LeRobot dataset: it has no meta/info.json")
-
-
-def require_eval(path: Path) -> None:
-    """Raise `UsageError` unless `path` is a file, an `eval.json`, or a folder that holds one."""
-    if not path.is_file() and not (path / "eval.json").is_file():
-        problem = "holds no eval.json" if path.exists() else "does not exist; expected an eval.json"
-        raise UsageError(f"{path} {problem} of manip-il eval; a policy to measure is given as --policy.path={path}")
-
-
-def start_policy(settings: Open) -> Open:
-    """Return `--policy.*` of what is fitted, with the `pretrained_model` folder that its `path` means."""
-    if "path" not in settings:
-        return settings
-    path = settings["path"]
-    if not isinstance(path, str) or not path:
-        raise UsageError(f"--policy.path is {path!r}; expected a checkpoint or a run")
-    return {**settings, "path": str(find_policy(Path(path).expanduser()))}
 
 
 def round_policy(settings: Open) -> tuple[Open, Path | None]:
@@ -70,8 +36,6 @@ def round_policy(settings: Open) -> tuple[Open, Path | None]:
     """
     if "path" not in settings:
         return settings, None
-    from manip_il.learn.checkpoint import Checkpoint
-
     settings = start_policy(settings)
     start = Path(settings["path"])
     if (options := Checkpoint.open(start).mlp_options) is None:
@@ -83,12 +47,6 @@ def round_policy(settings: Open) -> tuple[Open, Path | None]:
 
 def check_given(config: RunConfig) -> None:
     """Raise `MismatchError` unless the datasets and the policy that a run begins with fit its environment."""
-    from manip_il.collect.environments import env_spec
-    from manip_il.data.dataset import Dataset
-    from manip_il.data.schema import SIM_STATE
-    from manip_il.learn.checkpoint import Checkpoint
-    from manip_il.learn.sources import check_same_sources
-
     recorded = None if config.redraw else config.cameras
     here, run = env_spec(config.env, recorded), f"{config.env.robot} {config.env.task} of this run"
     for root in config.datasets:
@@ -110,10 +68,6 @@ def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str
     name: of the dataset. Raises `MismatchError` if its numbers mean something else. A dataset of a user's own arm or
     task, whose name alone it holds, is not compared.
     """
-    from manip_il.collect.environments import env_fingerprint, env_spec, is_known
-    from manip_il.data.fingerprint import compare_fingerprints
-    from manip_il.data.schema import check_same_spec
-
     if not is_known(spec.robot, spec.task, spec.object):
         return []
     env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
@@ -132,9 +86,6 @@ def open_driver(
     policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or what was given of it:
     the rest is as the policy has it. device: of a checkpoint. Raises what `check_policy` raises.
     """
-    from manip_il.collect.drivers import PolicyDriver, driver_of
-    from manip_il.learn.checkpoint import Checkpoint
-
     if policy is None:
         return env_config(env) if isinstance(env, dict) else env, driver_of(kind), None
     checkpoint = Checkpoint.open(path := find_policy(policy))
@@ -147,10 +98,6 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
 
     Raises `MismatchError` unless the policy can drive `env`, `ManipError` if it names models to load without `trust`.
     """
-    from manip_il.collect.environments import env_fingerprint, env_spec
-    from manip_il.data.fingerprint import compare_fingerprints
-    from manip_il.learn.checkpoint import policy_cameras
-
     path, origin, cameras = checkpoint.path, checkpoint.origin, policy_cameras(checkpoint.path)
     spec = env_spec(env, cameras)
     checkpoint.check_fits(spec)
@@ -168,23 +115,8 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
 
 def check_policies(policies: Mapping[str, Path], trial: Trial) -> None:
     """Raise, before any episode runs, if one of the policies (name -> folder) cannot take a test."""
-    from manip_il.learn.checkpoint import Checkpoint
-
     for name, policy in policies.items():
         checkpoint = Checkpoint.open(policy)
         if checkpoint.origin is not None and checkpoint.origin.task != trial.env.task:
             raise MismatchError("task", name, checkpoint.origin.task, "the comparison", trial.env.task)
         check_policy(checkpoint, trial.env, trust=trial.trust)
-
-
-def load_reward(path: Path) -> LearnedReward:
-    """Return the reward in a folder of `fit`, or in its `pretrained_model`. Raises what `LearnedReward.load` raises."""
-    from manip_il.learn.reward import LearnedReward
-
-    return LearnedReward.load(reward_folder(path))
-
-
-def reward_folder(path: Path) -> Path:
-    """Return the `pretrained_model` folder that a path means."""
-    inner = path / "pretrained_model"
-    return inner if (inner / "config.json").is_file() else path

@@ -20,9 +20,11 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Union
 
+from manip_il.checks import parse_yaml
+
 Open = dict[str, Any]  # option -> value as YAML reads it
 Given = dict[str, Any]  # field -> value
-_EXPECTED = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
+_EXPECTED = {int: "a whole number", float: "a number", bool: "true or false", Path: "a path", Any: "YAML"}
 _METAVARS = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH"}
 
 
@@ -205,6 +207,8 @@ def decode(option_type: Any, value: Any) -> Any:
     import draccus  # here, as help needs no YAML
 
     some = without_none(option_type)
+    if option_type is Any:
+        return parse_yaml(value)
     if hasattr(some, "parse") and isinstance(value, str):
         return some.parse(value)
     if some == list[Path] and isinstance(value, str):

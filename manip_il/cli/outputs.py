@@ -62,6 +62,19 @@ class ResumableOutput(Output):
     resume: bool = option(False, "continue what was interrupted", free=True)
 
 
+@dataclass
+class OutputFile:
+    """File that a command writes."""
+
+    output: Path = option(MISSING, "the file")
+    overwrite: bool = option(False, "replace an existing file")
+
+    def check(self) -> None:
+        """Raise `UsageError` if something is there that may not be replaced."""
+        if self.output.is_dir() or (self.output.exists() and not self.overwrite):
+            raise UsageError(f"{self.output} exists already; choose another --output, or give --overwrite=true")
+
+
 def prepare_output(folder: Path, *, resume: bool = False, overwrite: bool = False) -> None:
     """Make sure that `folder` may be written to; on return it is absent or empty, unless `resume`.
 
@@ -77,11 +90,17 @@ def prepare_output(folder: Path, *, resume: bool = False, overwrite: bool = Fals
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def check_output(folder: Path, *, resume: bool = False, overwrite: bool = False, resumable: bool = False) -> None:
-    """Raise `UsageError` if `prepare_output` would fail; nothing is changed.
+def check_output(
+    folder: Path, source: Path | None = None, *, resume: bool = False, overwrite: bool = False, resumable: bool = False
+) -> None:
+    """Raise `UsageError` if `prepare_output` would fail, or the folder overlaps what is read; nothing is changed.
 
     `FolderExistsError` if the folder holds something that could be continued (resumable).
     """
+    if source is not None:
+        inside, outside = source.resolve(), folder.resolve()
+        if inside.is_relative_to(outside) or outside.is_relative_to(inside):
+            raise UsageError(f"{folder} overlaps {source}; expected a folder of its own")
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
     if folder.exists() and not folder.is_dir():
@@ -94,12 +113,6 @@ def check_output(folder: Path, *, resume: bool = False, overwrite: bool = False,
         raise FolderExistsError(folder)
     else:
         raise UsageError(f"{folder} exists already; replace it with --overwrite=true")
-
-
-def check_new_file(path: Path, overwrite: bool) -> None:
-    """Raise `UsageError` if a command may not write its file: something is there that it may not replace."""
-    if path.is_dir() or (path.exists() and not overwrite):
-        raise UsageError(f"{path} exists already; choose another --output, or give --overwrite=true")
 
 
 def save_options(folder: Path, options: Any) -> None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from manip_il import __version__
-from manip_il.checks import parse_yaml, read_yaml, shorten
+from manip_il.checks import read_yaml, shorten
 from manip_il.cli.options import (
     Option,
     choices,
@@ -103,30 +103,38 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
     rest = list(words)
     while rest:
         word = rest.pop(0)
-        name, equals, value = word.removeprefix("--").partition("=")
-        group = _open_group(name, known)
         if not word.startswith("--"):
             if not places or word.startswith("-"):
                 raise UsageError(f"unexpected {shorten(word)}; options are written --name=value, {_lists(command)}")
             option = places[0] if places[0].is_list else places.pop(0)
             before = said[option.name].value if option.is_list and option.name in said else []
             said[option.name] = _Said([*before, word] if option.is_list else word, option.label)
-        elif name in MOVED:
+            continue
+        name, equals, value = word[2:].partition("=")
+        name = name.replace("-", "_")  # as other programs write it
+        if name in MOVED:
             raise UsageError(f"--{name} has a new name: {MOVED[name]}{value or 'REWARD'}")
-        elif name == CONFIG_PATH:
-            config_paths.append(value if equals else _next_value(name, "a path", rest))
-        elif group:
-            said[name] = _Said(_as_yaml(value if equals else _next_value(name, "a value", rest), group), f"--{name}")
-        elif name not in known or known[name].positional or known[name].is_open:
-            raise _unknown_option("option", name, known, "--", command)
+        kind = Path if name == CONFIG_PATH else _type_of(name, known, command)
+        if not equals and kind is bool and (not rest or rest[0] not in ("true", "false")):
+            value = "true"
+        elif not equals:
+            if not rest or rest[0].startswith("--"):
+                raise UsageError(f"--{name} has no value; expected {expected(kind)}")
+            value = rest.pop(0)
+        if name == CONFIG_PATH:
+            config_paths.append(value)
         else:
-            kind = known[name].type
-            if not equals and kind is bool and (not rest or rest[0] not in ("true", "false")):
-                value = "true"
-            elif not equals:
-                value = _next_value(name, expected(kind), rest)
             said[name] = _Said(from_word(kind, value), f"--{name}")
     return said, config_paths
+
+
+def _type_of(name: str, known: Known, command: str) -> Any:
+    """Return the type of an option that is given by its name, `Any` of one in an open group."""
+    if _open_group(name, known):
+        return Any
+    if name not in known or known[name].positional or known[name].is_open:
+        raise _unknown_option("option", name, known, "--", command)
+    return known[name].type
 
 
 def _open_group(name: str, known: Known) -> str:
@@ -134,20 +142,6 @@ def _open_group(name: str, known: Known) -> str:
     if name in known:
         return ""
     return next((option.name for option in known.values() if option.is_open and name.startswith(f"{option.name}.")), "")
-
-
-def _as_yaml(word: str, group: str) -> Any:
-    try:
-        return parse_yaml(word)
-    except ValueError as error:
-        raise UsageError(f"--{group}: {shorten(word)} is not a YAML value: {error}") from error
-
-
-def _next_value(name: str, wanted: str, rest: list[str]) -> str:
-    """Take the value of `--name value` from `rest`."""
-    if not rest or rest[0].startswith("--"):
-        raise UsageError(f"--{name} has no value; expected {wanted}")
-    return rest.pop(0)
 
 
 def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _Said]:
@@ -178,8 +172,11 @@ def _make[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str
     values: dict[tuple[str, ...], Any] = {}
     for option in known.values():
         if option.is_open:
-            begin = f"{option.name}."
-            inside = {name.removeprefix(begin): one.value for name, one in said.items() if name.startswith(begin)}
+            inside = {
+                name.removeprefix(f"{option.name}."): _decode_said(Any, one)
+                for name, one in said.items()
+                if name.startswith(f"{option.name}.")
+            }
             if inside:
                 values[option.path] = ({} if option.default is MISSING else option.default) | inside
         elif option.name in said:
@@ -209,6 +206,8 @@ def _build[T](cls: type[T], values: Mapping[tuple[str, ...], Any], base: Any = N
 
 
 def _decode_said(option_type: Any, said: _Said) -> Any:
+    if option_type is Any and not said.is_word:
+        return said.value
     try:
         return decode(option_type, said.value)
     except ManipError:  # of a class that parses itself
@@ -223,26 +222,21 @@ def _decode_said(option_type: Any, said: _Said) -> Any:
 def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
     """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
 
-    kind: `option`, or which file's key. dashes: before the names. command: empty if none is known.
+    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or which file's key. dashes: before the names.
+    command: empty if none is known.
     """
     inside = [one.label for one in known.values() if one.label.startswith(f"--{name}.")]
     if inside:
         return UsageError(f"{dashes}{name} is a group of options; known: {', '.join(inside)}")
-    named = [one.name for one in known.values() if not (dashes and one.positional) and not one.is_open]
-    near = did_you_mean([dashes + one for one in nearest_options(name, named)])
-    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; {_lists(command)}")
-
-
-def nearest_options(name: str, known: Collection[str]) -> list[str]:
-    """Return the options that a name may have meant, nearest first: `num_episodes` finds `dataset.num_episodes`."""
     by_leaf: dict[str, list[str]] = {}
-    for option in known:
-        by_leaf.setdefault(option.rpartition(".")[2], []).append(option)
-    name = name.replace("-", "_")
-    leaf = name.rpartition(".")[2]
+    for one in known.values():
+        if not one.is_open and not (dashes and one.positional):
+            by_leaf.setdefault(one.name.rpartition(".")[2], []).append(one.name)
+    leaf, named = name.rpartition(".")[2], [one for names in by_leaf.values() for one in names]
     leaves = [leaf] if leaf in by_leaf else nearest_names(leaf, by_leaf)
-    of_leaf = [option for one in leaves for option in by_leaf[one]]
-    return list(dict.fromkeys([*of_leaf, *nearest_names(name, known)]))[:_FEW]
+    near = [*(one for found in leaves for one in by_leaf[found]), *nearest_names(name, named)]
+    offered = did_you_mean([dashes + one for one in list(dict.fromkeys(near))[:_FEW]])
+    return UsageError(f"unknown {kind} {shorten(dashes + name)}{offered}; {_lists(command)}")
 
 
 def _lists(command: str) -> str:

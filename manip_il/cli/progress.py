@@ -6,7 +6,8 @@ import os
 import signal
 import sys
 import time
-from pathlib import Path
+from collections.abc import Generator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from manip_il.errors import ManipError, UsageError, printable
 
 if TYPE_CHECKING:
     from manip_il.algorithms.run import Watch
-    from manip_il.evaluation.results import EpisodeResult, EvalResult
+    from manip_il.evaluation.results import EpisodeResult
     from manip_il.mdp import Episode
 
 INTERVAL = 5.0  # [s] between plain lines
@@ -40,95 +41,27 @@ def say(*lines: str) -> None:
         print(printable(line), flush=True)
 
 
-def say_policy(policy: Path, validation: EvalResult, test: str, remedies: str) -> None:
-    """Print where a run's best policy is and how to test it, or, if it never succeeded, what to try.
-
-    test: the command that tests it. remedies: what may help.
-    """
-    from manip_il.evaluation.eval_report import evaluation_verdict
-
-    if validation.success.successes:
-        say(f"best policy: {policy}", f"next: {test}")
-    else:
-        say(evaluation_verdict(validation), f"try in a new run: {remedies}")
-        say(f"failures by phase, with films: {test}")
-
-
 def warn(*lines: str) -> None:
     """Print warnings on standard error, one line each."""
     for line in lines:
         print(f"manip-il: warning: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 
 
-class Progress:
-    """Progress of `total` steps, None if the number is unknown; use as a context manager.
-
-    A bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing if progress is switched off.
-    """
-
-    def __init__(self, total: int | None, description: str):
-        from rich import progress
-        from rich.console import Console
-
-        columns = (
-            progress.TextColumn("{task.description}", markup=False),
-            progress.BarColumn(),
-            progress.MofNCompleteColumn(),
-            progress.TimeRemainingColumn(),
-            progress.TextColumn("{task.fields[details]}", markup=False),
-        )
-        # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
-        redirect, hidden = sys.stdout.isatty(), total == 0 or not has_bars()
-        console = Console(stderr=True)
-        self._bar = progress.Progress(*columns, console=console, redirect_stdout=redirect, disable=hidden)
-        self._bar.add_task(description, total=total, details="")
-        [self._task] = self._bar.tasks
-        self._fields: dict[str, object] = {}
-        self._start = self._printed = time.monotonic()
-
-    def __enter__(self) -> Progress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.stop()
-        if self.done:
-            self._print()
-
-    @property
-    def done(self) -> int:
-        """Steps so far."""
-        return int(self._task.completed)
-
-    def advance(self, n: int = 1, **fields: object) -> None:
-        """Add `n` steps; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
-        self._fields |= fields
-        texts = {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in self._fields.items()}
-        self._bar.update(self._task.id, advance=n, details=", ".join(f"{name} {text}" for name, text in texts.items()))
-        if time.monotonic() - self._printed >= INTERVAL:
-            self._print()
-
-    def _print(self) -> None:
-        self._printed = time.monotonic()
-        if self._bar.disable and not _quiet:
-            count = self.done if self._task.total is None else f"{self.done}/{self._task.total:.0f}"
-            rate = f"{self.done / max(self._printed - self._start, 1e-9):.3g}/s"
-            details = ", ".join(filter(None, [rate, self._task.fields["details"]]))
-            print(f"{self._task.description}: {count} ({details})", file=sys.stderr, flush=True)
-
-
 class Stages:
-    """One `Progress` at a time; use as a context manager.
+    """Progress of work in stages of so many steps; use as a context manager.
 
-    The first Ctrl-C or SIGTERM stops the work after the step in hand, the second at once. kept: what is safe on disk,
-    for the message to the user, also if the work fails.
+    A bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing if progress is switched off. The
+    first Ctrl-C or SIGTERM stops the work after the step in hand, the second at once. kept: what is safe on disk and
+    can be resumed, for the message to the user, also if the work fails.
     """
 
-    def __init__(self, kept: str):
+    def __init__(self, kept: str = ""):
         self.kept = kept
         self._stopping = False
         self._handlers: dict[int, Any] = {}
-        self._bar: Progress | None = None
+        self._bar: Any = None
+        self._fields: dict[str, object] = {}
+        self._began = self._printed = 0.0
         self._solved = 0
 
     def __enter__(self) -> Stages:
@@ -141,7 +74,7 @@ class Stages:
         self.close()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        if isinstance(error, ManipError | KeyboardInterrupt) and not isinstance(error, UsageError):
+        if self.kept and isinstance(error, ManipError | KeyboardInterrupt) and not isinstance(error, UsageError):
             said = f"{error}; " if error.args else ""
             error.args = (f"{said}kept: {self.kept}; continue with --resume=true",)
 
@@ -151,27 +84,56 @@ class Stages:
         self._stopping = True
         os.write(2, _STOPPING)  # print() may not be entered twice, and a signal can come inside one
 
-    def start(self, description: str, total: int) -> None:
-        """Close the bar of the stage before and open one of `total` episodes or steps."""
+    def start(self, description: str, total: int | None) -> None:
+        """Close the bar of the stage before and open one of `total` episodes or steps, None if that is unknown."""
+        from rich import progress
+        from rich.console import Console
+
         self.close()
         self.check()
-        self._solved = 0
-        self._bar = Progress(total, description).__enter__()
-
-    @property
-    def _done(self) -> int:
-        return self._bar.done if self._bar else 0
+        columns = (
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.fields[details]}", markup=False),
+        )
+        # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
+        redirect, hidden = sys.stdout.isatty(), total == 0 or not has_bars()
+        self._bar = progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=redirect, disable=hidden)
+        self._bar.add_task(description, total=total, details="")
+        self._bar.start()
+        self._fields, self._solved = {}, 0
+        self._began = self._printed = time.monotonic()
 
     def close(self) -> None:
         """Close the bar."""
         if self._bar is not None:
-            self._bar.__exit__()
+            self._bar.stop()
+            if self._done:
+                self._print()
             self._bar = None
 
+    @property
+    def _done(self) -> int:
+        return int(self._bar.tasks[0].completed) if self._bar else 0
+
+    def _print(self) -> None:
+        self._printed = time.monotonic()
+        if self._bar.disable and not _quiet:
+            task, rate = self._bar.tasks[0], f"{self._done / max(self._printed - self._began, 1e-9):.3g}/s"
+            count = self._done if task.total is None else f"{self._done}/{task.total:.0f}"
+            details = ", ".join(filter(None, [rate, task.fields["details"]]))
+            print(f"{task.description}: {count} ({details})", file=sys.stderr, flush=True)
+
     def step(self, n: int = 1, **fields: object) -> None:
-        """Count `n` steps that are done; `fields` say something of them."""
+        """Count `n` steps that are done; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
         if self._bar is not None:
-            self._bar.advance(n, **fields)
+            self._fields |= fields
+            texts = {name: f"{one:.4g}" if isinstance(one, float) else one for name, one in self._fields.items()}
+            self._bar.update(0, advance=n, details=", ".join(f"{name} {text}" for name, text in texts.items()))
+            if time.monotonic() - self._printed >= INTERVAL:
+                self._print()
         self.check()
 
     def episode(self, episode: Episode | EpisodeResult) -> None:
@@ -204,3 +166,11 @@ class Stages:
             on_log=self.log,
             on_step=self.step,
         )
+
+
+@contextmanager
+def progress(total: int | None, description: str) -> Generator[Stages]:
+    """Yield the progress of work of one stage, see `Stages.start`."""
+    with Stages() as stages:
+        stages.start(description, total)
+        yield stages

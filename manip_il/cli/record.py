@@ -13,7 +13,7 @@ from manip_il.cli.outputs import check_same_options, prepare_output, save_option
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -24,11 +24,7 @@ HOLD = 10  # control steps that a demonstration goes on for after success
 
 def require_repo_id(value: str) -> None:
     """Raise `UsageError` unless the value is USER/NAME: a folder is named after it."""
-    try:
-        checks.repo_id("repo_id", value)
-    except ManipError as error:
-        raise UsageError(str(error)) from None
-    if "/" not in value:
+    if "/" not in checks.repo_id("repo_id", value):
         raise UsageError(f"repo_id is {value!r}; expected USER/NAME")
 
 
@@ -79,32 +75,19 @@ class RecordOptions:
         with exclusive(root):
             prepare_output(root, resume=self.resume, overwrite=self.overwrite)
             prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
-            if self._is_complete(root, journals):
-                say(f"{root} holds its {self.dataset.num_episodes} episodes already")
-            else:
-                self._record(job, root, journals, repo_id)
+            if self.resume:
+                check_same_options(journals, self)
+            self._record(job, root, journals, repo_id)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 
     def _job(self) -> RolloutJob:
         from manip_il.collect.job import RolloutJob
         from manip_il.evaluation.suites import varied
 
-        env, cameras = common.env_config(self.env), common.camera_config(self.cameras, self.image)
+        env = common.env_config(self.env)
+        cameras = common.camera_config(self.cameras, self.image) if self.cameras else None
         conditions = varied(self.vary, env, sees=cameras is not None)
         return RolloutJob(env, hold=HOLD, cameras=cameras, conditions=conditions)
-
-    def _is_complete(self, root: Path, journals: Path) -> bool:
-        """Return whether a resumed recording is complete."""
-        from manip_il.data.dataset import Dataset
-
-        if not self.resume:
-            return False
-        check_same_options(journals, self)
-        if not root.is_dir() or not any(root.iterdir()):
-            return False
-        if not journals.is_dir():
-            raise ManipError(f"no {journals} to continue from; record {root} again with --overwrite=true")
-        return Dataset.open(root).info.episodes == self.dataset.num_episodes
 
     def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance, record

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from manip_il.cli.inputs import REWARD, exists, load_reward, require_dataset
+from manip_il.cli.common_options import REWARD, exists, require_dataset
 from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output, check_new_file
-from manip_il.cli.progress import Progress, say, warn
+from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile
+from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import write_file
+from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
 _PAIRS = "pairs.json of manip-il reward pairs"
@@ -36,37 +36,26 @@ class IrlOptions:
 
     def run(self) -> None:
         """Read, learn, write the reward and the page, print the weights."""
-        from manip_il.algorithms.inverse import (
-            FILE_NAME,
-            Inverse,
-            inverse_report,
-            open_line,
-            read_carried,
-            weight_table,
-        )
-        from manip_il.data.dataset import Dataset
+        from manip_il.algorithms import inverse
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
         from manip_il.rewards.methods import learn
         from manip_il.seeding import rng_for, stream_base
 
-        dataset, begin, timings = Dataset.open(self.dataset), time.monotonic(), dict[str, float]()
-        with Progress(dataset.info.episodes, f"irl {self.dataset}") as bar:
-            carried = read_carried(self.dataset, bar.advance)
-        timings["reading"] = time.monotonic() - begin
-        begin, rng = time.monotonic(), rng_for(stream_base("training", self.seed), "irl")
+        with progress(None, f"irl {self.dataset}") as bar:
+            carried = inverse.read_carried(self.dataset, bar.step)
+        rng = rng_for(stream_base("training", self.seed), "irl")
         learnt = learn(self.method, [one.demonstration for one in carried], rng)
-        timings["learning"] = time.monotonic() - begin
-        found = Inverse(str(self.dataset), tuple(carried), learnt)
+        found = inverse.Inverse(str(self.dataset), tuple(carried), learnt)
         with self.output.open(self) as folder:
-            write_json(folder / FILE_NAME, found.to_json())
-            inverse_report(found, command_line("reward irl", self), to_plain(self), timings).write(folder / REPORT_FILE)
-        print_table(weight_table(found))
-        if line := open_line(found):
+            write_json(folder / inverse.FILE_NAME, found.to_json())
+            page = inverse.inverse_report(found, command_line("reward irl", self), to_plain(self))
+            page.write(folder / REPORT_FILE)
+        print_table(inverse.weight_table(found))
+        if line := inverse.open_line(found):
             warn(line)
         say(f"report: {folder / REPORT_FILE}")
-        robot = "" if dataset.spec.robot == "panda" else f"--robot.type={dataset.spec.robot} "
-        say(f"next: manip-il eval --policy.type=expert {robot}--task.type=carry:{folder / FILE_NAME}")
+        say(f"next: manip-il eval --policy.type=expert --task.type=carry:{folder / inverse.FILE_NAME}")
 
 
 @dataclass
@@ -85,25 +74,25 @@ class PairsOptions:
         None, "choose those about which the networks of this reward disagree most", check=exists(REWARD)
     )
     seed: int = _seed("the choice")
-    output: Path = option(Path("pairs.json"), "the file")
-    overwrite: bool = option(False, "replace an existing file")
+    file: OutputFile = group(OutputFile(Path("pairs.json")), prefix="")
 
     def run(self) -> None:
         """Read the sources, choose, and write the pairs."""
         from manip_il.evaluation.results import write_json
+        from manip_il.learn.reward import LearnedReward
         from manip_il.preferences.frames import find_datasets
         from manip_il.preferences.pairs import choose_pairs
         from manip_il.seeding import rng_for, stream_base
 
-        check_new_file(self.output, self.overwrite)
-        reward = load_reward(self.reward) if self.reward else None
+        self.file.check()
+        reward = LearnedReward.load(find_policy(self.reward)) if self.reward else None
         rng = rng_for(stream_base("training", self.seed), "pairs")
         clips = choose_pairs(find_datasets(self.sources), self.clip, self.count, self.seed, rng, reward)
-        write_json(self.output, clips.pairs.to_json())
+        write_json(self.file.output, clips.pairs.to_json())
         if clips.too_short:
             warn(f"{clips.too_short:,} episodes are shorter than {self.clip} control steps: no clip is from them")
-        say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {self.output}")
-        say(f"next: manip-il reward ask {self.output} --output=ask.html")
+        say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {self.file.output}")
+        say(f"next: manip-il reward ask {self.file.output} --output=ask.html")
 
 
 @dataclass
@@ -116,22 +105,21 @@ class AskOptions:
 
     example: ClassVar[str] = "manip-il reward ask pairs.json --output=ask.html"
     pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
-    output: Path = option(Path("ask.html"), "the page")
+    file: OutputFile = group(OutputFile(Path("ask.html")), prefix="")
     robot: Path | None = option(None, "the YAML of the sources' robot, if that does not ship")
-    overwrite: bool = option(False, "replace an existing file")
 
     def run(self) -> None:
         """Render the films and write the page."""
         from manip_il.preferences.asking import render_films, render_page
         from manip_il.preferences.pairs import Pairs, read_clips
 
-        check_new_file(self.output, self.overwrite)
+        self.file.check()
         clips = read_clips(Pairs.read(self.pairs))
-        with Progress(len(clips.pairs), "render") as bar:
-            films = render_films(clips, str(self.robot) if self.robot else None, bar.advance)
+        with progress(len(clips.pairs), "render") as bar:
+            films = render_films(clips, str(self.robot) if self.robot else None, bar.step)
         page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
-        write_file(self.output, page.encode())
-        say(f"{len(clips.pairs):,} pairs, {len(page) / 1e6:.1f} MB: {self.output}")
+        write_file(self.file.output, page.encode())
+        say(f"{len(clips.pairs):,} pairs, {len(page) / 1e6:.1f} MB: {self.file.output}")
         say("open it in a browser, compare, and save the answers as preferences.json")
         say(f"next: manip-il reward fit {self.pairs} preferences.json --output_dir=runs/reward")
 
@@ -148,8 +136,7 @@ class AnswerOptions:
     pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
     teacher: str = option("perfect", "perfect, boltzmann[:1] or mistaken[:0.1]")
     seed: int = _seed("the teacher's chances")
-    output: Path = option(Path("preferences.json"), "the file")
-    overwrite: bool = option(False, "replace an existing file")
+    file: OutputFile = group(OutputFile(Path("preferences.json")), prefix="")
 
     def run(self) -> None:
         """Compare every pair and write the answers."""
@@ -159,15 +146,15 @@ class AnswerOptions:
         from manip_il.seeding import rng_for, stream_base
 
         teacher = Teacher.parse(self.teacher)
-        check_new_file(self.output, self.overwrite)
+        self.file.check()
         clips = read_clips(Pairs.read(self.pairs))
         rng = rng_for(stream_base("training", self.seed), "teacher")
         found = answer_pairs(teacher, clips, rng)
-        write_json(self.output, found.to_json())
+        write_json(self.file.output, found.to_json())
         given = [one.answer for one in found.answers]
         counts = ", ".join(f"{given.count(answer):,} {answer}" for answer in dict.fromkeys(sorted(given)))
-        say(f"{counts}: {self.output}")
-        say(f"next: manip-il reward fit {self.pairs} {self.output} --output_dir=runs/reward")
+        say(f"{counts}: {self.file.output}")
+        say(f"next: manip-il reward fit {self.pairs} {self.file.output} --output_dir=runs/reward")
 
 
 @dataclass
@@ -195,34 +182,29 @@ class FitOptions:
 
     def run(self) -> None:
         """Fit, measure on held-out pairs, write the reward."""
-        from manip_il.learn.reward import shape_for
+        from manip_il.data.dataset import Dataset
+        from manip_il.evaluation.results import write_json
+        from manip_il.learn.reward import shape_for, write_reward
+        from manip_il.learn.training_state import PRETRAINED_MODEL
         from manip_il.preferences.answers import Preferences, join_answers
         from manip_il.preferences.fitting import fit_answers, summary_lines
         from manip_il.preferences.pairs import Pairs, join_pairs, read_clips
         from manip_il.seeding import stream_base
 
         pairs = [Pairs.read(path) for path in (self.pairs, *self.more_pairs)]
-        given = [Preferences.read(path, pairs) for path in self.answers]
-        answers, clips = join_answers(given), read_clips(join_pairs(pairs))
-        with Progress(None, f"fit {len(answers.better):,} answers") as bar:
+        answers = join_answers([Preferences.read(path, pairs) for path in self.answers])
+        clips = read_clips(join_pairs(pairs))
+        with progress(None, f"fit {len(answers.better):,} answers") as bar:
             shape = shape_for(clips.frames[0].spec, self.members)
-            found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.advance)
+            found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.step)
+        fingerprint = Dataset.open(Path(clips.pairs.sources[0].root)).fingerprint
+        options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
         with self.output.open(self) as folder:
-            self._write(folder, found, clips)
+            target = folder / PRETRAINED_MODEL
+            target.mkdir(parents=True, exist_ok=True)
+            write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
+            write_json(folder / "fit.json", found.to_json())
         say(*summary_lines(found, answers))
         if answers.contradictory:
             warn(f"{answers.contradictory:,} pairs are answered left and right: both answers count")
         say(f"next: manip-il data score DATASET --reward={folder} --output_dir=runs/scores")
-
-    def _write(self, folder: Path, found: Any, clips: Any) -> None:
-        from manip_il.data.dataset import Dataset
-        from manip_il.evaluation.results import write_json
-        from manip_il.learn.reward import write_reward
-        from manip_il.learn.training_state import PRETRAINED_MODEL
-
-        target = folder / PRETRAINED_MODEL
-        target.mkdir(parents=True, exist_ok=True)
-        fingerprint = Dataset.open(Path(clips.pairs.sources[0].root)).fingerprint
-        options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
-        write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
-        write_json(folder / "fit.json", found.to_json())

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from manip_il import checks
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import exists, open_driver
+from manip_il.cli.common_options import exists
 from manip_il.cli.options import Given, command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output, check_new_file
-from manip_il.cli.progress import Progress, say, warn
+from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile
+from manip_il.cli.progress import progress, say
 from manip_il.errors import ManipError, RenderError
 from manip_il.option import option
 from manip_il.tasks import NAMES
-
-if TYPE_CHECKING:
-    from manip_il.evaluation.robot_check import RobotCheck
 
 PAGE = "check.html"
 
@@ -41,39 +37,27 @@ class RobotNewOptions:
 
     def run(self) -> None:
         """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
+        from manip_il.collect.workers import Engine
         from manip_il.data.atomic import write_file
-        from manip_il.evaluation.robot_check import advice, verdict
+        from manip_il.evaluation.robot_check import advice, check_robot, verdict
         from manip_il.robots.suggest import suggest, yaml_of
 
         target = self.output or self.model.with_suffix(".yaml")
         checks.name(f"the name of {target}, which will be the robot's,", target.stem)
-        check_new_file(target, self.overwrite)
+        OutputFile(target, self.overwrite).check()
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
         found = suggest(self.model, self.gripper)
-        text = yaml_of(found, *paths)
-        write_file(target, text.encode())
+        write_file(target, yaml_of(found, *paths).encode())
         try:
-            checked = _measure(str(target), list(NAMES), 0)
+            with Engine(None) as engine:
+                checked = check_robot(str(target), list(NAMES), 0, engine, lambda _: None)
         except ManipError as error:
             raise ManipError(f"wrote {target}, which cannot be used yet: {error}") from None
-        except BaseException:
-            target.unlink(missing_ok=True)
-            raise
         say(f"wrote {target}. {verdict(checked)}")
         say(*(f"change: {line}" for line in advice(checked)))
         if len(checked.failed) == len(NAMES):
             raise ManipError(f"wrote {target}, with which no task can be done yet; see above")
         say(f"look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
-
-
-def _measure(
-    robot: str, tasks: Sequence[str], episodes: int, on_result: Callable[[object], object] = lambda _: None
-) -> RobotCheck:
-    from manip_il.collect.workers import Engine
-    from manip_il.evaluation.robot_check import check_robot
-
-    with Engine(None) as engine:
-        return check_robot(robot, tasks, episodes, engine, on_result)
 
 
 @dataclass
@@ -94,8 +78,10 @@ class RobotCheckOptions:
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` if a task cannot be done."""
+        from manip_il.collect.workers import Engine
+        from manip_il.evaluation import robot_check
         from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.robot_check import FILE_NAME, check_report, looks
+        from manip_il.evaluation.tables import print_table
         from manip_il.robots.gripper import sweep
         from manip_il.robots.table import get_robot
         from manip_il.tasks.table import get_task
@@ -105,36 +91,22 @@ class RobotCheckOptions:
         for task in tasks:
             get_task(task)
         with self.output.open(self) as folder:
-            with Progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
-                found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
-            write_json(folder / FILE_NAME, found.to_json(), indent=2)
+            with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar, Engine(None) as engine:
+                found = robot_check.check_robot(self.robot, tasks, self.episodes, engine, lambda _: bar.step())
+            write_json(folder / robot_check.FILE_NAME, found.to_json(), indent=2)
             try:
-                pictures, no_pictures = looks(self.robot), ""
+                pictures, no_pictures = robot_check.looks(self.robot), ""
             except RenderError as error:
                 pictures, no_pictures = (), str(error)
-                warn(f"the page has no pictures: {error}")
-            report = check_report(found, pictures, no_pictures, command_line("robot check", self), to_plain(self))
-            report.write(folder / PAGE)
-        self._say(found)
+            made_by = (command_line("robot check", self), to_plain(self))
+            robot_check.check_report(found, pictures, no_pictures, *made_by).write(folder / PAGE)
+        say(robot_check.home_line(found))
+        print_table(robot_check.task_table(found))
+        say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
         say(f"page: {folder / PAGE}")
         if found.failed:
             names = ", ".join(task.name for task in found.failed)
             raise ManipError(f"{self.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
-
-    def _say(self, found: RobotCheck) -> None:
-        from manip_il.evaluation.robot_check import advice, home_line, task_table, verdict
-        from manip_il.evaluation.tables import print_table
-
-        say(home_line(found))
-        print_table(task_table(found))
-        say(verdict(found), *(f"change: {line}" for line in advice(found)))
-
-
-@dataclass
-class VisitorGroup:
-    """`--policy.*` of the policy whose visited states the expert takes over in."""
-
-    path: Path | None = common.policy_option()
 
 
 @dataclass
@@ -146,7 +118,7 @@ class CertifyOptions:
 
     example: ClassVar[str] = "manip-il robot certify --policy.path=runs/dagger --output_dir=runs/certificate"
     first: ClassVar[str] = "policy.path robot.type task.type cases output_dir"
-    policy: VisitorGroup = field(default_factory=VisitorGroup)
+    policy: Path | None = common.policy_option(flag="policy.path")
     env: Given = common.env_given(of_policy=True)
     cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)
     seed: int = common.seed_option()
@@ -156,18 +128,19 @@ class CertifyOptions:
 
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
+        from manip_il.cli.inputs import open_driver
         from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
         from manip_il.evaluation.policy_folder import find_policy
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
 
-        env, *_ = open_driver(self.policy.path, "expert", self.env, trust=self.trust)
-        policy = find_policy(self.policy.path) if self.policy.path else None
-        engine, count = self.engine.open(), count_episodes(env, self.cases, policy)
+        env, *_ = open_driver(self.policy, "expert", self.env, trust=self.trust)
+        policy = find_policy(self.policy) if self.policy else None
+        count = count_episodes(env, self.cases, policy)
         with self.output.open(self) as folder:
-            with Progress(count, f"certify {env.robot} {env.task}") as bar, engine:
-                advance = bar.advance
-                certificate = certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)
+            with progress(count, f"certify {env.robot} {env.task}") as bar, self.engine.open() as engine:
+                arguments = (engine, env, self.cases, self.seed, policy, lambda _: bar.step())
+                certificate = certify(*arguments, trust=self.trust)
             write_json(folder / FILE_NAME, certificate.to_json(), indent=None)
             certificate.report(command_line("robot certify", self), to_plain(self)).write(folder / REPORT_FILE)
         print_table(certificate.table(), empty="-")

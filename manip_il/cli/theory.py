@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import exists
+from manip_il.cli.common_options import exists
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output
-from manip_il.cli.progress import Progress, say
+from manip_il.cli.progress import progress, say
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -44,25 +43,13 @@ class TheoryOptions:
         from manip_il.evaluation.tables import print_table
         from manip_il.theory.bounds import all_curves
         from manip_il.theory.linear import drifts
-        from manip_il.theory.processes import PROCESSES
         from manip_il.theory.report import FILE_NAME, Theory, slope_table, theory_report
 
-        timings, begin = dict[str, float](), time.monotonic()
         with self.output.open(self) as folder:
-            shift = None
-            if self.source is not None:
-                shift = self._shift(self.source)
-                timings["the run"] = time.monotonic() - begin
-            begin, curves = time.monotonic(), []
-            with Progress(2 * len(PROCESSES), "theorems") as bar:
-                for curve in all_curves():
-                    curves.append(curve)
-                    bar.advance()
-            theory = Theory(tuple(curves), tuple(drifts()), shift)
-            timings["theorems"] = time.monotonic() - begin
+            shift = self._shift(self.source) if self.source else None
+            theory = Theory(tuple(all_curves()), tuple(drifts()), shift)
             write_json(folder / FILE_NAME, theory.to_json())
-            report = theory_report(theory, command_line("theory", self), to_plain(self), timings)
-            report.write(folder / REPORT_FILE)
+            theory_report(theory, command_line("theory", self), to_plain(self)).write(folder / REPORT_FILE)
         print_table(slope_table(theory))
         say(f"policies above their bound: {theory.above}")
         say(f"report: {folder / REPORT_FILE}")
@@ -76,6 +63,6 @@ class TheoryOptions:
         rounds = find_rounds(run)
         env = read_arm(run).members[0].env()
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
-        with Progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
-            certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.advance())
-            return measure_shift(engine, env, rounds, certificate.mu or 0, self.episodes, lambda _: bar.advance())
+        with progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
+            certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.step())
+            return measure_shift(engine, env, rounds, certificate.mu or 0, self.episodes, lambda _: bar.step())

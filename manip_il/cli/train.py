@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import dataset_differences, exists, require_dataset, start_policy
+from manip_il.cli.common_options import exists, require_dataset, start_policy
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
-from manip_il.cli.progress import Progress, Stages, say, set_quiet, warn
+from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
@@ -61,36 +62,26 @@ class TrainOptions:
     trust: bool = common.trust_option()
     output: ResumableOutput = group(ResumableOutput(Path("runs/train")), prefix="")
 
-    def check(self) -> None:
-        """Refuse what does not go together, datasets that lack what the policy looks at, and a folder that is taken."""
-        if self.weights is not None and len(self.dataset.root) > 1:
-            raise UsageError("--weights is for the frames of one dataset; give one --dataset.root")
-        from manip_il.data.info import read_info
-        from manip_il.learn.sources import input_columns  # at once, before LeRobot is imported, which takes seconds
-
-        config = self._fit_config()
-        for root in self.dataset.root:
-            input_columns(config, root, read_info(root))
-        if _is_first_process():
-            self.output.check()
-
     def run(self) -> None:
         """Read the datasets, fit, and say where the checkpoint is."""
         from manip_il.learn.lerobot_config import lerobot_options
 
-        if not _is_first_process():
+        writes = os.environ.get(RANK, "0") == "0"  # whether this is the one of several processes that does
+        if not writes:
             set_quiet(True)
-        config, folder = self._fit_config(), self.output.output_dir
+        config, folder = self.config(), self.output.output_dir
         options, _ = lerobot_options(config)  # refuses what LeRobot would, before anything is written
         sources = self._sources(config)
-        weights = self._frame_weights(getattr(options.policy, "chunk_size", None), sources.datasets[0])
-        with self.output.open(self) if _is_first_process() else contextlib.nullcontext():
+        weights = self._frame_weights(getattr(options.policy, "chunk_size", None), sources.datasets)
+        with self.output.open(self) if writes else contextlib.nullcontext():
             path = self._fit(config, options.save_freq, sources, weights)
-        if _is_first_process():
-            own = common.own_names(sources.spec.robot, sources.spec.task, sources.spec.object)
-            say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path}{own} --output_dir={folder}/eval")
+        if writes:
+            own_names = common.own_names(sources.spec.robot, sources.spec.task, sources.spec.object)
+            say(f"checkpoint: {path}")
+            say(f"next: manip-il eval --policy.path={path}{own_names} --output_dir={folder}/eval")
 
-    def _fit_config(self) -> FitConfig:
+    def config(self) -> FitConfig:
+        """Return what the trainer takes; `UsageError` for what does not go together."""
         from manip_il.seeding import stream_base
 
         policy, seed = start_policy(self.fit.get("policy", {})), stream_base("training", self.seed)
@@ -98,28 +89,32 @@ class TrainOptions:
         return FitConfig(**self.fit | own)
 
     def _sources(self, config: FitConfig) -> Sources:
-        """Return the datasets, which must agree with the first."""
+        """Return the datasets, which must agree with the first and have what the policy looks at."""
+        from manip_il.cli.inputs import dataset_differences
         from manip_il.data.dataset import Dataset
         from manip_il.learn.names import PLAIN
-        from manip_il.learn.sources import Sources, check_same_sources
+        from manip_il.learn.sources import Sources, check_same_sources, input_columns
 
         sources = Sources(tuple(map(Dataset.open, self.dataset.root)), tuple(self.dataset.weights))
         specs, language = [one.spec for one in sources.datasets], config.kind not in PLAIN
         check_same_sources(sources.roots, specs, pictures=config.takes_images, language=language)
         for one in sources.datasets:
+            seen = input_columns(config, one.root, one.info)
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
-            odd = [key for key in one.cameras if config.takes_images and not one.features[key].is_rgb]
+            odd = [key for key in one.cameras if config.takes_images and key not in seen]
             warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
         return sources
 
-    def _frame_weights(self, chunk: int | None, dataset: Dataset) -> NDArray[np.float64] | None:
+    def _frame_weights(self, chunk: int | None, datasets: Sequence[Dataset]) -> NDArray[np.float64] | None:
         """Return how often each frame is drawn, relative to the others, (N,); None if all are drawn alike."""
         if self.weights is None:
             return None
+        if len(datasets) > 1:
+            raise UsageError("--weights is for the frames of one dataset; give one --dataset.root")
         from manip_il.learn.samples import rabc_weights
 
-        episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
-        weights = rabc_weights(self.weights, episodes, chunk or int(dataset.fps))
+        episodes = datasets[0].columns(["episode_index"])["episode_index"].astype("int64")
+        weights = rabc_weights(self.weights, episodes, chunk or int(datasets[0].fps))
         say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         return weights
 
@@ -128,13 +123,8 @@ class TrainOptions:
 
         folder, resume = self.output.output_dir, self.output.resume
         pictures = sum(len(one) * len(one.cameras) for one in sources.datasets) if config.takes_images else 0
-        with Progress(pictures, "decode pictures, once") as bar:
-            trainer = Trainer(sources, config, folder, resume=resume, on_frames=bar.advance, weights=weights)
+        with progress(pictures, "decode pictures, once") as bar:
+            trainer = Trainer(sources, config, folder, resume=resume, on_frames=bar.step, weights=weights)
         with Stages(f"every finished checkpoint in {folder} (one every {save_freq:,} steps)") as stages:
             stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
             return trainer.fit(stages.log)
-
-
-def _is_first_process() -> bool:
-    """Whether this is the one of several processes (`accelerate launch`, `torchrun`) that writes."""
-    return os.environ.get(RANK, "0") == "0"

@@ -65,7 +65,7 @@ def slope_table(theory: Theory) -> Table:
     )
 
 
-def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timings: Mapping[str, float]) -> Report:
+def theory_report(theory: Theory, command: str, config: Mapping[str, Any]) -> Report:
     """Return the report of all that was found."""
     sections = [_theorems(theory), _linear(theory)]
     facts = [
@@ -84,7 +84,6 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any], timin
         facts=tuple(facts),
         command=command,
         config=config,
-        timings=timings,
         sections=tuple(sections),
     )
 

@@ -18,25 +18,17 @@ from ..learn.tiny_policies import write_checkpoint
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 
 
-@pytest.mark.parametrize("name", ["gail", "airl"])
 @pytest.mark.parametrize(
-    ("words", "says", "code"),
+    ("words", "says"),
     [
-        ("", "--dataset.root is missing", 2),
-        ("--dataset.root=nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
-        (f"--dataset.root={SAMPLE} --init=nowhere", "no policy in nowhere", 2),
-        (f"--dataset.root={SAMPLE} --steps=0", "steps is 0; expected at least 1", 2),
-        (f"--dataset.root={SAMPLE} --ppo.gamma=2", "ppo.gamma is 2.0; expected 0 to 1", 2),
-        (
-            f"--dataset.root={SAMPLE} --discriminator.penalty=-1",
-            "discriminator.penalty is -1.0; expected at least 0",
-            2,
-        ),
-        (f"--dataset.root={SAMPLE} --seed=-1", "seed is -1", 2),
+        ("", "--dataset.root is missing"),
+        (f"--dataset.root={SAMPLE} --init=nowhere", "no policy in nowhere"),
+        (f"--dataset.root={SAMPLE} --ppo.gamma=2", "ppo.gamma is 2.0; expected 0 to 1"),
+        (f"--dataset.root={SAMPLE} --discriminator.penalty=-1", "discriminator.penalty is -1.0; expected at least 0"),
     ],
 )
-def test_bad_input_is_one_line(name, words, says, code, here, error):
-    assert main(["rl", name, *words.split(), "--quiet"]) == code
+def test_bad_input_is_one_line(words, says, here, error):
+    assert main(["rl", "airl", *words.split(), "--quiet"]) == 2
     assert says in error()
     assert not any(here.glob("runs/*/checkpoints"))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -13,13 +12,11 @@ import sys
 import time
 from dataclasses import MISSING
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from manip_il.cli.dagger import DaggerOptions, best_verdict
+from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.demo import demo_verdict
 from manip_il.cli.main import load, main
 from manip_il.cli.options import command_line, options_of
@@ -87,13 +84,10 @@ def test_record_writes_successes_and_their_provenance(demos):
     assert Dataset.open(demos).provenance["seeds"] == [1_000_000, 1_000_002]
 
 
-def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp_path, capsys, error):
+def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp_path, error):
     assert main(record(tmp_path / "d", 2)) == 0
     assert main(record(tmp_path / "d", 3, "--resume=true")) == 0
     assert files(tmp_path / "d") == files(demos)
-    capsys.readouterr()
-    assert main(record(tmp_path / "d", 3, "--resume=true")) == 0
-    assert "3 episodes already" in capsys.readouterr().out
     assert main(record(tmp_path / "d", 3, "--resume=true", "--seed=1")) == 1
     assert "--seed differs" in error()
 
@@ -176,9 +170,9 @@ def test_the_demo_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
     assert "report: " in out
     page = (tmp_path / "q" / "report.html").read_text()
     assert all(name in page for name in ("expert", "cloning, as many labels", "DAgger (round"))
-    before = files(tmp_path / "q" / "evaluation")
+    before = files(tmp_path / "q" / "evaluations")
     assert main([*words, "--resume=true"]) == 0
-    assert files(tmp_path / "q" / "evaluation") == before
+    assert files(tmp_path / "q" / "evaluations") == before
 
 
 def test_a_command_line_can_be_copied_from_a_report():
@@ -186,27 +180,9 @@ def test_a_command_line_can_be_copied_from_a_report():
     assert command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"
 
 
-NAMES = ["cloning (round 0)", "DAgger, round 1"]
-
-
 def result(successes: int, n: int) -> EvalResult:
     episodes = tuple(EpisodeResult(seed, seed < successes, seed < successes, 5, 0.0) for seed in range(n))
     return EvalResult("p", "panda", "reach", {}, episodes, EvalSettings(100, 0.02))
-
-
-def rounds(*successes: int, n: int) -> list[Any]:
-    return [SimpleNamespace(number=index, validation=result(count, n)) for index, count in enumerate(successes)]
-
-
-@pytest.mark.parametrize(
-    ("successes", "verdict"),
-    [
-        ((0, 0), r"No round of 2 succeeds in any of 4 validation episodes\."),
-        ((1, 1), r"DAgger, round 1 is chosen of 2: 25\.0 % .* success on 4 validation episodes\."),
-    ],
-)
-def test_the_verdict_names_the_best_round(successes, verdict):
-    assert re.fullmatch(verdict, best_verdict(NAMES, rounds(*successes, n=4)))
 
 
 def test_the_demo_says_where_nothing_is_shown():

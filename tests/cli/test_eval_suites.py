@@ -104,8 +104,7 @@ def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys, error):
 
 def test_until_width_stops_early(here, capsys, error):
     words = ["--policy.type=random", "--task.type=reach", *SMALL, "--env.horizon=5", "--eval.n_episodes=300"]
-    assert evaluate("e", *words, "--until_width=0.1") == 0
-    assert "stopped after 100 episodes" in capsys.readouterr().out
+    assert evaluate("e", *words, "--until-width=0.1") == 0
     result = EvalResult.read(Path("e"))
     assert (len(result.episodes), result.until_width) == (100, 0.1)
     low, high = result.success.interval

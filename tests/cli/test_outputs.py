@@ -17,8 +17,6 @@ from manip_il.cli.train import SourceGroup, TrainOptions
 from manip_il.data.atomic import exclusive, write_file
 from manip_il.errors import FolderExistsError, MismatchError, UsageError
 
-from .made_runs import make_eval
-
 
 @pytest.fixture
 def ours(tmp_path):
@@ -109,25 +107,14 @@ def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monk
 SAMPLE = Path(__file__).resolve().parents[2] / "datasets" / "sample"
 COMMANDS = {
     "eval": ["--policy.type=expert", "--robot.type=fetch", "--task.type=reach", "--workers=1"],
-    "dagger": [],
     "train": [f"--dataset.root={SAMPLE}", "--steps=1"],
-    "compare": ["left.json", "right.json"],
     "robot certify": ["--robot.type=fetch", "--task.type=reach", "--workers=1"],
-    "demo": [],
 }
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    make_eval(tmp_path / "left.json", [True, False])
-    make_eval(tmp_path / "right.json", [False, False], seed=4_000_002)
-    return tmp_path
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_folder_that_holds_something_is_refused(command, here, error):
-    words = [command, *COMMANDS[command], f"--output_dir={here / 'full'}"]
+    words = [*command.split(), *COMMANDS[command], f"--output_dir={here / 'full'}"]
     write_file(here / "full" / "thesis.tex", b"years of work")
     assert main(words) == 2
     assert "full exists already; " in error()
@@ -138,11 +125,9 @@ def test_a_folder_that_holds_something_is_refused(command, here, error):
 @pytest.mark.parametrize("how", ["", "--overwrite=true"])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_folder_that_is_in_use_is_refused(command, how, here, error):
-    if command == "compare":  # on the same episodes
-        make_eval(here / "right.json", [False, False])
     out = here / "out"
     with exclusive(out):
-        assert main([command, *COMMANDS[command], f"--output_dir={out}", *([how] if how else [])]) == 1
+        assert main([*command.split(), *COMMANDS[command], f"--output_dir={out}", *([how] if how else [])]) == 1
         assert error().endswith(
             f": {out} is in use by process {os.getpid()}; wait until that is done, or choose another folder"
         )

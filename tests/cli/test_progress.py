@@ -4,13 +4,11 @@ import os
 import pty
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from manip_il.cli import progress as module
-from manip_il.cli.progress import Progress, say, say_policy, set_quiet, warn
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.cli.progress import progress, say, set_quiet, warn
 
 
 @pytest.fixture(autouse=True)
@@ -21,9 +19,9 @@ def loud():
 
 
 def test_short_work_prints_one_line_at_the_end(capsys):
-    with Progress(3, "record") as bar:
+    with progress(3, "record") as bar:
         for _ in range(3):
-            bar.advance(success=0.123456)
+            bar.step(success=0.123456)
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
@@ -34,18 +32,18 @@ def test_short_work_prints_one_line_at_the_end(capsys):
 def test_long_work_prints_a_line_an_interval_and_one_at_the_end(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    with Progress(None, "train") as bar:
+    with progress(None, "train") as bar:
         for _ in range(20):
             now[0] += 1.0
-            bar.advance(10)
+            bar.step(10)
     lines = capsys.readouterr().err.splitlines()
     assert lines == [f"train: {done} (10/s)" for done in (50, 100, 150, 200, 200)]
 
 
 def test_work_that_fails_still_says_how_far_it_came(capsys):
     def work() -> None:
-        with Progress(9, "record") as bar:
-            bar.advance(2)
+        with progress(9, "record") as bar:
+            bar.step(2)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -55,8 +53,8 @@ def test_work_that_fails_still_says_how_far_it_came(capsys):
 
 def test_quiet_silences_progress_and_not_say(capsys):
     set_quiet(True)
-    with Progress(3, "record") as bar:
-        bar.advance()
+    with progress(3, "record") as bar:
+        bar.step()
     say("done")
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == ("done\n", "")
@@ -64,9 +62,9 @@ def test_quiet_silences_progress_and_not_say(capsys):
 
 def test_a_terminal_gets_a_bar_and_a_pipe_beside_it_gets_the_output():
     code = (
-        "from manip_il.cli.progress import Progress, say\n"
-        "with Progress(2, 'record') as bar:\n"
-        "    bar.advance(loss=0.5); say('result'); bar.advance()"
+        "from manip_il.cli.progress import progress, say\n"
+        "with progress(2, 'record') as bar:\n"
+        "    bar.step(loss=0.5); say('result'); bar.step()"
     )
     leader, follower = pty.openpty()
     env = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
@@ -82,28 +80,6 @@ def test_a_terminal_gets_a_bar_and_a_pipe_beside_it_gets_the_output():
     assert done.stdout == b"result\n"
     assert b"2/2" in shown
     assert b"loss 0.5" in shown
-
-
-@pytest.mark.parametrize(
-    ("success", "lines"),
-    [
-        (True, ["best policy: runs/best", "next: manip-il eval"]),
-        (
-            False,
-            [
-                "DAgger round 2 fails in all 1 unseen episodes of panda reach: 0.0 % [0.0, 79.3]; "
-                "its one failure ends in the phase approach.",
-                "try in a new run: more --steps",
-                "failures by phase, with films: manip-il eval",
-            ],
-        ),
-    ],
-)
-def test_a_run_that_never_succeeded_says_what_to_try(success, lines, capsys):
-    episode = EpisodeResult(0, success, success, 5, 0.0, phase_at_end="approach")
-    found = EvalResult("DAgger round 2", "panda", "reach", {}, (episode,), EvalSettings(100, 0.02))
-    say_policy(Path("runs/best"), found, "manip-il eval", "more --steps")
-    assert capsys.readouterr().out.splitlines() == lines
 
 
 def test_each_warning_is_one_line(capsys):

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.inputs import find_policy
 from manip_il.cli.main import load, main
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import dump_yaml, parse
@@ -19,6 +18,7 @@ from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.lerobot_config import lerobot_options
 
 from ..damage import edit_json
@@ -68,7 +68,7 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, pol
         assert main(command) == 1
         assert re.search(r"evil/x.*add --trust=true", error())
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
-        lerobot_options(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._fit_config())  # pyright: ignore[reportAttributeAccessIssue]
+        lerobot_options(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"]).config())  # pyright: ignore[reportAttributeAccessIssue]
     assert not (tmp_path / "out").exists()
 
 
@@ -128,5 +128,5 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     run = make_run(here / "run", policy)
     task = ["--task.type=reach"] if command == "dagger" else []
     options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
-    fit = options.config().fit if command == "dagger" else options._fit_config()  # pyright: ignore[reportAttributeAccessIssue]
+    fit = options.config().fit if command == "dagger" else options.config()  # pyright: ignore[reportAttributeAccessIssue]
     assert Path(lerobot_options(fit)[0].policy.pretrained_path).resolve() == find_policy(run).resolve()

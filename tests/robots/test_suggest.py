@@ -95,11 +95,9 @@ def test_a_hand_put_on_sideways_is_written_without_success_and_the_remedy_named(
     assert yaml.safe_load((tmp_path / "arm.yaml").read_text())["hand"] == "flange"
 
 
-def test_of_work_that_broke_off_nothing_is_left(tmp_path: Path, monkeypatch, capsys):
-    words = ["robot", "new", str(model_in(tmp_path, "slides"))]
-    monkeypatch.setattr("manip_il.cli.robot._measure", lambda *_: {}["no such body"])
+def test_a_name_that_is_no_robots_is_refused(tmp_path: Path, capsys):
+    words = ["robot", "new", str(model_in(tmp_path, "slides")), f"--output={tmp_path / 'my arm.yaml'}"]
     assert main(words) == 1
-    assert main([*words, f"--output={tmp_path / 'my arm.yaml'}"]) == 1
     assert "robot's, is 'my arm'" in capsys.readouterr().err
     assert [one.name for one in tmp_path.iterdir()] == ["arm.xml"]
 

@@ -1,0 +1,198 @@
+"""`manip-il push`, `pull`, `export`, `data to-mcap`, `from-mcap`: datasets and policies to other places and forms."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from manip_il.cli.common_options import exists, require_dataset
+from manip_il.cli.options import group
+from manip_il.cli.outputs import OutputFile, check_output, prepare_output, save_options
+from manip_il.cli.progress import has_bars, progress, say, warn
+from manip_il.data.atomic import new_folder, write_file
+from manip_il.errors import FolderExistsError, ManipError, UsageError
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.option import option
+
+REMOTES = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
+EXPORTABLE = ("mlp", "cnn")
+
+
+@dataclass
+class PushOptions:
+    """Push a dataset, or a policy with its run, to the Hugging Face Hub, an object store, another machine or a folder.
+
+    A dataset is checked first, as by manip-il data check, and refused if it has errors. Only changes are uploaded.
+    Readers see the old version until the new one is complete. After an interruption run the same command again: what
+    has arrived is not sent twice.
+    """
+
+    example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
+    source: Path = option(
+        MISSING, "folder of a dataset, a run or a policy", positional=True, check=exists("a dataset, a run or a policy")
+    )
+    remote: str = option(MISSING, REMOTES, positional=True)
+    dry_run: bool = option(False, "only list what would be uploaded and removed")
+    journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
+    private: bool = option(False, "make a new repository on the Hub private")
+
+    def run(self) -> None:
+        """Examine, list, upload, switch over; print what was done."""
+        from rich import filesize
+
+        from manip_il.store.transfer import open_remote, push
+
+        remote = open_remote(self.remote, private=self.private, quiet=not has_bars())
+        plan = push(self.source, remote, journals=self.journals, dry_run=self.dry_run)
+        sizes = {path: plan.manifest.files[path].size for path in plan.upload}
+        if self.dry_run:
+            say(*(f"upload   {path} ({filesize.decimal(size)})" for path, size in sizes.items()))
+            say(*(f"remove   {path}" for path in plan.remove))
+        size, same = filesize.decimal(sum(sizes.values())), len(plan.local) - len(sizes)
+        uploaded, removed = ("to upload", "to remove") if self.dry_run else ("uploaded", "removed")
+        say(f"{remote.name}: {len(sizes)} files, {size}, {uploaded}; {len(plan.remove)} {removed}; {same} unchanged")
+        say("nothing was done" if self.dry_run else f"next: manip-il pull {remote.name} FOLDER")
+
+
+@dataclass
+class PullOptions:
+    """Pull a dataset or a policy from the Hugging Face Hub, an object store, another machine or a folder.
+
+    Every file is verified by its hash, and every file of a dataset opened once, before the folder appears. Paths that
+    leave the folder, links, pickles and code are refused; nothing that is pulled is executed.
+    """
+
+    example: ClassVar[str] = "manip-il pull hf://datasets/me/demos datasets/demos"
+    remote: str = option(MISSING, "what manip-il push was given, or any repo of the Hub", positional=True)
+    target: Path = option(MISSING, "new folder for it", positional=True)
+    revision: str | None = option(None, "branch, tag or commit of a repo on the Hub")
+    dry_run: bool = option(False, "only list what would be pulled")
+    overwrite: bool = option(False, "replace an existing dataset or run")
+
+    def run(self) -> None:
+        """Fetch, verify, rename; print what was pulled."""
+        from rich import filesize
+
+        from manip_il.store.transfer import open_remote, pull
+
+        if self.overwrite:
+            check_output(self.target, overwrite=True)
+        remote = open_remote(self.remote, revision=self.revision, quiet=not has_bars())
+        try:
+            manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
+        except FolderExistsError:
+            remedy = "replace them with --overwrite=true, or name a new folder"
+            raise UsageError(f"{self.target} or its journals exist already; {remedy}") from None
+        if self.dry_run:
+            say(*(f"pull     {path} ({filesize.decimal(file.size)})" for path, file in manifest.files.items()))
+        size = filesize.decimal(sum(file.size for file in manifest.files.values()))
+        what = f"a {manifest.kind} of {len(manifest.files)} files, {size}"
+        say(f"{remote.name}: {what}; nothing was done" if self.dry_run else f"{self.target}: {what}, all verified")
+        if not self.dry_run and manifest.kind == "dataset":
+            say(f"next: manip-il data check {self.target}")
+
+
+@dataclass
+class ExportOptions:
+    """Write an mlp or cnn policy as one file that runs without this package.
+
+    Observations go in raw, by LeRobot's names; joint targets [rad] and the gripper command [m] come out. The file is
+    run and compared with the checkpoint before it is written. docs/export.md shows how to run it.
+    """
+
+    example: ClassVar[str] = "manip-il export runs/dagger --output=policy.onnx"
+    policy: Path = option(MISSING, "a run, a checkpoint or its pretrained_model", positional=True, check=find_policy)
+    format: Literal["onnx"] = option("onnx", "for onnxruntime and others")
+    file: OutputFile = group(OutputFile(Path("policy.onnx")), prefix="")
+
+    def run(self) -> None:
+        """Export, compare, write."""
+        from manip_il.learn.checkpoint import policy_sha256, read_config
+        from manip_il.learn.export import export_onnx
+
+        self.file.check()
+        path = find_policy(self.policy)
+        if (kind := read_config(path)["type"]) not in EXPORTABLE:
+            raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
+        try:
+            exported = export_onnx(path, policy_sha256(path))
+        except ImportError as error:
+            raise ManipError(f"an ONNX file needs {error.name}: pip install 'manip_il[export]'") from error
+        write_file(self.file.output, exported.data)
+        if "robot" not in exported.metadata:
+            warn(f"{path} was written by another tool: the file does not say robot, task, control rate and names")
+        say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
+        for direction in ("inputs", "outputs"):
+            for one in exported.metadata[direction]:
+                shape = ", ".join(map(str, one["shape"]))
+                say(f"{direction.removesuffix('puts'):>3}: {one['name']} {one['dtype']} ({shape})")
+        say(f"exported: {self.file.output} ({len(exported.data):,} bytes)")
+
+
+@dataclass
+class McapExportOptions:
+    """Write a LeRobot v3.0 dataset as MCAP, which Foxglove opens: one file per episode, one topic per column.
+
+    With it, mapping.yaml, from which `manip-il data from-mcap` makes the same dataset again.
+    """
+
+    example: ClassVar[str] = "manip-il data to-mcap datasets/demos demos_mcap"
+    dataset: Path = option(MISSING, "the dataset's folder", positional=True, check=require_dataset)
+    out: Path = option(MISSING, "folder for the files", positional=True)
+    overwrite: bool = option(False, "replace an existing export")
+
+    def run(self) -> None:
+        """Export every episode; the folder appears when it is whole."""
+        from manip_il.data.dataset import Dataset
+        from manip_il.mcap.export import MAPPING, export_dataset, left_out
+
+        check_output(self.out, self.dataset, overwrite=self.overwrite)
+        dataset = Dataset.open(self.dataset)
+        prepare_output(self.out, overwrite=self.overwrite)
+        with new_folder(self.out) as folder, progress(dataset.info.episodes, "export") as bar:
+            for _ in export_dataset(dataset, folder):
+                bar.step()
+            save_options(folder, self)
+        if missing := left_out(dataset.info):
+            say(f"left out, as MCAP has no place for them: {', '.join(missing)}")
+        say(f"exported {dataset.info.episodes:,} episodes to {self.out}")
+        say(f"back to a dataset: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
+
+
+@dataclass
+class McapImportOptions:
+    """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in the order of their names.
+
+    The mapping names the topic and the field of every column, and how its messages are resampled to the dataset's rate:
+    nearest or previous, with a tolerance in seconds. A gap beyond it is an error.
+    """
+
+    example: ClassVar[str] = "manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
+    source: Path = option(
+        MISSING, "an MCAP file, or a folder of them", positional=True, check=exists("an MCAP file, or a folder of them")
+    )
+    dataset: Path = option(MISSING, "folder for the dataset", positional=True)
+    mapping: Path = option(
+        MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)", check=exists("a mapping file")
+    )
+
+    def run(self) -> None:
+        """Import every file; the dataset appears when it is whole."""
+        from manip_il.mcap.importing import import_files, list_files
+        from manip_il.mcap.mapping import load_mapping
+        from manip_il.mcap.read import read_topics
+
+        if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
+            raise UsageError(f"{self.dataset} exists already; choose another folder, or delete it first")
+        mapping = load_mapping(self.mapping)
+        paths = list_files(self.source)
+        frames = 0
+        with progress(len(paths), "import") as bar:
+            for count in import_files(paths, self.dataset, mapping):
+                bar.step()
+                frames += count
+        wanted = {source.topic for source in mapping.sources.values()}
+        if rest := sorted({topic for path in paths for topic in read_topics(path)} - wanted):
+            say(f"topics that the mapping does not name: {', '.join(rest)}")
+        say(f"imported {len(paths):,} episodes, {frames:,} frames to {self.dataset}")
