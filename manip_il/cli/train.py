@@ -64,12 +64,12 @@ class TrainOptions:
 
     def run(self) -> None:
         """Read the datasets, fit, and say where the checkpoint is."""
-        from manip_il.learn.lerobot_config import lerobot_options
-
         writes = os.environ.get(RANK, "0") == "0"  # whether this is the one of several processes that does
         if not writes:
             set_quiet(True)
         config, folder = self.config(), self.output.output_dir
+        from manip_il.learn.lerobot_config import lerobot_options  # takes seconds
+
         options, _ = lerobot_options(config)  # refuses what LeRobot would, before anything is written
         sources = self._sources(config)
         weights = self._frame_weights(getattr(options.policy, "chunk_size", None), sources.datasets)
