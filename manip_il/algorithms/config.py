@@ -134,11 +134,6 @@ class RunConfig:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
             raise UsageError("redraw is for policies on pictures, with --label=per_state")
-        self._check_method()
-        self._check_queries()
-
-    def _check_method(self) -> None:
-        """Options are for the method, and pictures are rendered exactly if the policy takes some."""
         if self.method not in ALGORITHMS:
             raise UnknownName("method", self.method, ALGORITHMS)
         if self.method in EXPERT_DRIVES and (self.label, self.query_rule, self.beta) != _DEFAULTS:
@@ -149,6 +144,7 @@ class RunConfig:
             raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation")
         if self.method == "dart" and self.cameras is not None:
             raise UsageError("method 'dart' measures the learner's errors from state vectors; it is not for images")
+        self._check_queries()
 
     def _check_queries(self) -> None:
         rule = self.query_rule

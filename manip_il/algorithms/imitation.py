@@ -120,9 +120,9 @@ class ImitationRun(Run):
         with self._timed("fit"):
             for member, start in enumerate(starts):
                 name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
-                self._watch.on_stage(name, round_, round_fit(config, start).total_steps)
-                into = self._folder(round_) / (f"{POLICY}_{member}" if member else POLICY)
-                members.append(fit_round(config, roots, into, start, self._watch.on_log, member))
+                fit, into = round_fit(config, start, member), f"{POLICY}_{member}" if member else POLICY
+                self._watch.on_stage(name, round_, fit.total_steps)
+                members.append(fit_round(config, roots, self._folder(round_) / into, fit, self._watch.on_log))
         self._fitted = Fitted(round_, tuple(members), config.fit.trust)
         return self._fitted
 

@@ -178,7 +178,7 @@ def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> R
     weights = Section(
         "What a metre costs",
         tables=(weight_table(found),),
-        notes=tuple(one for one in (*found.learnt.facts, open_line(found)) if one),
+        notes=tuple(one for one in (found.learnt.chains, open_line(found)) if one),
     )
     costs = Section(
         "The cost over the table",

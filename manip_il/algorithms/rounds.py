@@ -63,21 +63,19 @@ def fit_round(
     config: RunConfig,
     roots: Sequence[Path],
     folder: Path,
-    init_from: Path | None = None,
+    fit: FitConfig,
     on_log: Callable[[dict[str, Any]], None] | None = None,
-    member: int = 0,
 ) -> Path:
     """Fit, or go on with fitting, a policy to datasets; return the checkpoint's `pretrained_model`.
 
-    init_from: start there (see `refit`). on_log: sees the metrics, {} at a step without. member: of the ensemble,
-    each from a seed of its own.
+    on_log: sees the metrics, {} at a step without.
     """
     from manip_il.learn.sources import Sources
     from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
 
     trainer = Trainer(
         Sources(tuple(map(Dataset.open, roots))),
-        round_fit(config, init_from, member),
+        fit,
         folder,
         resume=True,
     )
@@ -85,9 +83,9 @@ def fit_round(
 
 
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
-    """Return the options of one round's fit. init_from: where a warm one starts from. member: of the ensemble.
+    """Return the options of one round's fit. init_from: where a warm one starts from.
 
-    Any other starts from the run's start policy, if there is one.
+    Any other starts from the run's start policy, if there is one. member: of the ensemble, each from a seed of its own.
     """
     steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
     if init_from is not None:

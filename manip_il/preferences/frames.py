@@ -14,7 +14,6 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import UsageError
 from manip_il.learn.samples import require_finite
 from manip_il.learn.sources import check_same_sources
 
@@ -84,15 +83,8 @@ def read_all(roots: Sequence[Path]) -> list[Frames]:
 
 
 def find_datasets(folders: Sequence[Path]) -> list[Path]:
-    """Return the datasets that folders stand for: themselves, or every round's of a run.
-
-    Raises `UsageError` for a folder that is neither.
-    """
+    """Return the datasets that folders stand for: every round's of a run, else themselves."""
     found: list[Path] = []
     for folder in folders:
-        rounds = [path for path in sorted(folder.glob(_ROUNDS)) if (path / INFO).is_file()]
-        if not (folder / INFO).is_file() and not rounds:
-            state = "holds no dataset" if folder.exists() else "does not exist"
-            raise UsageError(f"{folder} {state}; expected a LeRobot dataset or a run with rounds")
-        found += [folder] if (folder / INFO).is_file() else rounds
+        found += [path for path in sorted(folder.glob(_ROUNDS)) if (path / INFO).is_file()] or [folder]
     return found

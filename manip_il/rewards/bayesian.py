@@ -57,10 +57,9 @@ class Choices:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws of the weights. draws: (C, N, K) of C chains [1/m]. accepted: share of steps taken."""
+    """Draws of the weights. draws: (C, N, K) of C chains [1/m]."""
 
     draws: F64
-    accepted: float
 
     @property
     def pooled(self) -> F64:
@@ -97,16 +96,14 @@ def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: flo
     return rng.exponential(prior, (count, features))
 
 
-def fit(
-    demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR
-) -> tuple[Posterior, list[F64]]:
-    """Return the posterior, and the paths' features that each demonstration's was chosen from, (m, K)."""
+def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
+    """Return the posterior of each demonstration's choice between the paths that are cheapest for some taste."""
     features = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
     for _ in range(_ROUNDS):
         quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 10, _WARM_UP)
         sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
-    return draw_posterior(Choices.of(sums), rng, prior), sums
+    return draw_posterior(Choices.of(sums), rng, prior)
 
 
 def draw_posterior(
@@ -127,20 +124,17 @@ def draw_posterior(
     found = minimize(lambda logs: -density(logs[None])[0], np.full(size, np.log(prior)), method="BFGS")
     root = _STEP / np.sqrt(size) * np.linalg.cholesky(found.hess_inv)
     start = found.x + rng.standard_normal((chains, size)) @ root.T
-    logs, accepted = sample(density, start, root, count, warm_up, rng)
-    return Posterior(np.exp(logs), accepted)
+    return Posterior(np.exp(sample(density, start, root, count, warm_up, rng)))
 
 
-def sample(
-    density: Density, start: F64, root: F64, count: int, warm_up: int, rng: np.random.Generator
-) -> tuple[F64, float]:
-    """Return `count` draws of every chain that begins at `start` (C, K), (C, count, K), and the share of steps taken.
+def sample(density: Density, start: F64, root: F64, count: int, warm_up: int, rng: np.random.Generator) -> F64:
+    """Return `count` draws of every chain that begins at `start` (C, K), (C, count, K).
 
     root: Cholesky root of the steps' covariance, (K, K). The first `warm_up` steps are thrown away.
     """
     chains, size = start.shape
     now, height = start, density(start)
-    points, taken = np.empty((chains, count, size)), 0
+    points = np.empty((chains, count, size))
     for step in range(-warm_up, count):
         proposed = now + rng.standard_normal((chains, size)) @ root.T
         there = density(proposed)
@@ -148,5 +142,4 @@ def sample(
         now, height = np.where(accept[:, None], proposed, now), np.where(accept, there, height)
         if step >= 0:
             points[:, step] = now
-            taken += int(accept.sum())
-    return points, taken / (chains * count)
+    return points

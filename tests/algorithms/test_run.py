@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.algorithms import rounds
+from manip_il.algorithms import imitation
 from manip_il.algorithms.config import BetaSchedule, RunConfig
 from manip_il.algorithms.imitation import ImitationRun
 from manip_il.algorithms.rounds import round_folder
@@ -164,14 +164,14 @@ def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, begun):
 def begun(monkeypatch) -> list[Path | None]:
     """Where fits begin, from now on."""
     found: list[Path | None] = []
-    plain = rounds.round_fit
+    plain = imitation.round_fit
 
     def watch(config, *rest):
         fit = plain(config, *rest)
         found.append(fit.init_from)
         return fit
 
-    monkeypatch.setattr(rounds, "round_fit", watch)
+    monkeypatch.setattr(imitation, "round_fit", watch)
     return found
 
 

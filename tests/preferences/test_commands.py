@@ -61,7 +61,7 @@ def test_true_progress_scores_without_a_reward(here, capsys):
     ("line", "says", "code"),
     [
         ("reward pairs good other", "task differs: good has lift, other has reach", 1),
-        ("reward pairs nowhere", "nowhere does not exist; expected a LeRobot dataset or a run", 2),
+        ("reward pairs nowhere", "nowhere is not a LeRobot dataset", 1),
         ("reward pairs good --count=0", "--count is 0; expected at least 1", 2),
         ("reward pairs good --clip=99", "the longest episode has 30", 1),
         ("reward ask nowhere.json", "nowhere.json does not exist; expected pairs.json", 2),
