@@ -5,7 +5,7 @@ cheapest for some taste, and its own, a demonstration takes one with a probabili
 So a demonstrator chooses between sensible paths, and the better one is for its taste the likelier; the sum over them is
 exact, and small enough for chains of tens of thousands of steps. Tastes are drawn from the prior, and then from the
 posterior, which finds the paths that nearly tie. The posterior is drawn by random-walk Metropolis in log w, whose steps
-are as wide as the posterior is about its mode.
+are fitted in warm-ups, then fixed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from manip_il.rewards.paths import Demonstration, add_rivals, rivals
 
@@ -25,7 +24,8 @@ PRIOR = 300.0  # mean of a weight [1/m]
 TASTES = 60  # of the prior, for each demonstration
 CHAINS = 4
 _ROUNDS, _MORE = 3, 30  # rounds of tastes of the posterior
-_DRAWS, _WARM_UP = 20_000, 3_000  # of a chain
+_DRAWS, _WARM_UP = 10_000, 2_000  # of a chain, and of each warm-up
+_FIRST, _FITS = 0.3, 2  # size of the first steps, and warm-ups after which the steps are fitted to what was seen
 _STEP = 2.38  # over the root of the dimensions: a random walk's step, in deviations (Roberts et al. 1997)
 
 
@@ -101,7 +101,7 @@ def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior
     features = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
     for _ in range(_ROUNDS):
-        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 10, _WARM_UP)
+        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
         sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
     return draw_posterior(Choices.of(sums), rng, prior)
 
@@ -121,25 +121,25 @@ def draw_posterior(
         return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)  # d w = w d log w
 
     size = choices.excess.shape[1]
-    found = minimize(lambda logs: -density(logs[None])[0], np.full(size, np.log(prior)), method="BFGS")
-    root = _STEP / np.sqrt(size) * np.linalg.cholesky(found.hess_inv)
-    start = found.x + rng.standard_normal((chains, size)) @ root.T
-    return Posterior(np.exp(sample(density, start, root, count, warm_up, rng)))
+    start, root = np.log(prior * rng.uniform(0.5, 1.5, (chains, size))), _FIRST * np.eye(size)
+    for _ in range(_FITS):
+        tried = sample(density, start, root, warm_up, rng)[:, warm_up // 2 :]
+        start, root = tried[:, -1], _STEP / np.sqrt(size) * np.linalg.cholesky(np.cov(tried.reshape(-1, size).T))
+    return Posterior(np.exp(sample(density, start, root, count, rng)))
 
 
-def sample(density: Density, start: F64, root: F64, count: int, warm_up: int, rng: np.random.Generator) -> F64:
+def sample(density: Density, start: F64, root: F64, count: int, rng: np.random.Generator) -> F64:
     """Return `count` draws of every chain that begins at `start` (C, K), (C, count, K).
 
-    root: Cholesky root of the steps' covariance, (K, K). The first `warm_up` steps are thrown away.
+    root: Cholesky root of the steps' covariance, (K, K).
     """
     chains, size = start.shape
     now, height = start, density(start)
     points = np.empty((chains, count, size))
-    for step in range(-warm_up, count):
+    for step in range(count):
         proposed = now + rng.standard_normal((chains, size)) @ root.T
         there = density(proposed)
         accept = np.log(rng.random(chains)) < there - height
         now, height = np.where(accept[:, None], proposed, now), np.where(accept, there, height)
-        if step >= 0:
-            points[:, step] = now
+        points[:, step] = now
     return points

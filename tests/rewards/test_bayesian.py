@@ -33,8 +33,7 @@ def test_chains_have_the_moments_of_the_density_and_agree():
         lambda points: -0.5 * np.einsum("ci,ij,cj->c", points - mean, inverse, points - mean),
         np.zeros((4, 2)),
         1.7 * np.linalg.cholesky(covariance),
-        5_000,
-        1_000,
+        6_000,
         np.random.default_rng(0),
     )
     pooled = draws.reshape(-1, 2)
