@@ -166,7 +166,7 @@ class Lockstep(DummyVecEnv):
         running = [row for row, one in enumerate(self.envs) if not one.episode.ended]
         executed = np.zeros(targets.shape)
         if running:
-            joints = np.asarray(self._obs_from_buf())[running, : targets.shape[1]]
-            executed[running] = self._conversion.decode(targets[running], joints)
+            [seen] = self.buf_obs.values()  # without the copy that `_obs_from_buf` makes
+            executed[running] = self._conversion.decode(targets[running], seen[running, : targets.shape[1]])
         self.executed.append(executed)
         super().step_async(executed)
