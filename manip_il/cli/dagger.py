@@ -127,7 +127,8 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
 
     fingerprint = env_fingerprint(config.env, config.cameras)
     write_json(folder / FINGERPRINT_FILE, fingerprint)
-    results, there = list[Result](), {record["round"] for record in read_lines(folder / METRICS_FILE)}
+    results: list[Result] = []
+    there = {record["round"] for record in read_lines(folder / METRICS_FILE)}
     for result in ImitationRun(config, folder, engine, stages.watch()).results():
         stages.close()
         if result.number not in there:  # else from before an interruption, with the seconds of then
