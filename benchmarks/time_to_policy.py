@@ -49,7 +49,8 @@ def main() -> int:
         found = clone_by_peer(options.peer, options.seed, 2 if options.quick else EPOCHS)
         limit = found["seconds"]
         print(f"imitation: {found['success']:.1%} from {found['labels']:,} labels after {limit:.1f} s", flush=True)
-    config = replace(from_yaml(HERE.parent / "configs" / "fetch_5cm.yaml", DaggerOptions), seed=options.seed).config()
+    given = from_yaml(HERE.parent / "configs" / "fetch_5cm.yaml", DaggerOptions)
+    config = replace(given, settings=given.settings | {"seed": options.seed}).config()
     if options.quick:
         few = {"demonstrations": 4, "rounds": 1, "episodes_per_round": 4, "validation_episodes": 4, "refit_steps": 20}
         config = replace(config, **few, fit=replace(config.fit, steps=50))
