@@ -77,7 +77,7 @@ def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, 
         assert episode["drawn"] == dict(draw(conditions, episode["seed"]).values)
     assert data["settings"]["suite"] == "all"
     out = capsys.readouterr().out
-    assert all(f"| {name} " in out for name in data["by_condition"])
+    assert all(f"|{name} " in out for name in data["by_condition"])
     assert Path("e/report.html").read_text().count("<video") == 0
 
 
