@@ -18,6 +18,7 @@ from manip_il.sim.shape import ROLLING_MESH
 
 F64 = NDArray[np.float64]
 DEEPEST = 0.035  # of the ee site under an object's top: the palm just clears it [m]
+LEAST_HEIGHT = 0.012  # of what lies on the table: fingers slip over less [m]
 LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _DIRECTIONS = 500  # in which the points of a fine hull are looked for
 _ALIKE, _COPLANAR = 0.2, 0.01  # between sides that count as one, and of one side [rad]
@@ -36,7 +37,8 @@ class Rest(NamedTuple):
 
     down: unit vector, (3,). height: of the body's origin, tall: of the object, above: of its top over where it is
     grasped [m]. For each way to grasp it: across (w, 3), unit vector along the fingers' motion; centre (w, 3), between
-    the fingers; width between them and length across them [m]. fits: they go around it. round: any yaw will do.
+    the fingers; width between them and length across them [m]. fits: they go around it, and it is not too
+    low for them. round: any yaw will do.
     """
 
     down: F64
@@ -135,7 +137,7 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
         across=across,
         centre=middle,
         sizes=tuple((way.width, way.length) for way in ways),
-        fits=min(way.width for way in ways) <= widest - LEAST_ROOM,
+        fits=min(way.width for way in ways) <= widest - LEAST_ROOM and tall >= LEAST_HEIGHT,
         round=any_yaw,
     )
 

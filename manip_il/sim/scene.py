@@ -23,7 +23,7 @@ from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.posture import require_free_home
-from manip_il.sim.rests import LEAST_ROOM, Hull
+from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
@@ -166,7 +166,13 @@ def _check_objects(
     for name in task.grasped:
         one = objects[name]
         if name in hulls:
-            width = min(width for width, _ in hulls[name].rest(0).sizes)
+            lies = hulls[name].rest(0)
+            width = min(width for width, _ in lies.sizes)
+            if lies.tall < LEAST_HEIGHT:
+                raise UsageError(
+                    f"task {task.name}: {name!r} lies {lies.tall:.3f} m high, and fingers need {LEAST_HEIGHT} m; "
+                    "choose a larger one"
+                )
         else:
             width = variation.widest_grasp(int(model.geom_type[one.geom]), model.geom_size[one.geom])
         if width >= gripper.most - (LEAST_ROOM if name in hulls else 0.0):

@@ -83,11 +83,11 @@ def at_grasp(world: World, name: str) -> bool:
     g = grasp_of(world, name)
     box = AT_GRASP if g.open_enough else CLOSING
     if world.hull(name) is not None:
-        if world.opening < EMPTY * g.width:
-            return False
         # Its sides may be round: higher up they let the fingers slip off.
         deep = max(LEAST_DEEP, DEEP_SHARE * lie_of(world, name).tall)
-        box = (*box[:2], min(box[2], deep if g.open_enough else 2 * deep))
+        over = float(world.ee.position[2]) - g.at[2]
+        if world.opening < EMPTY * g.width or over > (deep if g.open_enough else 2 * deep):
+            return False
     return is_inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.settled
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.sim.rests import LEAST_HEIGHT
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
 from manip_il.sim.world import GOAL, World
@@ -75,10 +76,12 @@ class PickPlace:
         return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label: a mesh lies on a side on which it is too wide for the gripper."""
-        if world.hull(OBJECT) is None or lie_of(world, OBJECT).fits or held(world, OBJECT):
+        """Return why there is no sound label: a mesh lies too wide or too low for the gripper."""
+        if world.hull(OBJECT) is None or (lie := lie_of(world, OBJECT)).fits or held(world, OBJECT):
             return ""
-        width = min(width for _, width, _, _ in lie_of(world, OBJECT).grasps)
+        if lie.tall < LEAST_HEIGHT:
+            return f"{OBJECT} lies on a side on which it is {lie.tall:.3f} m high, too low for the fingers"
+        width = min(width for _, width, _, _ in lie.grasps)
         return f"{OBJECT} lies on a side on which it is {width:.3f} m wide, more than the gripper goes around"
 
     def progress(self, world: World) -> float:

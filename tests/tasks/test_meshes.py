@@ -84,7 +84,7 @@ def settled(world: World, quaternion: np.ndarray, seconds: float = 1.5) -> None:
     world.update()
 
 
-@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize("name", [name for name in MESHES if name != "plate"])
 def test_however_it_falls_it_rests_on_a_known_side_with_grasps(name, folder):
     env, rng = make_env("panda", object=text(folder, name)), np.random.default_rng(1)
     expert, world = Expert(env.scene), env.world
@@ -137,6 +137,10 @@ def test_a_side_that_is_too_wide_has_no_label_and_says_why(tmp_path):
     label = expert.label(env.get_state())
     assert not label.valid
     assert "object lies on a side on which it is 0.090 m wide" in label.reason
+    plate = make_env("panda", object=f"mesh:{write_mesh('plate', tmp_path)}")
+    plate.reset(seed=0)
+    settled(plate.world, np.array([1.0, 1.0, 0.0, 0.0]))
+    assert "0.008 m high, too low for the fingers" in Expert(plate.scene).label(plate.get_state()).reason
 
 
 def test_labels_are_those_of_another_process_and_order(folder):
@@ -243,6 +247,7 @@ MISTAKES = {
         "own.stl",
         "m wide, and the gripper of panda opens",
     ),
+    "is too low": (trimesh.creation.box((0.06, 0.05, 0.006)).export, "own.stl", "0.006 m high, and fingers need"),
     "is in millimetres": (trimesh.creation.box((50, 40, 30)).export, "own.stl", "is 50 m long; expected 0.02 to 0.2 m"),
     "has too many faces": (lambda path: path.write_bytes(b"\nf 1 2 3" * 1_000_000), "own.obj", "has 1,000,000 faces"),
     "is not there": (lambda path: None, "own.obj", "own.obj does not exist; expected a mesh"),
