@@ -85,7 +85,7 @@ bench: setup  ## every speed ratio, in about 40 minutes; PEER=PYTHON, which has 
 
 lock: | $(filter .tools%,$(UV))  ## choose the versions anew
 	$(UV) pip compile --quiet --universal --generate-hashes --no-annotate --no-header \
-	    --python $(PYTHON) --extra dev --extra so101 --extra ray --extra tensorboard --extra export pyproject.toml -o requirements.lock
+	    --python $(PYTHON) --extra dev --extra so101 --extra ray --extra tensorboard --extra export --extra serve pyproject.toml -o requirements.lock
 
 clean:  ## remove what tools left behind; keeps .venv, runs and datasets
 	rm -rf build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

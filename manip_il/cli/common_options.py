@@ -37,9 +37,9 @@ OWN_TASK_HELP = "its Python file, if the dataset's task does not ship"
 OWN_OBJECT_HELP = "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh"
 
 
-def env_given(*, of_policy: bool = False) -> Any:
+def env_given(*, of_policy: bool = False, robot: str = EnvConfig.robot) -> Any:
     """Return the field of `--robot.*`, `--task.*`, `--env.*`. of_policy: what is not given is as the policy has it."""
-    return given(EnvConfig, defaults=dict.fromkeys(_POLICYS) if of_policy else None)
+    return given(EnvConfig, defaults=dict.fromkeys(_POLICYS) if of_policy else {"robot": robot})
 
 
 def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:

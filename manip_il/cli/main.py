@@ -39,6 +39,7 @@ COMMANDS = {
     "eval": Command("evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
     "compare": Command("compare:CompareOptions", "compare policies, runs or whole studies on the same seeds"),
     "view": Command("view:ViewOptions", "watch a robot at its task, in a window or a browser"),
+    "serve": Command("serve:ServeOptions", "run a virtual SO-101 that LeRobot's own programs open"),
     "push": Command("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": Command("transfer:PullOptions", "download a dataset or policy, every file verified"),
     "export": Command("transfer:ExportOptions", "export a policy as ONNX"),

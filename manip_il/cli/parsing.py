@@ -103,6 +103,9 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
     rest = list(words)
     while rest:
         word = rest.pop(0)
+        if word == "--" and places and places[-1].is_list:  # what follows belongs to another program
+            said[places[-1].name] = _Said(rest, places[-1].label)
+            break
         if not word.startswith("--"):
             if not places or word.startswith("-"):
                 raise UsageError(f"unexpected {shorten(word)}; options are written --name=value, {_lists(command)}")

@@ -164,10 +164,14 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
         mujoco.mj_step(world.model, data, self.config.physics_steps)
         world.update()  # positions as of now, not of the last physics step's start
+        self.count_step()
+        return executed
+
+    def count_step(self) -> None:
+        """Count a control step that has passed, and whether the task is solved after it."""
         self._step += 1
         self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
         self._ever = self._ever or self.solved
-        return executed
 
     @property
     def solved(self) -> bool:

@@ -1,0 +1,74 @@
+"""Cameras over ZMQ, as LeRobot's own image server sends them: JSON with JPEG in base64."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import time
+from typing import Any
+
+import cv2
+import mujoco
+import zmq
+
+from manip_il.errors import UsageError
+from manip_il.serve.station import Station
+from manip_il.sim import render
+from manip_il.sim.config import CameraConfig
+
+RATE = 30  # pictures a second
+_QUALITY: list[int] = [cv2.IMWRITE_JPEG_QUALITY, 90]
+
+
+class Cameras:
+    """A thread that shows a station's world on one port, `RATE` times a second.
+
+    images: the last ones, camera -> (H, W, 3). shown: how many so far; slow: rate that
+    the machine allows, where it is less [1/s].
+    Raises `UsageError` for a port that is taken.
+    """
+
+    def __init__(self, station: Station, cameras: CameraConfig, port: int):
+        self._station, self._cameras = station, cameras
+        self.shown, self.slow = 0, 0.0
+        self.images: dict[str, render.Picture] = {}
+        self._data = mujoco.MjData(station.env.scene.model)
+        self._socket: Any = zmq.Context.instance().socket(zmq.PUB)
+        self._socket.setsockopt(zmq.SNDHWM, 2)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        try:
+            self._socket.bind(f"tcp://127.0.0.1:{port}")
+        except zmq.ZMQError as error:
+            raise UsageError(f"--camera_port={port} cannot be used ({error}); give another one") from error
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, and free the port."""
+        self._stop.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _run(self) -> None:
+        """OpenGL belongs to the thread that made it: everything is drawn here."""
+        due = time.perf_counter()
+        while not self._stop.wait(max(0.0, due - time.perf_counter())):
+            begun = time.perf_counter()
+            self._socket.send_string(self._message())
+            took = time.perf_counter() - begun
+            self.shown += 1
+            if self.shown >= 10:
+                self.slow = 1 / took if took > 1 / RATE else 0.0
+            due = max(due + 1 / RATE, time.perf_counter())
+        render.close()
+
+    def _message(self) -> str:
+        env = self._station.env
+        self._data.qpos[:], self._data.mocap_pos[:] = self._station.seen
+        images = self.images = render.pictures(env.scene, self._data, self._cameras, env.looks)
+        # RGB goes in as it is and comes out of the client's `imdecode` as it is, so that red stays red.
+        coded = {name: cv2.imencode(".jpg", one, _QUALITY)[1] for name, one in images.items()}
+        texts = {name: base64.b64encode(one.tobytes()).decode() for name, one in coded.items()}
+        return json.dumps({"timestamps": dict.fromkeys(texts, time.time()), "images": texts})

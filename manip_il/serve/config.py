@@ -1,0 +1,80 @@
+"""How servos move, and how a session is served: settings without the simulator.
+
+Published and measured values of the servos: Feetech's data sheet of the STS3215-C018 (12 V: 30 kg cm at stall, 45 turns
+a minute without load); play of the gears of about 1 degree and an error of 1.8 to 2.6 degrees under 1.5 kg on 10 cm
+(github.com/TheRobotStudio/SO-ARM100, issue 134; robonine.com); friction as in MuJoCo Menagerie's SO-101. The delay is
+an assumption.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from manip_il.option import check_bounds, option
+
+if TYPE_CHECKING:
+    import numpy as np
+
+_IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}
+VARIED = {  # ranges of `--vary=servo`: factors, but for what is a place or a time
+    "stiffness": (0.7, 1.3),
+    "torque": (0.8, 1.1),
+    "speed": (0.8, 1.1),
+    "play": (0.3, 1.5),
+    "delay": (0.0, 0.03),
+    "friction": (0.3, 2.0),
+    "offset": (-1.0, 1.0),
+}
+_ADDED = ("delay", "offset")
+
+
+@dataclass(frozen=True)
+class ServoConfig:
+    """Numbers of every servo of an arm. `UsageError` for one out of bounds."""
+
+    stiffness: float = option(27.0, "torque for an error at P_Coefficient 32 [N m/rad]", at_least=1, at_most=1000)
+    torque: float = option(2.94, "at stall [N m]", at_least=0.1, at_most=20)
+    speed: float = option(4.7, "without load [rad/s]", at_least=0.5, at_most=50)
+    play: float = option(0.9, "of the gears [deg]", at_least=0, at_most=10)
+    delay: float = option(0.005, "between a command and its effect [s]", at_least=0, at_most=0.5)
+    friction: float = option(0.052, "of the gears [N m]", at_least=0, at_most=2)
+    offset: float = option(0.0, "of a joint from where its calibration has it [deg]", at_least=-10, at_most=10)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "servo.")
+
+    def ideal(self) -> ServoConfig:
+        """Return servos that are stiff and without play, friction and delay."""
+        return replace(self, **_IDEAL)
+
+    def varied(self, rng: np.random.Generator) -> ServoConfig:
+        """Draw servos that differ from these within `VARIED`."""
+        drawn = {name: rng.uniform(*VARIED[name]) for name in VARIED}
+        own = {one.name: getattr(self, one.name) for one in fields(self)}
+        return replace(
+            self, **{name: own[name] + drawn[name] if name in _ADDED else own[name] * drawn[name] for name in VARIED}
+        )
+
+
+@dataclass(frozen=True)
+class SessionConfig:
+    """A session: who moves the leader, how the follower's servos move, and what is kept."""
+
+    output_dir: Path = option(Path("runs/serve"), "folder of the links follower and leader, and of their calibrations")
+    leader: Literal["expert", "policy", "sliders", "none"] = option("expert", "who moves the leader arm")
+    servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
+    camera_port: int = option(5599, "where the cameras are served (ZMQ)", at_least=1, at_most=65_535)
+    speed: float = option(1.0, "of time, in that of the clock", at_least=0.1, at_most=20)
+    reset: Literal["solved", "enter", "never"] = option(
+        "solved", "without a COMMAND, the world is drawn anew a second after it is solved or on Enter; on Enter; never"
+    )
+    intervene: float = option(
+        0.3, "with LeRobot's DAgger: correct a policy whose targets differ by more from the expert's [rad]", at_least=0
+    )
+    log: Path | None = option(None, "folder for journals of what the client cannot see: states and labels")
+    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
+    policy: Path | None = None  # checkpoint of a leader that is a policy
+    servos: ServoConfig = field(default_factory=ServoConfig)
+    varies: bool = False  # whether each world's servos are drawn anew

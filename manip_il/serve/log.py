@@ -1,0 +1,79 @@
+"""What a client of the virtual arm cannot see, kept beside what it records: states, labels of all of them, who drove.
+
+A frame is logged when the client asks where the follower is, so that the frames are those of its own dataset.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.expert import Expert
+from manip_il.data.build import Recording
+from manip_il.data.episodes import to_episode
+from manip_il.data.journal import Journal, list_seeds
+from manip_il.mdp import Actor, Transition
+from manip_il.serve.station import Read, Station
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.envs import env_of
+
+
+class SessionLog:
+    """Journals of a session, one an episode, in a folder that `manip-il data build` makes a dataset of.
+
+    driver: who moves the follower at the moment.
+    """
+
+    def __init__(self, folder: Path, station: Station, config: EnvConfig):
+        self._journal = Journal(folder, env_spec(config), env_fingerprint(config))
+        self._journal.prepare()
+        Recording(f"local/{folder.name}", provenance={"driver": "lerobot"}).write(folder)
+        self._station, self._env = station, env_of(config)
+        self._expert, self.driver = Expert(self._env.scene), Actor.EXPERT
+        self._reads: list[tuple[Read, Actor]] = []
+        self._running = False
+
+    @property
+    def seeds(self) -> list[int]:
+        """Seeds of the episodes that are there."""
+        return list_seeds(self._journal.folder)
+
+    def begin(self) -> None:
+        """Begin an episode in the world as it is."""
+        self._reads, self._running = [], True
+
+    def frame(self, read: Read) -> None:
+        """Log a moment at which the client has read where the follower is."""
+        if not self._running:
+            return
+        if self._reads and self._reads[-1][0].commands == read.commands:  # it asks once more, as it got no answer
+            self._reads.pop()
+        self._reads.append((read, self.driver))
+
+    def end(self, *, keep: bool) -> None:
+        """End the episode; its journal is written at once if it is to be kept."""
+        reads, self._reads, self._running = [*self._reads, (self._station.look(), self.driver)], [], False
+        if keep and len(reads) > 1:
+            frames = [self._transition(step, reads) for step in range(len(reads) - 1)]
+            self._journal.write(to_episode(frames))
+
+    def _transition(self, step: int, reads: list[tuple[Read, Actor]]) -> Transition:
+        """A frame, with what the follower was told and what came of it until the next one."""
+        (now, actor), (after, _) = reads[step : step + 2]
+        env = self._env
+        env.set_state(after.state)
+        reward, success = env.reward, env.solved
+        env.set_state(now.state)
+        return Transition(
+            seed=self._station.seed,
+            step=step,
+            state=now.state,
+            observation=env.observe(),
+            label=self._expert.label(now.state),
+            executed_action=self._station.to_action(after.told),
+            actor=actor,
+            reward=reward,
+            success=success,
+            done=step == len(reads) - 2,
+            progress=env.progress,
+        )

@@ -1,0 +1,284 @@
+"""Runs one of LeRobot's programs against a station and does what a person would: presses its keys, moves its arms."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import signal
+import sys
+from collections import deque
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from manip_il.mdp import Actor
+from manip_il.serve.log import SessionLog
+from manip_il.serve.movers import ExpertMover
+from manip_il.serve.station import Read, Station
+
+RIGHT, LEFT, ESCAPE, ENTER, PAUSE, CORRECT = b"\x1b[C", b"\x1b[D", b"\x1b", b"\n", b" ", b"\t"
+HELD = 1.0  # how long the task is solved before an episode ends [s]
+_SETTLED = 0.5  # a new world stands for so long before the program is told that it is ready [s]
+_TERMINAL = 0.001  # that what is printed may take to get here [s]
+_PATIENCE = 2  # horizons before an episode counts as failed
+_DIFFERS = 0.25  # how long a policy differs from the expert before it is corrected [s]
+_DWELL = 0.5  # of a joint at the end of its range [s]
+URGENT = 10  # how much nicer the program is than what answers it
+_HIDDEN = ("DISPLAY", "WAYLAND_DISPLAY")  # without them LeRobot reads its keys from the terminal
+
+
+class Operator:
+    """A program in a terminal of its own, and who sits at it.
+
+    seeds: of the worlds, one after another. intervene: by how much a policy's targets may differ from the expert's
+    before it is corrected, with LeRobot's DAgger strategy [rad]. failed, solved: episodes so far.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        station: Station,
+        expert: ExpertMover,
+        seeds: Iterator[int],
+        log: SessionLog | None = None,
+        intervene: float = 0.3,
+    ):
+        self.station, self._expert, self._seeds, self._log, self._intervene = station, expert, seeds, log, intervene
+        self._keep = True
+        self._mover, self.solved, self.failed, self.corrections = station.mover, 0, 0, 0
+        self._heard, self.status = "", None
+        self._happened = deque[str | Read]()
+        self._doing: Iterator[None] = iter(())
+        self._says = [  # what LeRobot's programs print, and what is done then
+            (r"Recording episode", self._record),
+            (r"Reset the environment", self._renew),
+            (r"Stop recording", self._finish),
+            (r"Replaying episode", self._follow),
+            (r"Base strategy control loop started", self._watch),
+            (r"corrections-only recording started|DAgger continuous recording started", self._supervise),
+            (r"Phase transition: autonomous -> paused", self._hand_over),
+            (r"Phase transition: paused -> correcting", self._correct),
+            (r"Phase transition: correcting -> paused", self._resume),
+            (r"Press ENTER to use provided calibration file", self._confirm),
+            (r"Connect the controller board to the '(\w+)' motor only", self._connect),
+            (r"Move .* to the middle of its range of motion", self._centre),
+            (r"sequentially through their entire ranges|Move all joints except", self._sweep),
+            (r"RECORDING STARTED", self._sweep_by_leader),
+        ]
+        station.mover = lambda station: None  # the arms stand until an episode begins
+        self._pid, self._terminal = _start(command)
+        station.on_read = self._was_read
+
+    def each_step(self) -> bool:
+        """Read what the program says and act; returns False once it has ended, with its exit code in `status`."""
+        self._listen(0.0)
+        while self._happened:
+            event = self._happened.popleft()
+            if isinstance(event, str):
+                self._hear(event)
+            elif self._log is not None:
+                self._log.frame(event)
+        next(self._doing, None)
+        if self.status is not None:
+            self._end(keep=self._keep)
+        return self.status is None
+
+    def _listen(self, patience: float) -> None:
+        """Take what the program has printed. patience: how long to wait for something [s]."""
+        with self.station.buses["follower"].lock:
+            while self.status is None and select.select([self._terminal], [], [], patience)[0]:
+                try:
+                    said = os.read(self._terminal, 65_536)
+                except OSError:  # it has closed its terminal
+                    self.status = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
+                    return
+                os.write(sys.stdout.fileno(), said)
+                self._happened.append(said.decode(errors="replace"))
+
+    def _was_read(self, read: Read) -> None:
+        """Keep order: a program prints that an episode begins before it reads its first frame."""
+        self._listen(_TERMINAL)
+        self._happened.append(read)
+
+    def stop(self) -> None:
+        """Press escape, so that the program saves what it has and ends."""
+        self._press(ESCAPE)
+
+    def kill(self) -> None:
+        """End the program if it still runs."""
+        if self.status is None:
+            os.kill(self._pid, signal.SIGTERM)
+
+    def _hear(self, text: str) -> None:
+        self._heard += text
+        while True:
+            found = [(match, act) for pattern, act in self._says if (match := re.search(pattern, self._heard))]
+            if not found:
+                break
+            match, act = min(found, key=lambda one: one[0].start())
+            self._heard = self._heard[match.end() :]
+            self._doing = act(*match.groups())
+            next(self._doing, None)
+        self._heard = self._heard[-200:]
+
+    def _press(self, key: bytes) -> None:
+        os.write(self._terminal, key)
+
+    def _wait(self, seconds: float) -> Iterator[None]:
+        yield from [None] * max(1, round(seconds * self.station.env.config.control_hz))
+
+    def _begin(self, driver: Actor) -> None:
+        if self._log is not None:
+            self._log.begin()
+            self._log.driver = driver
+
+    def _end(self, *, keep: bool) -> None:
+        if self._log is not None:
+            self._log.end(keep=keep)
+
+    def _start_world(self) -> None:
+        self.station.mover = lambda station: None
+        self.station.reset(next(self._seeds))
+
+    @property
+    def _is_solved(self) -> bool:
+        """Whether the task has been solved for a while."""
+        return self.station.solved >= round(HELD * self.station.env.config.control_hz)
+
+    def _attempt(self) -> Iterator[None]:
+        """Wait until the task is solved, or for longer than that may take."""
+        for _ in range(_PATIENCE * self.station.env.config.horizon):
+            if self._is_solved:
+                break
+            yield
+
+    def _count(self) -> None:
+        self.solved, self.failed = self.solved + self._is_solved, self.failed + (not self._is_solved)
+
+    # An episode of `lerobot-record`, or of the episodic strategy
+
+    def _record(self) -> Iterator[None]:
+        self._begin(Actor.EXPERT)
+        self.station.mover = self._mover
+        yield from self._attempt()
+        self._count()
+        self._keep = self._is_solved
+        self._press(RIGHT if self._is_solved else LEFT)
+
+    def _renew(self) -> Iterator[None]:
+        self._end(keep=self._keep)
+        self._start_world()
+        yield from self._wait(_SETTLED)
+        self._press(RIGHT)
+
+    def _finish(self) -> Iterator[None]:
+        self._end(keep=self._keep)
+        yield
+
+    def _follow(self) -> Iterator[None]:
+        """Log what the program does to its end."""
+        self._begin(Actor.LEARNER)
+        yield
+
+    # A policy that is watched, or corrected
+
+    def _watch(self) -> Iterator[None]:
+        while True:
+            self._begin(Actor.LEARNER)
+            yield from self._attempt()
+            self._end(keep=True)
+            self._count()
+            self._start_world()
+
+    def _supervise(self) -> Iterator[None]:
+        """Watch the policy until it would do something else than the expert, or gets nowhere: then pause it."""
+        while True:
+            self._begin(Actor.LEARNER)
+            differs = 0
+            for _ in self._attempt():
+                yield
+                differs = differs + 1 if self._differs() else 0
+                if differs > _DIFFERS * self.station.env.config.control_hz:
+                    break
+            if not self._is_solved:
+                break
+            self._count()
+            self._end(keep=True)
+            self._start_world()
+        self._press(PAUSE)
+
+    def _differs(self) -> bool:
+        """Whether the arm is on its way to somewhere else than the expert would go."""
+        wanted = self._expert(self.station)
+        return wanted is not None and np.abs(self.station.follower.goal() - wanted)[:-1].max() > self._intervene
+
+    def _hand_over(self) -> Iterator[None]:
+        yield from self._wait(_SETTLED)
+        self._press(CORRECT)
+
+    def _correct(self) -> Iterator[None]:
+        self.station.mover = self._expert
+        if self._log is not None:
+            self._log.driver = Actor.EXPERT
+        yield from self._attempt()
+        self._count()
+        self.corrections += 1
+        self._end(keep=True)
+        self._press(CORRECT)
+
+    def _resume(self) -> Iterator[None]:
+        self._start_world()
+        yield from self._wait(_SETTLED)
+        self._press(PAUSE)
+        yield from self._supervise()
+
+    # Setting up
+
+    def _confirm(self) -> Iterator[None]:
+        yield from self._wait(_SETTLED)
+        self._press(ENTER)
+
+    def _connect(self, name: str) -> Iterator[None]:
+        for bus in self.station.buses.values():
+            bus.connected = {bus.servos[self.station.names.index(name)]}
+        yield from self._confirm()
+
+    def _centre(self) -> Iterator[None]:
+        low, high = self.station.limits.T
+        self.station.hand = np.where((low < 0) & (high > 0) & (np.arange(len(low)) < len(low) - 1), 0, (low + high) / 2)
+        yield from self._confirm()
+
+    def _sweep(self) -> Iterator[None]:
+        for end in self.station.limits.T:
+            self.station.hand = end
+            yield from self._wait(_DWELL)
+        self._press(ENTER)
+        yield from self._wait(_DWELL)
+        self.station.hand = None
+        self.station.reset(self.station.seed)
+
+    def _sweep_by_leader(self) -> Iterator[None]:
+        low, high = self.station.limits.T
+        for joint in range(len(low)):
+            for end in (low, high):
+                goal = self.station.leader.q.copy()
+                goal[joint] = end[joint]
+                self.station.mover = lambda station, goal=goal: goal
+                yield from self._wait(1.0)
+
+
+def _start(command: Sequence[str]) -> tuple[int, int]:
+    """Run a program in a new terminal; its process and the terminal's other end."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.nice(max(0, -os.nice(0)))
+        for name in _HIDDEN:
+            os.environ.pop(name, None)
+        try:
+            os.execvp(command[0], list(command))
+        except OSError as error:
+            print(f"{command[0]}: {error.strerror}")
+            os._exit(127)
+    return pid, terminal

@@ -1,0 +1,101 @@
+"""The serial protocol and the registers, as Feetech's servos have them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.serve.chain import BROADCAST, CENTRE, GOAL, HOMING_OFFSET, POSITION, Chain, Register
+from manip_il.serve.port import Port
+
+PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x82, 0x83
+LIMITS = [(800, 3300)] * 6
+
+
+def packet(number: int, instruction: int, *parameters: int) -> bytes:
+    body = bytes([number, len(parameters) + 2, instruction, *parameters])
+    return b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
+
+
+def answers(bus: Chain, sent: bytes) -> list[bytes]:
+    return [answer for answer, _ in bus.answers(sent) if answer]
+
+
+@pytest.fixture
+def bus() -> Chain:
+    return Chain(LIMITS)
+
+
+@pytest.mark.parametrize("value", [0, 1, -1, 2047, -2047])
+def test_a_negative_number_is_sign_and_magnitude(value: int):
+    memory = bytearray(96)
+    HOMING_OFFSET.write(memory, value)
+    assert HOMING_OFFSET.read(memory) == value
+    assert Register(31, 2).read(memory) == abs(value) | (0x800 if value < 0 else 0)
+
+
+def test_every_servo_answers_a_broadcast_and_an_absent_one_nothing(bus: Chain):
+    assert answers(bus, packet(BROADCAST, PING)) == [b"".join(packet(number, 0) for number in range(1, 7))]
+    assert answers(bus, packet(3, PING)) == [packet(3, 0)]
+    assert answers(bus, packet(9, PING)) == []
+
+
+def test_a_servo_says_that_it_is_an_sts3215(bus: Chain):
+    assert answers(bus, packet(1, READ, 3, 2)) == [packet(1, 0, 777 & 0xFF, 777 >> 8)]
+
+
+def test_position_is_the_encoder_less_the_offset(bus: Chain):
+    servo = bus.servos[0]
+    HOMING_OFFSET.write(servo.memory, -100)
+    servo.show(CENTRE)
+    assert POSITION.read(servo.memory) == CENTRE + 100
+    GOAL.write(servo.memory, CENTRE + 100)
+    assert servo.goal == CENTRE
+
+
+def test_a_goal_stays_within_the_limits(bus: Chain):
+    GOAL.write(bus.servos[0].memory, 4000)
+    assert bus.servos[0].goal == LIMITS[0][1]
+
+
+def test_sync_write_tells_several_servos_at_once_and_sync_read_asks_them(bus: Chain):
+    assert answers(bus, packet(BROADCAST, SYNC_WRITE, 42, 2, 1, 0x10, 0x08, 2, 0x20, 0x08)) == []
+    assert [servo.goal for servo in bus.servos[:2]] == [0x810, 0x820]
+    assert answers(bus, packet(BROADCAST, SYNC_READ, 42, 2, 2, 1)) == [
+        packet(2, 0, 0x20, 0x08) + packet(1, 0, 0x10, 0x08)
+    ]
+
+
+def test_what_a_servo_measures_cannot_be_written(bus: Chain):
+    bus.servos[0].show(CENTRE)
+    answers(bus, packet(1, WRITE, 56, 0, 0))
+    assert POSITION.read(bus.servos[0].memory) == CENTRE
+
+
+def test_limits_and_offsets_outlive_the_session_and_the_torque_does_not(tmp_path: Path):
+    port = Port(LIMITS, tmp_path / "arm.eeprom")
+    answers(port, packet(2, WRITE, 31, 7, 0) + packet(2, WRITE, 40, 1))
+    port.close()
+    again = Port(LIMITS, tmp_path / "arm.eeprom")
+    assert HOMING_OFFSET.read(again.servos[1].memory) == 7
+    assert not again.servos[1].has_torque
+    again.close()
+
+
+def test_garbage_is_not_answered_and_what_follows_is():
+    """Noise, halves of packets, wrong checksums, 10,000 times: only whole right ones are answered, in the end all."""
+    chain, asked, rng = Chain(LIMITS), packet(1, READ, 3, 2), np.random.default_rng(0)
+    right, rest = packet(1, 0, 777 & 0xFF, 777 >> 8), b""
+    for _ in range(10_000):
+        noise = rng.integers(0, 255, rng.integers(0, 24), dtype=np.uint8).tobytes()  # no 255: no head of a packet
+        wrong = asked[:-1] + bytes([asked[-1] ^ int(rng.integers(1, 256))])
+        half = asked[: int(rng.integers(0, len(asked)))]
+        found: list[bytes] = []
+        for part in (noise, wrong, half, asked * 4):
+            for answer, after in chain.answers(rest + part):
+                rest = after
+                found += [answer] if answer else []
+        assert found
+        assert {*found} == {right}

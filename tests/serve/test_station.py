@@ -1,0 +1,165 @@
+"""A simulated arm behind its ports: LeRobot's own drivers, unmodified, and what the world does meanwhile."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot.robots.so_follower import SO101Follower, SOFollowerRobotConfig
+from lerobot.teleoperators.so_leader import SO101Leader, SOLeaderTeleopConfig
+
+from manip_il.cli.main import main
+from manip_il.data.journal import list_episodes, read_journal
+from manip_il.errors import UsageError
+from manip_il.serve.config import ServoConfig, SessionConfig
+from manip_il.serve.movers import ExpertMover
+from manip_il.serve.station import Station
+from manip_il.sim.env import joint_state
+from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import env_of
+
+
+def station_of(folder: Path, servo: str = "sts3215", robot: str = "so101") -> Station:
+    station = Station(env_of(make_config(robot, "lift")), SessionConfig(output_dir=folder, servo=servo))
+    station.reset(1)
+    return station
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    station = station_of(tmp_path)
+    yield station
+    station.close()
+
+
+def run(station: Station, seconds: float) -> None:
+    """Let time pass, as fast as the machine can."""
+    steps = iter(range(round(seconds * station.env.config.control_hz)))
+    station._wait = lambda begun, slices: (begun, slices)
+    station.run(lambda: next(steps, None) is not None)
+
+
+def test_an_arm_without_feetech_servos_is_refused(tmp_path: Path):
+    with pytest.raises(UsageError, match="panda has no Feetech servos"):
+        station_of(tmp_path, robot="panda")
+
+
+def told(station: Station, joint: int, degrees: float) -> None:
+    """Turn the torque on and tell one joint to go somewhere else, from where it is."""
+    for number, servo in enumerate(station.buses["follower"].servos):
+        servo.memory[40] = 1
+        servo.aim(station.follower.encoder()[number] + (round(degrees / 360 * 4096) if number == joint else 0))
+
+
+@pytest.mark.parametrize(("servo", "most"), [("ideal", 0.6), ("sts3215", 6.0)])
+def test_joints_go_where_they_are_told(tmp_path: Path, servo: str, most: float):
+    """Ideal servos to within a fraction of a degree; real ones sag and have play."""
+    station = station_of(tmp_path, servo)
+    before = joint_state(station.env.world)
+    told(station, 0, 20.0)
+    run(station, 2.0)
+    moved = joint_state(station.env.world) - before
+    assert moved[0] == pytest.approx(20.0, abs=most)
+    assert np.abs(moved[1:5]).max() < most
+    station.close()
+
+
+def test_an_arm_whose_torque_is_off_stays(station: Station):
+    before = joint_state(station.env.world)
+    run(station, 1.0)
+    assert np.abs(joint_state(station.env.world) - before)[:5].max() < 2.0
+
+
+def test_a_lower_gain_sags_more(station: Station):
+    sag = np.abs(station.follower.sag()).max()
+    for servo in station.buses["follower"].servos:
+        servo.memory[21] = 16
+    assert np.abs(station.follower.sag()).max() == pytest.approx(2 * sag)
+
+
+def test_servos_that_vary_differ_within_their_ranges():
+    drawn = [ServoConfig().varied(np.random.default_rng(seed)) for seed in range(50)]
+    assert len({one.stiffness for one in drawn}) == 50
+    assert all(0.7 * 27 <= one.stiffness <= 1.3 * 27 and 0 <= one.delay <= 0.035 for one in drawn)
+
+
+def test_the_expert_at_the_leader_solves_the_task_through_the_servos(station: Station):
+    station.mover = ExpertMover(station)
+    for servo in station.buses["follower"].servos:
+        servo.memory[40] = 1
+
+    def follow() -> bool:
+        for leader, follower in zip(station.buses["leader"].servos, station.buses["follower"].servos, strict=True):
+            follower.memory[42:44] = leader.memory[56:58]
+        return station.solved < 5 and station.env.get_state().step < 400
+
+    station._wait = lambda begun, slices: (begun, slices)
+    station.run(follow)
+    assert station.solved >= 5
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory) -> Iterator[Path]:
+    """The folder of a session in a process of its own, as a user has it."""
+    folder = tmp_path_factory.mktemp("serve")
+    words = ["serve", "--task.type=lift", "--leader=none", "--servo=ideal", f"--output_dir={folder}"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "manip_il.cli.main", *words], stdout=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stdout is not None
+        assert "lerobot-record" in "".join(run.stdout.readline() for _ in range(4))
+        yield folder
+        run.send_signal(signal.SIGINT)
+        assert run.wait(30) == 0
+
+
+@pytest.mark.slow
+def test_lerobots_own_drivers_open_it(served: Path):
+    """Their calibration fits, a target moves the arm, and a leader with torque is moved by what it is told."""
+    follower = SO101Follower(
+        SOFollowerRobotConfig(port=str(served / "follower"), id="follower", calibration_dir=served)
+    )
+    leader = SO101Leader(SOLeaderTeleopConfig(port=str(served / "leader"), id="leader", calibration_dir=served))
+    follower.connect(calibrate=False)
+    leader.connect(calibrate=False)
+    assert follower.is_calibrated
+    assert leader.is_calibrated
+    seen = follower.get_observation()
+    target = {**seen, "shoulder_pan.pos": seen["shoulder_pan.pos"] + 15}
+    for _ in range(40):
+        follower.send_action(target)
+        time.sleep(1 / 30)
+    assert follower.get_observation()["shoulder_pan.pos"] == pytest.approx(target["shoulder_pan.pos"], abs=1)
+    leader.enable_torque()
+    leader.send_feedback({**leader.get_action(), "wrist_flex.pos": 40.0})
+    time.sleep(2.0)
+    assert leader.get_action()["wrist_flex.pos"] == pytest.approx(40.0, abs=0.5)
+    follower.disconnect()
+    leader.disconnect()
+
+
+@pytest.mark.slow
+def test_lerobot_record_records_solved_episodes_with_the_frames_of_the_log(tmp_path: Path):
+    """The program is not changed: its keys are pressed, and beside its dataset are states and labels."""
+    root, program = tmp_path / "arm", Path(sys.executable).with_name("lerobot-record")
+    where = [f"--robot.port={root}/follower", f"--teleop.port={root}/leader"]
+    arms = ["--robot.type=so101_follower", "--robot.id=follower", "--teleop.type=so101_leader", "--teleop.id=leader"]
+    ids = [f"--robot.calibration_dir={root}", f"--teleop.calibration_dir={root}"]
+    data = ["--dataset.repo_id=local/t", f"--dataset.root={tmp_path}/data", "--dataset.single_task=lift"]
+    rest = ["--dataset.push_to_hub=false", "--dataset.num_episodes=2", "--play_sounds=false"]
+    words = ["serve", "--task.type=lift", f"--output_dir={root}", f"--log={tmp_path}/log", "--"]
+    assert main([*words, str(program), *arms, *where, *ids, *data, *rest]) == 0
+    recorded = LeRobotDataset("local/t", root=tmp_path / "data")
+    logged = [read_journal(path)[1] for path in list_episodes(tmp_path / "log")]
+    assert recorded.num_episodes == len(logged) == 2
+    assert all(episode.success for episode in logged)
+    states = np.stack(recorded.hf_dataset["observation.state"])
+    assert np.abs(states[:10] - logged[0].columns["observation.state"][:10]).max() < 0.2  # a step of the encoder
+    assert main(["data", "build", f"{tmp_path}/log", f"{tmp_path}/ours"]) == 0
