@@ -153,7 +153,6 @@ def test_a_package_brings_names(touch, monkeypatch):
 
     monkeypatch.setattr(own, "entry_points", lambda group, name: [Entry()] if name == "touch" else [])
     own.packaged_task.cache_clear()
-    get_task.cache_clear()
     assert get_task("touch").instruction == "Touch the top of the cube."
     with pytest.raises(UnknownName, match="or the path of a Python file"):
         get_task("tuch")
