@@ -28,7 +28,7 @@ from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]
 FEETECH = ("so_follower",)  # `robot_type` of the arms whose servos these are, in LeRobot
-_SLICES = 4  # times in a control step that commands reach the motors and registers are written
+_SLICES = 4  # times in a control step, at most, that commands reach the motors and registers are written
 _LATE = 0.25  # behind the wall clock by more, time is given up [s]
 _FULL_TURN = "wrist_roll"  # LeRobot's calibration gives it a whole turn
 
@@ -68,7 +68,9 @@ class Station:
         self.env, self._config = env, config
         self._servos = config.servos.ideal() if config.servo == "ideal" else config.servos
         self.names = [name.removesuffix(".pos") for name in env.scene.robot.joint_names]
-        self.slice = 1 / (env.config.control_hz * _SLICES)
+        steps = env.config.physics_steps
+        self._slices = next(count for count in range(_SLICES, 0, -1) if steps % count == 0)
+        self.slice = 1 / (env.config.control_hz * self._slices)
         self.limits = self._limits()
         names = ("follower", "leader")
         self.buses = {name: self._bus(config.output_dir, name) for name in names}
@@ -76,7 +78,7 @@ class Station:
         self.leader = Leader(self.buses["leader"], env.data.qpos[self.follower.q])
         self.mover: Mover = lambda station: None
         self.hand: F64 | None = None
-        self.seed, self.solved, self.late = 0, 0, 0
+        self.seed, self.solved = 0, 0
         self.on_read: Callable[[Read], None] = lambda read: None
         self._show()
         self.buses["follower"].on_read = self._was_read
@@ -117,27 +119,27 @@ class Station:
         servos = self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos
         self.follower.reset(servos)
         self.leader.place(self.env.data.qpos[self.follower.q])
+        self._show()
 
     def run(self, each_step: Callable[[], bool]) -> None:
         """Let time pass until `each_step`, called every control step, returns False."""
         begun, slices = time.perf_counter(), 0
         while True:
             begun, slices = self._wait(begun, slices)
-            if slices % _SLICES == 0:
+            if slices % self._slices == 0:
                 if self.hand is None:
                     self.env.begin_step()
                 if not each_step():
                     return
                 for bus in self.buses.values():
                     bus.keep()
-            self._advance(slices % _SLICES == _SLICES - 1)
+            self._advance(slices % self._slices == self._slices - 1)
             slices += 1
 
     def _wait(self, begun: float, slices: int) -> tuple[float, int]:
         """Wait for the time of a slice; returns the beginning of time, later where the machine is too slow."""
         behind = time.perf_counter() - begun - slices * self.slice / self._config.speed
         if behind > _LATE:
-            self.late += 1
             return begun + behind, slices
         time.sleep(max(0.0, -behind))
         return begun, slices
@@ -154,7 +156,7 @@ class Station:
             wanted = self.mover(self)
             self.leader.move(self.leader.q if wanted is None else wanted, most)
             self.follower.command()
-            mujoco.mj_step(env.world.model, env.data, env.config.physics_steps // _SLICES)
+            mujoco.mj_step(env.world.model, env.data, env.config.physics_steps // self._slices)
             env.world.update()
             if ends_step:
                 env.count_step()
