@@ -114,7 +114,8 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
             said[option.name] = _Said([*before, word] if option.is_list else word, option.label)
             continue
         name, equals, value = word[2:].partition("=")
-        name = name.replace("-", "_")  # as other programs write it
+        if (ours := name.replace("-", "_")) in known:  # as other programs write it
+            name = ours
         if name in MOVED:
             raise UsageError(f"--{name} has a new name: {MOVED[name]}{value or 'REWARD'}")
         kind = Path if name == CONFIG_PATH else _type_of(name, known, command)

@@ -60,7 +60,9 @@ class ServeOptions:
 
         env = common.env_config({"robot": "so101", **self.env})
         policy = find_policy(self.policy.path) if self.policy.path is not None else None
-        cameras = common.camera_config(self.cameras, self.image) or (policy_cameras(policy) if policy else None)
+        cameras = policy_cameras(policy) if policy is not None else None
+        if self.cameras:
+            cameras = common.camera_config(self.cameras, self.image)
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)
         session = SessionConfig(
             **self.session, policy=policy, servos=ServoConfig(**self.servos), varies=SERVO in self.vary

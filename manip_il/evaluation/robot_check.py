@@ -266,7 +266,7 @@ def _task_advice(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
             change = f"choose a narrower one, --task.object=box:{narrow:.3g}, or widen gripper.open"
         sizes = f"{1000 * task.width:.0f} mm wide, the gripper opens {1000 * check.opening:.0f} mm"
         yield f"{task.name}: its object is {sizes}: {change}."
-    elif task.refused:
+    elif task.refused and check.table:  # else it is said of the whole workspace
         yield f"{task.name}: {task.refused}."
     elif task.clean is not None:
         success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))

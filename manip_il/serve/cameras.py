@@ -12,7 +12,7 @@ import cv2
 import mujoco
 import zmq
 
-from manip_il.errors import UsageError
+from manip_il.errors import RenderError, UsageError
 from manip_il.serve.station import Station
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
@@ -24,9 +24,8 @@ _QUALITY: list[int] = [cv2.IMWRITE_JPEG_QUALITY, 90]
 class Cameras:
     """A thread that shows a station's world on one port, `RATE` times a second.
 
-    images: the last ones, camera -> (H, W, 3). shown: how many so far; slow: rate that
-    the machine allows, where it is less [1/s].
-    Raises `UsageError` for a port that is taken.
+    images: the last ones, camera -> (H, W, 3). shown: how many so far; slow: rate that the machine allows,
+    where it is less [1/s]. Raises `UsageError` for a port that is taken, `RenderError` without off-screen OpenGL.
     """
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
@@ -41,9 +40,14 @@ class Cameras:
             self._socket.bind(f"tcp://127.0.0.1:{port}")
         except zmq.ZMQError as error:
             raise UsageError(f"--camera_port={port} cannot be used ({error}); give another one") from error
-        self._stop = threading.Event()
+        self._stop, self._began = threading.Event(), threading.Event()
+        self._error: RenderError | None = None
+        render.close()  # OpenGL belongs to the thread that made it: from here on that is ours
         self._thread = threading.Thread(target=self._run, name="cameras", daemon=True)
         self._thread.start()
+        self._began.wait()
+        if self._error is not None:
+            raise self._error
 
     def close(self) -> None:
         """End the thread, and free the port."""
@@ -52,17 +56,22 @@ class Cameras:
         self._socket.close()
 
     def _run(self) -> None:
-        """OpenGL belongs to the thread that made it: everything is drawn here."""
-        due = time.perf_counter()
-        while not self._stop.wait(max(0.0, due - time.perf_counter())):
-            begun = time.perf_counter()
-            self._socket.send_string(self._message())
-            took = time.perf_counter() - begun
-            self.shown += 1
-            if self.shown >= 10:
-                self.slow = 1 / took if took > 1 / RATE else 0.0
-            due = max(due + 1 / RATE, time.perf_counter())
-        render.close()
+        try:
+            due = time.perf_counter()
+            while not self._stop.wait(max(0.0, due - time.perf_counter())):
+                begun = time.perf_counter()
+                self._socket.send_string(self._message())
+                took = time.perf_counter() - begun
+                self._began.set()
+                self.shown += 1
+                if self.shown >= 10:
+                    self.slow = 1 / took if took > 1 / RATE else 0.0
+                due = max(due + 1 / RATE, time.perf_counter())
+        except RenderError as error:
+            self._error = error
+            self._began.set()
+        finally:
+            render.close()
 
     def _message(self) -> str:
         env = self._station.env

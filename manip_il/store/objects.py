@@ -31,7 +31,9 @@ TIMEOUT = 30.0  # of connecting to an ssh server, and of any one answer [s]
 _FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # of object stores: what others push is seen
 _S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
 _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, "sftp": {}}
-_SFTP = re.compile(r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:\d{1,4}|:[1-5]\d{4})?/[^@]+")
+_SFTP = re.compile(
+    r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
+)
 _AT_ONCE, _SMALL_AT_ONCE = 4, 10  # files; s3fs holds as many parts of large ones in memory, and has ten connections
 _SMALL = 10_000_000  # bytes of the largest file
 

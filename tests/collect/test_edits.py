@@ -145,7 +145,7 @@ def edit_own_file(part: str, **entries: object) -> Callable[[Path], None]:
     ("change", "words"),
     [
         (edit_own_file("spec", robot="ur5"), "the robot 'ur5' .* states cannot be restored"),
-        (edit_own_file("spec", task="juggle"), "the task 'juggle', which are not both known"),
+        (edit_own_file("spec", task="juggle"), "the task 'juggle', of which not all is known here"),
         (edit_own_file("spec", sim_state_size=7), "size of sim_state differs: .* has 7"),
         (lambda root: (root / layout.INFO).unlink(), "is not a LeRobot dataset"),
     ],
