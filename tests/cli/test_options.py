@@ -82,7 +82,7 @@ def test_words_change_what_they_name(words, change):
     ("words", "parts"),
     [
         (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help=all lists all"]),
-        (["--repo-id=x"], ["unknown option '--repo_id' (did you mean '--dataset.repo_id' or '--small.repo_id'?)"]),
+        (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--dataset.repo_id' or '--small.repo_id'?)"]),
         (["--dataset=x"], ["--dataset is a group", "--dataset.num_episodes"]),
         (["--lr=fast"], ["--lr", "expected a number", "'fast'"]),
         (["--lr=nan"], ["expected a number"]),
