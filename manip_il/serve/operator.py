@@ -25,7 +25,7 @@ _TERMINAL = 0.001  # that what is printed may take to get here [s]
 _PATIENCE = 2  # horizons before an episode counts as failed
 _DIFFERS = 0.25  # how long a policy differs from the expert before it is corrected [s]
 _DWELL = 0.5  # of a joint at the end of its range [s]
-URGENT = 10  # how much nicer the program is than what answers it
+URGENT = 10  # how far the priority of what answers is above the program's
 _HIDDEN = ("DISPLAY", "WAYLAND_DISPLAY")  # without them LeRobot reads its keys from the terminal
 
 
@@ -47,7 +47,7 @@ class Operator:
     ):
         self.station, self._expert, self._seeds, self._log, self._intervene = station, expert, seeds, log, intervene
         self._keep = True
-        self._mover, self.solved, self.failed, self.corrections = station.mover, 0, 0, 0
+        self._mover, self.solved, self.failed = station.mover, 0, 0
         self._heard, self.status = "", None
         self._happened = deque[str | Read]()
         self._doing: Iterator[None] = iter(())
@@ -65,7 +65,6 @@ class Operator:
             (r"Connect the controller board to the '(\w+)' motor only", self._connect),
             (r"Move .* to the middle of its range of motion", self._centre),
             (r"sequentially through their entire ranges|Move all joints except", self._sweep),
-            (r"RECORDING STARTED", self._sweep_by_leader),
         ]
         station.mover = lambda station: None  # the arms stand until an episode begins
         self._pid, self._terminal = _start(command)
@@ -224,7 +223,6 @@ class Operator:
             self._log.driver = Actor.EXPERT
         yield from self._attempt()
         self._count()
-        self.corrections += 1
         self._end(keep=True)
         self._press(CORRECT)
 
@@ -258,15 +256,6 @@ class Operator:
         yield from self._wait(_DWELL)
         self.station.hand = None
         self.station.reset(self.station.seed)
-
-    def _sweep_by_leader(self) -> Iterator[None]:
-        low, high = self.station.limits.T
-        for joint in range(len(low)):
-            for end in (low, high):
-                goal = self.station.leader.q.copy()
-                goal[joint] = end[joint]
-                self.station.mover = lambda station, goal=goal: goal
-                yield from self._wait(1.0)
 
 
 def _start(command: Sequence[str]) -> tuple[int, int]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from serial import Serial
 
 from manip_il.serve.chain import BROADCAST, CENTRE, GOAL, HOMING_OFFSET, POSITION, Chain, Register
 from manip_il.serve.port import Port
@@ -99,3 +100,18 @@ def test_garbage_is_not_answered_and_what_follows_is():
                 found += [answer] if answer else []
         assert found
         assert {*found} == {right}
+
+
+def test_of_two_programs_on_a_port_the_second_gets_no_answer(tmp_path: Path):
+    port, refused = Port(LIMITS, tmp_path / "arm.eeprom"), list[str]()
+    port.on_refusal = refused.append
+    with Serial(str(port.path), timeout=2.0) as first:
+        first.write(packet(1, PING))
+        assert first.read(6) == packet(1, 0)
+        with Serial(str(port.path), timeout=0.3) as second:
+            second.write(packet(1, PING))
+            assert second.read(6) == b""
+        assert "another program" in refused[0]
+        first.write(packet(1, PING))
+        assert first.read(6) == packet(1, 0)
+    port.close()
