@@ -146,7 +146,7 @@ _QUICK = {"steps": 1_000, "episode_steps": 20, "demonstrations": 2}
 
 
 class Run:
-    """The steps that `gail` and `airl` are made of, as `LearningRun` has them, with nothing on disk."""
+    """The steps that `gail` and `airl` are made of, as `Agent` has them, with nothing on disk."""
 
     def __init__(self, name: str, settings: Settings, seed: int):
         self.simulated, self.metrics = 0, dict[str, float]()
@@ -166,14 +166,16 @@ class Run:
         with lent_generators(self._stream("discriminator")):
             return make(self._network)
 
-    def iterations(self) -> Iterator[int]:
-        while self.simulated < self._settings.steps:
-            self._number += 1
-            yield self._number
+    def agent(self) -> Run:
+        return self
 
-    def rollouts(self, number: int) -> Transitions:
+    def begin(self, agent: Run) -> Iterator[Any]:
+        return iter(())
+
+    def rollouts(self) -> Transitions:
         count = self._settings.episodes
-        self._envs.seed(stream_seeds("reinforcement", (number + 1) * count, self._seed)[-count])
+        self._number += 1
+        self._envs.seed(stream_seeds("reinforcement", (self._number + 1) * count, self._seed)[-count])
         with lent_generators(self._stream("rollouts")):
             rows = self._learner.collect()
         self.simulated += self._envs.simulated
@@ -193,7 +195,7 @@ class Run:
         with lent_generators(self._stream("updates")):
             self.metrics |= self._learner.improve(rewards, remaining=remaining)
 
-    def finish(self) -> dict[str, float]:
+    def finish(self, agent: Run) -> dict[str, float]:
         return self.metrics
 
     def acts(self, inputs: F32) -> F32:

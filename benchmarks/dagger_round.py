@@ -18,9 +18,9 @@ from pathlib import Path
 from _machine import describe_machine
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import DATASET, ImitationRun
-from manip_il.algorithms.rounds import round_folder
-from manip_il.algorithms.run import Result
+from manip_il.algorithms.results import Result
+from manip_il.algorithms.rounds import DATASET, round_folder
+from manip_il.algorithms.run import Run
 from manip_il.collect.expert import Expert
 from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.dataset import Dataset
@@ -50,7 +50,7 @@ def main() -> int:
     workers = default_workers()
     print(describe_machine())
     with tempfile.TemporaryDirectory() as name, Engine(workers) as engine:
-        for result in ImitationRun(config, Path(name), engine).results():
+        for result in Run(config, Path(name), engine).results():
             report(result, Path(name), config, workers)
     return 0
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 import manip_il.collect.expert as expert
 import manip_il.learn.mlp as mlp
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import ImitationRun
+from manip_il.algorithms.run import Run
 from manip_il.collect.environments import make_expert
 from manip_il.collect.workers import Engine
 from manip_il.learn.fit_config import FitConfig
@@ -109,7 +109,7 @@ def validation(seed: int, rounds: int, quick: bool) -> list[float]:
     )
     # In this process alone: what is patched here is not patched in others.
     with tempfile.TemporaryDirectory() as folder, Engine(1) as engine:
-        return [result.validation.success.rate for result in ImitationRun(config, Path(folder), engine).results()]
+        return [result.validation.success.rate for result in Run(config, Path(folder), engine).results()]
 
 
 def fall(rates: list[float]) -> float:

@@ -21,7 +21,7 @@ import numpy as np
 from _machine import describe_machine
 
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.algorithms.learning_run import LearningRun
+from manip_il.algorithms.run import Run
 from manip_il.algorithms.vector_env import RobotEpisode
 from manip_il.cli.main import main as command
 from manip_il.collect.workers import Engine
@@ -75,26 +75,27 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
         raise SystemExit("recording failed")
     env = make_config(robot, task)
     config = LearningConfig(method="gail", env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
-    run = LearningRun(config, folder, Engine())
+    run = Run(config, folder, Engine())
+    agent = run.agent()
     recorded = [Recorded(env, None) for _ in range(config.episodes)]
-    for one, episode in zip(run.envs.envs, recorded, strict=True):
+    for one, episode in zip(agent.envs.envs, recorded, strict=True):
         one.episode = episode
-    d = run.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
+    d = agent.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
     found = []
-    for number, _ in zip(run.iterations(), range(iterations), strict=False):
+    for _ in range(iterations):
         times = [time.process_time()]
-        learner = run.rollouts(number)
+        steps = agent.rollouts()
         times.append(time.process_time())
-        run.discriminate(d, learner)
-        run.improve(d.reward(learner))
-        run.finish()
+        agent.discriminate(d, steps)
+        agent.improve(d.reward(steps))
+        run.finish(agent)
         times.append(time.process_time())
         for episode in recorded:
             episode.replay()
         times.append(time.process_time())
         acting, learning, raw = np.diff(times)
-        steps = run.envs.simulated
-        found.append((steps / (acting + learning), steps / acting, steps / raw))
+        simulated = agent.envs.simulated
+        found.append((simulated / (acting + learning), simulated / acting, simulated / raw))
     return found
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from _machine import describe_machine
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import ImitationRun
+from manip_il.algorithms.run import Run
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.parsing import from_yaml
 from manip_il.collect.workers import Engine, default_workers
@@ -65,7 +65,7 @@ def reach_goals(config: RunConfig, limit: float | None) -> list[float]:
     print("round  labels  success (200 validation seeds)  seconds without evaluation")
     left, started, evaluation = list(GOALS), time.monotonic(), 0.0
     with tempfile.TemporaryDirectory() as folder, Engine(default_workers()) as engine:
-        for result in ImitationRun(config, Path(folder), engine).results():
+        for result in Run(config, Path(folder), engine).results():
             evaluation += result.seconds["validate"]
             spent = time.monotonic() - started - evaluation
             print(

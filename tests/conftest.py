@@ -31,7 +31,7 @@ IMPORTED_ONCE = [
     "manip_il.cli.dagger",
     "manip_il.cli.evaluate",
     "manip_il.cli.study",
-    "manip_il.algorithms.imitation",
+    "manip_il.algorithms.run",
     "manip_il.collect.record",
     "manip_il.collect.job",
     "manip_il.evaluation.eval_report",

@@ -3,16 +3,18 @@
 from collections.abc import Iterator
 
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.algorithms.learning_run import LearningRun
-from manip_il.algorithms.run import Result
+from manip_il.algorithms.results import Result
+from manip_il.algorithms.run import Run
 from manip_il.learn.discriminators import AirlDiscriminator
 
 
-def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield every iteration: roll out the learner, fit f by D = exp f / (exp f + pi), improve it by f - log pi."""
-    d = run.keep(lambda actor: AirlDiscriminator(c.discriminator, actor, c.discount))
-    for i in run.iterations():
-        learner = run.rollouts(i)
-        run.discriminate(d, learner)
-        run.improve(d.reward(learner, run.log_prob(learner)))
-        yield run.finish()
+def airl(run: Run, c: LearningConfig) -> Iterator[Result]:
+    """Yield every iteration: roll out the agent, fit f by D = exp f / (exp f + pi), improve it by f - log pi."""
+    agent = run.agent()
+    d = agent.keep(lambda actor: AirlDiscriminator(c.discriminator, actor, c.discount))
+    yield from run.begin(agent)
+    while agent.simulated < c.steps:
+        steps = agent.rollouts()
+        agent.discriminate(d, steps)
+        agent.improve(d.reward(steps, agent.log_prob(steps)))
+        yield run.finish(agent)

@@ -7,14 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import DATASET, JOURNALS, ImitationRun
-from manip_il.algorithms.rounds import Rollouts, round_folder
-from manip_il.algorithms.run import Result, Watch
+from manip_il.algorithms.results import Result, Watch
+from manip_il.algorithms.rounds import DATASET, JOURNALS, Rollouts, round_folder
+from manip_il.algorithms.run import Run
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 
 
-def cloning(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
+def cloning(run: Run, c: RunConfig) -> Iterator[Result]:
     """Yield every round: demonstrate, fit to all demonstrations, validate."""
     data: list[Rollouts] = []
     for i in range(c.rounds + 1):
@@ -31,7 +31,7 @@ def clone_with_labels(
     The demonstrations are those of round 0 of the run in `other`, and the ones that follow in their stream of seeds.
     Returns the checkpoint and the number of labels.
     """
-    run = ImitationRun(replace(config, label_budget=labels), folder, engine, watch)
+    run = Run(replace(config, label_budget=labels), folder, engine, watch)
     here, count = round_folder(folder, 0), config.demonstrations
     if not here.is_dir():
         with new_folder(here) as new:

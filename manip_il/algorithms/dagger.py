@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import ImitationRun, mixture
-from manip_il.algorithms.run import Result
+from manip_il.algorithms.results import Result
+from manip_il.algorithms.rounds import mixture
+from manip_il.algorithms.run import Run
 
 
-def dagger(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
+def dagger(run: Run, c: RunConfig) -> Iterator[Result]:
     """Yield every round: roll out the learner, query the expert where it went, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)

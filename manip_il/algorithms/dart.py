@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import ImitationRun
-from manip_il.algorithms.run import Result
+from manip_il.algorithms.results import Result
+from manip_il.algorithms.run import Run
 from manip_il.collect.drivers import NoisyExpertDriver
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
@@ -16,7 +16,7 @@ from manip_il.errors import ManipError
 from manip_il.learn.policy import LearnedPolicy, actions_along
 
 
-def dart(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
+def dart(run: Run, c: RunConfig) -> Iterator[Result]:
     """Yield every round: demonstrate under noise like the learner's errors, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)

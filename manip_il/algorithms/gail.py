@@ -3,16 +3,18 @@
 from collections.abc import Iterator
 
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.algorithms.learning_run import LearningRun
-from manip_il.algorithms.run import Result
+from manip_il.algorithms.results import Result
+from manip_il.algorithms.run import Run
 from manip_il.learn.discriminators import GailDiscriminator
 
 
-def gail(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield every iteration: roll out the learner, fit the discriminator, improve the learner by its reward."""
-    d = run.keep(lambda actor: GailDiscriminator(c.discriminator, actor))
-    for i in run.iterations():
-        learner = run.rollouts(i)
-        run.discriminate(d, learner)
-        run.improve(d.reward(learner))
-        yield run.finish()
+def gail(run: Run, c: LearningConfig) -> Iterator[Result]:
+    """Yield every iteration: roll out the agent, fit the discriminator, improve the agent by its reward."""
+    agent = run.agent()
+    d = agent.keep(lambda actor: GailDiscriminator(c.discriminator, actor))
+    yield from run.begin(agent)
+    while agent.simulated < c.steps:
+        steps = agent.rollouts()
+        agent.discriminate(d, steps)
+        agent.improve(d.reward(steps))
+        yield run.finish(agent)

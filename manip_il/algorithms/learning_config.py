@@ -14,7 +14,7 @@ LONGER = 1.5  # times the longest demonstration, by default
 
 @dataclass(frozen=True, kw_only=True)
 class LearningConfig:
-    """Options of `LearningRun`. method: `gail`, `airl` or `ppo`. datasets: demonstrations.
+    """Options of a run of reinforcement learning. method: `gail`, `airl` or `ppo`. datasets: demonstrations.
 
     start, reward: `pretrained_model` folders of a clone, and of the reward that `ppo` learns from.
     Raises `UsageError` for a number out of range.

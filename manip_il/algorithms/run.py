@@ -1,102 +1,80 @@
-"""One run in a folder: what imitation and reinforcement learning have in common.
+"""One run of a method in a folder: the steps that the loops of `cloning`, `dart`, `dagger`, `gail`, `airl`, `ppo` take.
 
 Every step leaves its result in the folder, whole, and is skipped if that is there already: a run that was killed goes
 on where it was by running its loop again.
+
+    round_003/           of imitation: see `rounds`
+    held_out/            the expert's demonstrations that no policy learns from
+    dataset/             all rounds' labels, once the run has ended
+    checkpoints/last/    of reinforcement learning, the last finished iteration: see `agent`
+    validation/          by iteration, every validated policy and its eval.json
+    best/                the policy with the highest validation success, the later of equals
 """
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import shutil
-import time
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from manip_il.algorithms.results import VALIDATION, Clock, Result, Watch, best_result, best_validation, validations
+from manip_il.algorithms.rounds import (
+    DATASET,
+    JOURNALS,
+    REDRAWN,
+    Fitted,
+    Rollouts,
+    begin_with,
+    expert_job,
+    fit_round,
+    given_rollouts,
+    merge_rounds,
+    read_rollouts,
+    record_round,
+    round_fit,
+    round_folder,
+    round_scenes,
+)
+from manip_il.collect.drivers import Driver, PolicyDriver
+from manip_il.collect.edits import Source, Target, redraw_dataset
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.workers import Engine
+from manip_il.collect.query import Query
+from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance, record
+from manip_il.collect.scenes import CHUNK
+from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.atomic import new_folder
-from manip_il.errors import ManipError
-from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.evaluation.runner import evaluate
-from manip_il.learn.training_state import PRETRAINED_MODEL
-from manip_il.mdp import Episode
+from manip_il.data.build import Recording
+from manip_il.data.dataset import Dataset
+from manip_il.data.journal import list_episodes, read_journal
+from manip_il.evaluation.results import FILE_NAME, EvalResult
+from manip_il.evaluation.runner import HOLD, evaluate
+from manip_il.learn.training_state import PRETRAINED_MODEL, last_checkpoint
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL
+from manip_il.sim.events import standard_in
 
-BEST = "best"
-STAGES = ("collect", "fit", "validate")
+if TYPE_CHECKING:  # torch and stable-baselines3 stay out of what only rolls out
+    from manip_il.algorithms.agent import Agent
 
-
-@dataclass(frozen=True)
-class Watch:
-    """Functions that a run calls with its progress. An exception from one ends the run; what is on disk stays."""
-
-    on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
-    on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
-    on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} at a step without metrics
-    on_step: Callable[[], None] = lambda: None  # of anything else
-
-
-@dataclass(frozen=True)
-class Result:
-    """One finished round of imitation, or iteration of reinforcement learning; 0 is what an iteration began with.
-
-    steps, episodes: simulated so far. metrics: of the method, such as `labels`, the sound ones learnt from so far.
-    policy: its checkpoint. validated: None if no validation was due. seconds: by stage, 0 of one that was found
-    finished on disk.
-    """
-
-    unit: Literal["round", "iteration"]
-    number: int
-    steps: int
-    episodes: int
-    metrics: dict[str, float]
-    policy: Path
-    validated: EvalResult | None
-    seconds: dict[str, float]
-
-    @property
-    def validation(self) -> EvalResult:
-        """The validation. Raises `ManipError` if none was due."""
-        if self.validated is None:
-            raise ManipError(f"{self.unit} {self.number} was not validated")
-        return self.validated
-
-    @property
-    def labels(self) -> int:
-        """Sound labels learnt from so far."""
-        return int(self.metrics["labels"])
-
-    def to_json(self) -> dict[str, Any]:
-        """Return one line of `metrics.jsonl`."""
-        success = None if self.validated is None else self.validated.success
-        return {
-            self.unit: self.number,
-            "steps": self.steps,
-            "episodes": self.episodes,
-            **self.metrics,
-            "validation_success": None if success is None else success.rate,
-            "validation_interval": None if success is None else list(success.interval),
-            "validation_episodes": None if success is None else success.n,
-            "seconds": self.seconds,
-        }
-
-
-def best_result(results: Iterable[Result]) -> Result:
-    """Return the highest validation success; of equals the later, which has seen more."""
-    return max(results, key=lambda result: (result.validation.success.rate, result.number))
+BEST, CHECKPOINTS, HELD_OUT = "best", "checkpoints", "held_out"
 
 
 class Run:
-    """A folder, the workers, seconds by stage, and the validation by which the best policy is chosen."""
+    """A folder, the workers, and what has been made so far.
 
-    def __init__(self, config: Any, folder: Path, engine: Engine, watch: Watch | None):
+    config: a `RunConfig` for imitation, a `LearningConfig` for reinforcement learning.
+    """
+
+    def __init__(self, config: Any, folder: Path, engine: Engine, watch: Watch | None = None):
         self.config, self.folder = config, folder
-        self._engine, self._watch = engine, watch or Watch()
-        self._seconds: dict[str, float] = {}
+        self._engine, self._watch, self._clock = engine, watch or Watch(), Clock()
+        self._made: dict[int, Rollouts] = {}
+        self._held_out_steps = 0
+        self._fitted: Fitted | None = None
 
     def results(self) -> Iterator[Result]:
         """Run, or go on with, the loop of the method: the function of its name, in the module of its name."""
@@ -105,24 +83,177 @@ class Run:
         return self.follow(loop(self, self.config))
 
     def follow(self, results: Iterator[Result]) -> Iterator[Result]:
-        """Yield what a loop over the steps of this run yields, until the run has ended."""
-        return results
+        """Yield what a loop over the steps of this run yields, until it ends or the label budget is spent.
 
-    @contextmanager
-    def _timed(self, stage: str) -> Generator[None]:
-        """Add what a stage takes to the seconds."""
-        started = time.monotonic()
-        yield
-        self._seconds[stage] = self._seconds.get(stage, 0.0) + time.monotonic() - started
+        Rounds that were finished before are yielded again. After the last, `dataset` holds the labels of all rounds.
+        """
+        rounds: list[Result] = []
+        for result in results:
+            yield result
+            if result.unit == "round":
+                rounds.append(result)
+                if self._left(result.number + 1) == 0:
+                    break
+        if rounds:
+            best = best_result(rounds)
+            self._keep_best(best.policy)
+            made = [one.dataset for one in self._made.values() if one.dataset is not None]
+            merge_rounds(made, self.folder / DATASET, f"local/{self.config.env.name}_dagger", best.number)
 
-    def _take_seconds(self) -> dict[str, float]:
-        """The seconds of every stage since the last call, rounded."""
-        taken, self._seconds = dict.fromkeys(STAGES, 0.0) | self._seconds, {}
-        return {stage: round(seconds, 3) for stage, seconds in taken.items()}
+    def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
+        """Record `count` successful episodes of the expert as a round's; round 0 may be given, see `RunConfig`."""
+        here, config = self._folder(round_), self.config
+        if round_ == 0 and (config.datasets or config.start):
+            with self._clock.timed("collect"):
+                self._made[0] = given_rollouts(here, config.datasets, self._repo_id(0))
+            return self._made[0]
+        self._watch.on_stage("collect", round_, count)
+        with self._clock.timed("collect"):
+            if not (here / DATASET).is_dir():
+                job = expert_job(config, round_)
+                stream = f"round/{round_}" if round_ else "demonstrations"
+                seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
+                episodes = collect_successes(self._engine, job, seeds, count, here / JOURNALS, self._watch.on_episode)
+                recording = Recording(self._repo_id(round_), True, count, provenance(job), labels=self._left(round_))
+                record_round(here, job, episodes, recording)
+            self._made[round_] = read_rollouts(here, round_, beta=1.0, queried_everywhere=True)
+        return self._made[round_]
 
-    def _validate(self, job: RolloutJob, path: Path, name: str) -> EvalResult:
+    def held_out(self, count: int = 10) -> Path:
+        """Record episodes of the expert that no policy learns from; return their dataset."""
+        root, journals = (self.folder / HELD_OUT / name for name in (DATASET, JOURNALS))
+        with self._clock.timed("collect"):
+            if not root.is_dir():
+                job = replace(expert_job(self.config, 0), cameras=None)
+                episodes = collect(self._engine, job, stream_seeds("held_out", count, self.config.seed), journals)
+                record(episodes, journals, root, job, Recording("local/held_out", provenance=provenance(job)))
+            self._held_out_steps = sum(len(read_journal(path)[1]) for path in list_episodes(journals))
+        return root
+
+    def rollouts(self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0) -> Rollouts:
+        """Record a round's episodes, successful or not, with the expert's labels as `config.label` has them.
+
+        query: when the expert is queried; None: in every state. disturbed: share of the episodes that run under
+        `STANDARD` as well.
+        """
+        here, config, rule = self._folder(round_), self.config, query or Query()
+        count = config.episodes_per_round
+        self._watch.on_stage("collect", round_, count)
+        with self._clock.timed("collect"):
+            if not (here / DATASET).is_dir():
+                steps = config.steps_of_branch if config.label == "branch" else 1
+                job = replace(expert_job(config, round_), driver=driver, label=config.label, query=rule)
+                job = replace(job, branch_steps=steps, patience=config.patience if job.labels_all else None)
+                seeds, first = stream_seeds(f"round/{round_}", count, config.seed), round(disturbed * count)
+                hard = replace(job, conditions=(standard_in(job.conditions),))
+                episodes = itertools.chain(
+                    collect(self._engine, hard, seeds[:first], here / JOURNALS, self._watch.on_episode),
+                    collect(self._engine, job, seeds[first:], here / JOURNALS, self._watch.on_episode),
+                )
+                name, left = self._repo_id(round_), self._left(round_)
+                recording = Recording(name, provenance=provenance(job), only_labelled=not job.labels_all, labels=left)
+                record_round(here, job, episodes, recording)
+            everywhere = config.label == "per_state" and rule.kind in ("every", "safety")
+            self._made[round_] = read_rollouts(here, round_, driver.beta, queried_everywhere=everywhere)
+        return self._made[round_]
+
+    def fit(self, data: Sequence[Rollouts]) -> Fitted:
+        """Fit the policy, and the others of an ensemble after it, to rollouts; it belongs to the last one's round."""
+        config, before, round_ = self.config, self._fitted, data[-1].round
+        here, members = self._folder(round_), list[Path]()
+        if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
+            members.append(begin_with(config.start, here))
+        else:
+            roots = [self._learnt_from(one, one.dataset) for one in data if one.dataset is not None]
+            starts = before.members if before and config.refit == "warm" else (None,) * config.ensemble
+            for member, start in enumerate(starts):
+                name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
+                fit = round_fit(config, start, member)
+                self._watch.on_stage(name, round_, fit.total_steps)
+                with self._clock.timed("fit"):
+                    members.append(fit_round(roots, here, fit, member, self._watch.on_log))
+        self._fitted = Fitted(round_, tuple(members), config.fit.trust)
+        return self._fitted
+
+    def validate(self, policy: Fitted) -> Result:
+        """Measure a round's policy on the validation's seeds, which ends the round."""
+        round_, config = policy.round, self.config
+        self._watch.on_stage("validate", round_, config.validation_episodes)
+        driver = PolicyDriver((policy.path,), trust=config.fit.trust)
+        job = RolloutJob(config.env, driver, config.hold, label="last", conditions=config.conditions)
+        validation = self._evaluate(job, self._folder(round_) / FILE_NAME, f"DAgger round {round_}")
+        here, so_far = self._made[round_], [one for one in self._made.values() if one.round <= round_]
+        return Result(
+            unit="round",
+            number=round_,
+            steps=sum(one.steps for one in so_far) + self._held_out_steps,
+            episodes=sum(one.episodes for one in so_far),
+            metrics={
+                "beta": here.beta,
+                "labels": sum(one.labels for one in so_far),
+                # More than labels if it must answer to decide (`safety`, the held-out episodes of `dart`).
+                "queries": sum(one.queries for one in so_far) + self._held_out_steps,
+                "rollout_success": here.successes / max(1, here.episodes),
+            },
+            policy=policy.path,
+            validated=validation,
+            seconds=self._clock.take(),
+        )
+
+    def agent(self) -> Agent:
+        """Return what reinforcement learning improves, new."""
+        from manip_il.algorithms.agent import Agent
+
+        return Agent(self.config, self._clock)
+
+    def begin(self, agent: Agent) -> Iterator[Result]:
+        """Take the agent to its last finished iteration, if there is one; yield that, else the clone that it begins as.
+
+        So the line of an iteration is not lost that ended before it was written.
+        """
+        checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
+        if checkpoint is not None:
+            agent.load(checkpoint)
+            yield self._iteration(agent, checkpoint / PRETRAINED_MODEL)
+        elif start is not None:
+            yield self._iteration(agent, start)
+
+    def finish(self, agent: Agent) -> Result:
+        """Write the iteration, which ends it; validate its policy if that is due."""
+        folder = self.folder / CHECKPOINTS
+        agent.save(folder / f"{agent.number:06d}")
+        for other in folder.iterdir():
+            if not other.is_symlink() and other.name != f"{agent.number:06d}":
+                shutil.rmtree(other, ignore_errors=True)
+        self._watch.on_step()
+        return self._iteration(agent, folder / "last" / PRETRAINED_MODEL)
+
+    def _iteration(self, agent: Agent, policy: Path) -> Result:
+        """The result of an agent's iteration, with a validation if one is due; 0 is always validated."""
+        every, validated = self.config.validation_every, None
+        due = agent.simulated // every != agent.validated_at // every
+        if due or agent.simulated >= self.config.steps or agent.number == 0:
+            agent.validated_at = agent.simulated
+            validated = self._validate_kept(policy, agent.number)
+        episodes, seconds = agent.number * self.config.episodes, self._clock.take()
+        metrics = agent.metrics
+        return Result("iteration", agent.number, agent.simulated, episodes, metrics, policy, validated, seconds)
+
+    def _validate_kept(self, policy: Path, number: int) -> EvalResult:
+        """Evaluate a policy, of which the run keeps a copy, unless that has been done; keep it if it is the best."""
+        here = self.folder / VALIDATION / f"{number:06d}"
+        if not here.is_dir():
+            with new_folder(here) as new:
+                shutil.copytree(policy, new / PRETRAINED_MODEL)
+        job = RolloutJob(self.config.env, PolicyDriver((policy,)), HOLD, label="last")
+        found = self._evaluate(job, here / FILE_NAME, f"iteration {number}")
+        if number == best_validation(validations(self.folder)):
+            self._keep_best(policy)
+        return found
+
+    def _evaluate(self, job: RolloutJob, path: Path, name: str) -> EvalResult:
         """Evaluate a job on the validation's seeds and write `path`, unless that has been done. name: in the file."""
-        with self._timed("validate"):
+        with self._clock.timed("validate"):
             if path.is_file():
                 return EvalResult.read(path)
             suite = job.conditions[0].name if job.conditions else NOMINAL.name
@@ -135,3 +266,31 @@ class Run:
         """Copy the best policy's `pretrained_model` to where it is looked for."""
         with new_folder(self.folder / BEST, replace=True) as new:
             shutil.copytree(policy, new / PRETRAINED_MODEL)
+
+    def _folder(self, round_: int) -> Path:
+        return round_folder(self.folder, round_)
+
+    def _repo_id(self, round_: int) -> str:
+        return f"local/{self.config.env.name}_round_{round_}"
+
+    def _left(self, round_: int) -> int | None:
+        """Labels that may still be had in a round; None without a limit."""
+        if self.config.label_budget is None:
+            return None
+        had = sum(one.labels for one in self._made.values() if one.round < round_)
+        return max(0, self.config.label_budget - had)
+
+    def _learnt_from(self, rollouts: Rollouts, dataset: Path) -> Path:
+        """The dataset that policies learn from of a round: its own, or scenes drawn anew of its states."""
+        root = self._folder(rollouts.round) / REDRAWN
+        if not self.config.redraw:
+            return dataset
+        if not root.is_dir():
+            made = [one.dataset for one in self._made.values() if one.dataset and one.round <= rollouts.round]
+            scenes = round_scenes(self.config, made)
+            self._watch.on_stage("redraw", rollouts.round, len(scenes.numbers[::CHUNK]))
+            workers = min(self._engine.workers or default_workers(), default_workers())
+            with self._clock.timed("redraw"):
+                target = Target(root, workers, on_piece=self._watch.on_step)
+                redraw_dataset(Source(Dataset.open(dataset), self.config.env), scenes, target)
+        return root

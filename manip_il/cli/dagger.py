@@ -17,7 +17,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.run import Result
+    from manip_il.algorithms.results import Result
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.figures import Curve
     from manip_il.evaluation.report import Report
@@ -81,7 +81,7 @@ class DaggerOptions:
         say(f"best policy: {best}", f"next: manip-il eval --policy.path={best}{own} --output_dir={folder}/test")
 
     def config(self) -> RunConfig:
-        """Return what `ImitationRun` takes; raises for what does not go together, or does not fit what is given."""
+        """Return what `Run` takes; raises for what does not go together, or does not fit what is given."""
         from manip_il.cli.inputs import check_given, round_policy
         from manip_il.collect.query import parse_query  # which imports numpy
         from manip_il.evaluation.suites import varied
@@ -121,7 +121,7 @@ class DaggerOptions:
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Result]:
     """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
-    from manip_il.algorithms.imitation import ImitationRun
+    from manip_il.algorithms.run import Run
     from manip_il.collect.environments import env_fingerprint
     from manip_il.evaluation.results import write_json
 
@@ -129,7 +129,7 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     write_json(folder / FINGERPRINT_FILE, fingerprint)
     results: list[Result] = []
     there = {record["round"] for record in read_lines(folder / METRICS_FILE)}
-    for result in ImitationRun(config, folder, engine, stages.watch()).results():
+    for result in Run(config, folder, engine, stages.watch()).results():
         stages.close()
         if result.number not in there:  # else from before an interruption, with the seconds of then
             append_line(folder / METRICS_FILE, result.to_json())
@@ -141,7 +141,7 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
 
 
 def _report(options: DaggerOptions, config: RunConfig, results: list[Result]) -> Report:
-    from manip_il.algorithms.run import best_result
+    from manip_il.algorithms.results import best_result
     from manip_il.evaluation.eval_report import run_report
     from manip_il.evaluation.results import compare_results
     from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow

@@ -95,7 +95,7 @@ class DemoOptions:
     ) -> tuple[list[Path | None], list[PolicyRow]]:
         """Run DAgger, clone from as many labels, and test both, their beginning and the expert (no policy)."""
         from manip_il.algorithms.cloning import clone_with_labels
-        from manip_il.algorithms.run import best_result
+        from manip_il.algorithms.results import best_result
         from manip_il.evaluation.runner import Trial
         from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, PolicyRow
         from manip_il.seeding import stream_seeds

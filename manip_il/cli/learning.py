@@ -53,7 +53,7 @@ class Learning:
 
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
-        from manip_il.algorithms.learning_run import learning_report, validations
+        from manip_il.algorithms.results import learning_report, validations
         from manip_il.collect.workers import Engine
 
         config = self.learning_config()
@@ -83,11 +83,11 @@ class Learning:
         return LearningConfig(method=self.method, env=env, ppo=self.ppo, **more, **self.settings)
 
     def _learn(self, config: LearningConfig, folder: Path, engine: Engine, stages: Stages) -> None:
-        from manip_il.algorithms.learning_run import LearningRun
-        from manip_il.algorithms.run import Watch
+        from manip_il.algorithms.results import Watch
+        from manip_il.algorithms.run import Run
 
         watch, metrics = Watch(on_episode=lambda _: stages.check(), on_step=stages.check), folder / METRICS_FILE
-        results = LearningRun(config, folder, engine, watch).results()
+        results = Run(config, folder, engine, watch).results()
         stages.start(f"{self.title}, steps", config.steps)
         written = {record["iteration"] for record in read_lines(metrics)}
         for result in results:

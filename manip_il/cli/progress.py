@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from manip_il.errors import ManipError, UsageError, printable
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.run import Watch
+    from manip_il.algorithms.results import Watch
     from manip_il.evaluation.results import EpisodeResult
     from manip_il.mdp import Episode
 
@@ -158,7 +158,7 @@ class Stages:
 
     def watch(self) -> Watch:
         """Return the callbacks that a run of an algorithm reports to."""
-        from manip_il.algorithms.run import Watch
+        from manip_il.algorithms.results import Watch
 
         return Watch(
             on_stage=lambda stage, round_, total: self.start(f"round {round_}, {stage}", total),

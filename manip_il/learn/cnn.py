@@ -18,9 +18,9 @@ from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, KEYPOINTS, STATE
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.keypoints import KeypointEncoder, heat_map_losses
-from manip_il.learn.mlp import MLPConfig, MLPPolicy
+from manip_il.learn.mlp import MLPConfig, MLPPolicy, offsets_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
-from manip_il.learn.network import MLPNetwork, fit_statistics
+from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
 from manip_il.learn.samples import Table
 from manip_il.option import option
 
@@ -39,9 +39,10 @@ class CNNConfig(MLPConfig):
     camera. aux_weight: while learning, weight of the mean absolute error, in standard deviations, of reading
     `observation.environment_state` off joints and keypoints by a perceptron, if the dataset has that column and
     it is not an input. The action is read off what was read off, too, and off joints and keypoints; acting never sees
-    the true state. heatmap_weight: while learning, weight of the cross-entropy [nats] of heat maps against the places
-    of points that the scene names (`privileged.keypoints.<camera>`), each of which has a keypoint of its own beside the
-    others; 0: off. What is not said here is the mlp's.
+    the true state. scales: as the mlp's, of the offsets in what was read off, or in the state if it is an input;
+    scaled: their columns there. heatmap_weight: while learning, weight of the cross-entropy [nats] of heat maps against
+    the places of points that the scene names (`privileged.keypoints.<camera>`), each of which has a keypoint of its own
+    beside the others; 0: off. What is not said here is the mlp's.
 
     `use_amp` takes the convolutions of learning to half precision, if the processor has bfloat16: twice as fast.
     Acting is always in single precision.
@@ -66,8 +67,6 @@ class CNNConfig(MLPConfig):
         self.channels = tuple(self.channels)
         if len(self.channels) < 2 or min(self.channels) < 1:
             raise UsageError(f"policy.channels is {list(self.channels)}; expected two layers or more")
-        if self.scales:
-            raise UsageError("policy.scales is for the mlp, which is given offsets; the cnn sees them in pictures")
 
     @override
     def validate_features(self) -> None:
@@ -142,21 +141,29 @@ class CNNPolicy(MLPPolicy):
             self.privileged = _perceptron(self.seen_size, config.width, config.depth, size)
             self.register_buffer("truth_mean", torch.zeros(size))
             self.register_buffer("truth_scale", torch.ones(size))
-        self.model = MLPNetwork(self.seen_size + size, n, config)
+        self.offsets = list(config.scaled) if size or ENVIRONMENT_STATE in self.inputs else []
+        shape = Shape.of(vars(config) | {"scales": (), "scaled": ()})  # offsets are squashed here
+        self.model = MLPNetwork(self.seen_size + size + len(config.scales) * len(self.offsets), n, shape)
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return joint state, keypoints and what is read off them (B, d)."""
+        """Return joint state, keypoints, what is read off them, and offsets at each scale (B, d)."""
         keypoints = [encoder(batch[key]) for encoder, key in zip(self.encoders, self.cameras, strict=True)]
         seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
-        if self.privileged is None:
-            return seen
+        parts, around, config = [seen], batch.get(ENVIRONMENT_STATE), cast(CNNConfig, self.config)
         with torch.autocast(seen.device.type, enabled=False):
-            width, config = self.seen_size, cast(CNNConfig, self.config)
-            encoded = ((seen - self.model.input_mean[:width]) * self.model.input_scale[:width]).clamp(
-                -config.clamp, config.clamp
-            )
-            return torch.cat([seen, self.privileged(encoded)], dim=-1)
+            if self.privileged is not None:
+                width = self.seen_size
+                encoded = ((seen - self.model.input_mean[:width]) * self.model.input_scale[:width]).clamp(
+                    -config.clamp, config.clamp
+                )
+                parts.append(self.privileged(encoded))
+                varies = self.truth_scale > 0
+                deviation = torch.where(varies, 1.0 / self.truth_scale, torch.zeros_like(self.truth_scale))
+                around = self.truth_mean + deviation * parts[1]
+            if around is not None and self.offsets:
+                parts += [torch.tanh(around[:, self.offsets] / scale) for scale in config.scales]
+            return torch.cat(parts, dim=-1)
 
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -166,7 +173,8 @@ class CNNPolicy(MLPPolicy):
                 return losses
             if (truth := self._of_frames(ENVIRONMENT_STATE, batch)) is not None:
                 wanted = (truth - self.truth_mean) * self.truth_scale
-                losses = losses + self.aux_weight * (inputs[:, self.seen_size :] - wanted).abs().mean(-1)
+                read_off = inputs[:, self.seen_size : self.seen_size + wanted.shape[1]]
+                losses = losses + self.aux_weight * (read_off - wanted).abs().mean(-1)
             if (places := self._of_frames(KEYPOINTS, batch)) is not None:
                 losses = losses + self.heatmap_weight * self._heat_map_losses(places)
             return losses
@@ -189,6 +197,12 @@ class CNNPolicy(MLPPolicy):
         maps = [(cast(KeypointEncoder, one).maps, at) for one, at in cameras]
         found = [heat_map_losses(one[:, : at.shape[1]], at.to(one.device)) for one, at in maps if one is not None]
         return torch.stack(found).mean(0)
+
+    @override
+    def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
+        """The columns of the environment state, which is an input or read off, that are offsets."""
+        reads = ENVIRONMENT_STATE in self.inputs or cast(CNNConfig, config).aux_weight > 0
+        return offsets_of(features if reads else {})
 
     @override
     def _more_columns(self) -> Sequence[str]:

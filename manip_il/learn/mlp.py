@@ -7,7 +7,7 @@ LeRobot finds all three in the module of the options' class. A plugin of LeRobot
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, override
 
@@ -153,12 +153,8 @@ class MLPPolicy(PreTrainedPolicy):
 
     def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
         """The columns of the inputs that say how far one thing is from another."""
-        names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in self.inputs else []
         n = (config.input_features or {})[STATE].shape[0]
-        found = tuple(n + i for i, name in enumerate(names) if "_from_" in name)
-        if not found:
-            raise UsageError(f"policy.scales is for offsets (..._from_...) among the inputs; there are {list(names)}")
-        return found
+        return tuple(n + i for i in offsets_of(features if ENVIRONMENT_STATE in self.inputs else {}))
 
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
         targets = self.model.encode_targets(self.model.relative(batch[ACTION], inputs))
@@ -193,6 +189,15 @@ class MLPPolicy(PreTrainedPolicy):
         targets = self.model.relative(actions, seen)
         inputs = self.model.expanded(seen).numpy()
         self.model.set_statistics(fit_statistics(inputs, targets.numpy(), self.model.loss))
+
+
+def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
+    """Return the columns of the environment state that say how far one thing is from another; `UsageError` for none."""
+    names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
+    found = tuple(i for i, name in enumerate(names) if "_from_" in name)
+    if not found:
+        raise UsageError(f"policy.scales is for offsets (..._from_...) among what is seen; there are {list(names)}")
+    return found
 
 
 def make_mlp_pre_post_processors(

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from manip_il.algorithms.agent import Agent
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.algorithms.learning_run import LearningRun, best_validation, validations
 from manip_il.algorithms.ppo import ppo
-from manip_il.algorithms.run import Result
+from manip_il.algorithms.results import Clock, Result, best_validation, validations
+from manip_il.algorithms.run import Run
 from manip_il.cli.main import main
 from manip_il.collect.workers import Engine
 from manip_il.errors import MismatchError, UsageError
@@ -56,7 +57,7 @@ def cloned(tmp_path_factory) -> Path:
 def run(config: LearningConfig, folder: Path, count: int | None = None) -> list[Result]:
     """Run an algorithm, or go on with it, for at most so many iterations beyond what it begins with."""
     begun = int(config.start is not None or (folder / "checkpoints").is_dir())
-    results = LearningRun(config, folder, Engine()).results()
+    results = Run(config, folder, Engine()).results()
     return list(itertools.islice(results, begun, None if count is None else begun + count))
 
 
@@ -121,8 +122,8 @@ def test_a_reward_that_is_given_sees_steps_as_datasets_have_them(config, cloned,
         return -np.abs(actions - states).sum(1).astype(np.float32)
 
     config = replace(config, datasets=(), start=cloned, episode_steps=10, steps=60, warmup=0)
-    results = list(ppo(LearningRun(config, tmp_path, Engine()), config, reward))
-    assert [one.steps for one in results] == [40, 80]
+    results = list(ppo(Run(config, tmp_path, Engine()), config, reward))
+    assert [one.steps for one in results] == [0, 40, 80]
     assert seen == [[40, 8, 8]] * 2
 
 
@@ -133,12 +134,12 @@ def test_no_file_of_a_run_names_the_machines_folders(config, tmp_path):
         assert str(config.datasets[0]) not in path.read_text()
 
 
-def test_what_cannot_begin_is_refused(config, cloned, tmp_path):
+def test_what_cannot_begin_is_refused(config, cloned):
     with pytest.raises(UsageError, match=r"give --dataset\.root=DIR or --init=RUN"):
-        LearningRun(replace(config, datasets=()), tmp_path, Engine())
+        Agent(replace(config, datasets=()), Clock())
     with pytest.raises(MismatchError, match=r"joint_delta, --action_space has ee_delta"):
-        LearningRun(replace(config, start=cloned, action_space="ee_delta"), tmp_path, Engine())
+        Agent(replace(config, start=cloned, action_space="ee_delta"), Clock())
     with pytest.raises(UsageError, match="episodes is 5; expected a multiple"):
-        LearningRun(replace(config, episodes=5), tmp_path, Engine())
+        Agent(replace(config, episodes=5), Clock())
     with pytest.raises(UsageError, match="episode_steps is 10; expected at least"):
-        LearningRun(replace(config, episode_steps=10), tmp_path, Engine())
+        Agent(replace(config, episode_steps=10), Clock())

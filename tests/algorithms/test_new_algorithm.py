@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.imitation import ImitationRun, mixture
-from manip_il.algorithms.rounds import Rollouts
-from manip_il.algorithms.run import Result, Watch
+from manip_il.algorithms.results import Result, Watch
+from manip_il.algorithms.rounds import Rollouts, mixture
+from manip_il.algorithms.run import Run
 from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
@@ -32,13 +32,13 @@ CONFIG = RunConfig(
 )
 
 
-def expert_only(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
+def expert_only(run: Run, c: RunConfig) -> Iterator[Result]:
     """Fit to the expert's demonstrations, once."""
     policy = run.fit([run.demonstrations(c.demonstrations)])
     yield run.validate(policy)
 
 
-def halves(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
+def halves(run: Run, c: RunConfig) -> Iterator[Result]:
     """Let expert and learner drive half of the steps each, and learn from the latest rollouts alone."""
     data: Rollouts = run.demonstrations(c.demonstrations)
     for i in range(1, c.rounds + 1):
@@ -49,7 +49,7 @@ def halves(run: ImitationRun, c: RunConfig) -> Iterator[Result]:
 
 
 def follow(algorithm, folder: Path, watch: Watch | None = None) -> list[Result]:
-    run = ImitationRun(CONFIG, folder, Engine(), watch)
+    run = Run(CONFIG, folder, Engine(), watch)
     return list(run.follow(algorithm(run, CONFIG)))
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.algorithms import imitation
+from manip_il.algorithms import run as runs
 from manip_il.algorithms.config import BetaSchedule, RunConfig
-from manip_il.algorithms.imitation import ImitationRun
+from manip_il.algorithms.results import Result, Watch, best_result
 from manip_il.algorithms.rounds import round_folder
-from manip_il.algorithms.run import Result, Watch, best_result
+from manip_il.algorithms.run import Run
 from manip_il.collect.query import Query
 from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset, joined_columns
@@ -51,7 +51,7 @@ def datasets(folder: Path, last: int) -> list[Path]:
 def run(tmp_path_factory) -> tuple[Path, list[Result], list[Episode]]:
     """One whole run: its folder, its rounds, and every episode that it made."""
     folder, made = tmp_path_factory.mktemp("dagger"), list[Episode]()
-    results = list(ImitationRun(CONFIG, folder, Engine(), Watch(on_episode=made.append)).results())
+    results = list(Run(CONFIG, folder, Engine(), Watch(on_episode=made.append)).results())
     return folder, results, made
 
 
@@ -126,7 +126,7 @@ def test_running_it_again_computes_nothing_anew(run, monkeypatch):
 
     monkeypatch.setattr(Engine, "run", refuse)
     logged: list[dict] = []
-    again = list(ImitationRun(CONFIG, folder, Engine(), Watch(on_log=logged.append)).results())
+    again = list(Run(CONFIG, folder, Engine(), Watch(on_log=logged.append)).results())
     assert logged == []
     assert [replace(result, seconds={}) for result in again] == [replace(result, seconds={}) for result in results]
     assert files(folder) == before
@@ -148,14 +148,14 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
             raise Stop
 
     with pytest.raises(Stop):
-        list(ImitationRun(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)).results())
-    again = list(ImitationRun(CONFIG, tmp_path, Engine()).results())
+        list(Run(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)).results())
+    again = list(Run(CONFIG, tmp_path, Engine()).results())
     assert [result.validation for result in again] == [result.validation for result in results]
     check_same_data(tmp_path, whole)
 
 
 def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, begun):
-    results = list(ImitationRun(replace(CONFIG, refit="warm"), tmp_path, Engine()).results())
+    results = list(Run(replace(CONFIG, refit="warm"), tmp_path, Engine()).results())
     assert set(begun) == {None, results[0].policy}
     assert files(results[1].policy) != files(run[1][1].policy)
 
@@ -164,28 +164,28 @@ def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, begun):
 def begun(monkeypatch) -> list[Path | None]:
     """Where fits begin, from now on."""
     found: list[Path | None] = []
-    plain = imitation.round_fit
+    plain = runs.round_fit
 
     def watch(config, *rest):
         fit = plain(config, *rest)
         found.append(fit.init_from)
         return fit
 
-    monkeypatch.setattr(imitation, "round_fit", watch)
+    monkeypatch.setattr(runs, "round_fit", watch)
     return found
 
 
 def test_a_run_begins_with_recorded_demonstrations_in_place_of_its_own(run, tmp_path):
     given = tuple(datasets(run[0], 1))
     config = replace(CONFIG, datasets=given, beta=ALONE)
-    results = list(ImitationRun(config, tmp_path / "run", Engine()).results())
+    results = list(Run(config, tmp_path / "run", Engine()).results())
     assert results[0].episodes == sum(Dataset.open(root).info.episodes for root in given)
     assert results[0].labels == joined_columns(given, ("label_valid",))["label_valid"].sum()
     assert not (round_folder(tmp_path / "run", 0) / "journals").exists()
     assert results[1].labels > results[0].labels
     aggregated = Dataset.open(tmp_path / "run" / "dataset").columns(("action",))["action"]
     np.testing.assert_array_equal(aggregated[: results[0].labels], joined_columns(given, ("action",))["action"])
-    again = list(ImitationRun(config, tmp_path / "run", Engine()).results())
+    again = list(Run(config, tmp_path / "run", Engine()).results())
     assert [result.validation for result in again] == [result.validation for result in results]
 
 
@@ -194,12 +194,12 @@ def test_a_run_begins_with_a_policy_and_goes_on_from_its_weights(run, tmp_path, 
     folder, before, _ = run
     start = before[1].policy
     config = replace(CONFIG, start=start, datasets=tuple(datasets(folder, 0)) if with_data else (), beta=ALONE)
-    results = list(ImitationRun(config, tmp_path, Engine()).results())
+    results = list(Run(config, tmp_path, Engine()).results())
     assert files(results[0].policy) == files(start)
     assert (results[0].labels > 0) == with_data
     assert set(begun) == {start}  # round 0 fits nothing
     assert results[1].labels > results[0].labels
-    assert list(ImitationRun(config, tmp_path, Engine()).results())[1].labels == results[1].labels
+    assert list(Run(config, tmp_path, Engine()).results())[1].labels == results[1].labels
 
 
 def labels(folder: Path, rounds: int) -> int:
@@ -208,7 +208,7 @@ def labels(folder: Path, rounds: int) -> int:
 
 def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
     config = replace(CONFIG, rounds=5, beta=ALONE, label_budget=180)
-    results = list(ImitationRun(config, tmp_path, Engine()).results())
+    results = list(Run(config, tmp_path, Engine()).results())
     assert [result.labels for result in results][-1] == 180 == labels(tmp_path, results[-1].number)
     assert results[-1].number < 5
     assert Dataset.open(tmp_path / "dataset").info.frames >= 180
@@ -216,7 +216,7 @@ def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
 
 @pytest.mark.parametrize("method", ["cloning", "dart"])
 def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path):
-    results = list(ImitationRun(replace(CONFIG, method=method, beta=ALONE), tmp_path, Engine()).results())
+    results = list(Run(replace(CONFIG, method=method, beta=ALONE), tmp_path, Engine()).results())
     table = joined_columns(datasets(tmp_path, 1), ("actor", "round", "seed", "executed_action", "action"))
     later = table["round"].ravel() == 1
     drove = {"cloning": Actor.EXPERT, "dart": Actor.NOISY_EXPERT}[method]
@@ -231,7 +231,7 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
 
 def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(tmp_path, caplog):
     config = replace(CONFIG, beta=ALONE, query_rule=Query("safety", 1000), rounds=2)
-    results = list(ImitationRun(config, tmp_path, Engine()).results())
+    results = list(Run(config, tmp_path, Engine()).results())
     assert len({result.labels for result in results}) == 1
     assert not (round_folder(tmp_path, 1) / "dataset").exists()
     assert "the expert was queried in none of its rollouts" in caplog.text
@@ -241,7 +241,7 @@ def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(t
 
 def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
     config = replace(CONFIG, beta=ALONE, query_rule=Query("ensemble", 0.05), ensemble=2)
-    results = list(ImitationRun(config, tmp_path, Engine()).results())
+    results = list(Run(config, tmp_path, Engine()).results())
     first, second = (round_folder(tmp_path, 0) / name for name in ("policy", "policy_1"))
     assert files(first).keys() == files(second).keys()
     weights = "checkpoints/000020/pretrained_model/model.safetensors"
@@ -252,7 +252,7 @@ def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
 @pytest.mark.parametrize(("label", "length"), [("per_state", None), ("takeover", None), ("branch", 4)])
 def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(label, length, tmp_path):
     config = replace(CONFIG, beta=ALONE, fit=FitConfig(ACT, steps=4, batch_size=8), label=label, refit="warm")
-    results = list(ImitationRun(config, tmp_path, Engine()).results())
+    results = list(Run(config, tmp_path, Engine()).results())
     assert results[1].labels > results[0].labels
     assert json.loads((results[1].policy / "config.json").read_text())["type"] == "act"
     table = joined_columns(datasets(tmp_path, 1), ("episode_index", "round", "actor", "label_valid"))
@@ -268,7 +268,7 @@ def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
     fit = FitConfig({"type": "cnn", "device": "cpu", "width": 16}, steps=2, batch_size=4, image_augment=False)
     cameras, env = CameraConfig(("front",), 64, 64), make_config("panda", "reach", horizon=20)
     config = replace(CONFIG, beta=ALONE, demonstrations=2, env=env, fit=fit, cameras=cameras, validation_episodes=1)
-    results = list(ImitationRun(config, tmp_path, Engine()).results())
+    results = list(Run(config, tmp_path, Engine()).results())
     assert results[1].labels > results[0].labels
     sees = json.loads((results[1].policy / "config.json").read_text())["input_features"]
     assert set(sees) == {"observation.state", "observation.images.front"}

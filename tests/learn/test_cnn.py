@@ -165,6 +165,36 @@ def test_the_truth_is_read_off_joints_and_keypoints_and_learnt_while_training_on
     assert torch.equal(held_out, unweighted.eval().forward(batch)[0])
 
 
+def test_offsets_that_are_read_off_or_given_enter_at_several_scales_too(meta, table, tmp_path):
+    columns = dict(meta.features)
+    names = ["a_from_b.x", "e1", "e2", "a_from_b.z", "e4", "e5"]
+    columns["observation.environment_state"] = columns["observation.environment_state"] | {"names": names}
+    named, batch, scales = SimpleNamespace(features=columns, root=meta.root, stats={}), make_batch(table), (0.003, 0.03)
+    truth = torch.from_numpy(table["observation.environment_state"])
+    for observation, seen in (("images", 4 + 24), ("both", 4 + 6 + 24)):
+        policy = new_policy(named, observation, scales=scales, width=64)
+        optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+        for _ in range(20):
+            optimizer.zero_grad()
+            policy.forward(batch)[0].backward()
+            optimizer.step()
+        given = policy.network_inputs(batch)[:, seen:].detach()
+        around = truth[:20]
+        if observation == "images":
+            read_off, given = given[:, :6], given[:, 6:]
+            around = read_off * truth.std(0, correction=0) + truth.mean(0)
+        squashed = torch.cat([torch.tanh(around[:, [0, 3]] / scale) for scale in scales], dim=1)
+        torch.testing.assert_close(given, squashed, rtol=1e-3, atol=1e-3)
+        policy.save_pretrained(tmp_path / observation)
+        again = CNNPolicy.from_pretrained(tmp_path / observation, strict=True)
+        assert torch.equal(again.eval().select_action(batch), policy.eval().select_action(batch))
+    for options in ({"scales": [0.003], "aux_weight": 0.0}, {"scales": [-1.0]}):
+        with pytest.raises(UsageError, match=r"policy\.scales is"):
+            new_policy(named, **options)
+    with pytest.raises(UsageError, match="scales is for offsets"):
+        new_policy(meta, scales=scales)
+
+
 def test_truth_that_is_an_input_is_not_learnt(meta, table):
     policy = new_policy(meta, observation="both")
     assert policy.privileged is None

@@ -1,0 +1,138 @@
+"""What a run says while it goes on, and what it yields: progress, results, the best of them, and their report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from manip_il.errors import ManipError
+from manip_il.evaluation.eval_report import run_report
+from manip_il.evaluation.figures import CLONING, DAGGER, Curve
+from manip_il.evaluation.report import Report
+from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, compare_results
+from manip_il.evaluation.rounds import history
+from manip_il.evaluation.tables import PolicyRow
+from manip_il.mdp import Episode
+
+STAGES = ("collect", "fit", "validate")
+VALIDATION = "validation"
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Functions that a run calls with its progress. An exception from one ends the run; what is on disk stays."""
+
+    on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
+    on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
+    on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} at a step without metrics
+    on_step: Callable[[], None] = lambda: None  # of anything else
+
+
+class Clock:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+
+    @contextmanager
+    def timed(self, stage: str) -> Generator[None]:
+        """Add what a stage takes to its seconds."""
+        started = time.monotonic()
+        yield
+        self._seconds[stage] = self._seconds.get(stage, 0.0) + time.monotonic() - started
+
+    def take(self) -> dict[str, float]:
+        """Return the seconds of every stage since the last call, rounded."""
+        taken, self._seconds = dict.fromkeys(STAGES, 0.0) | self._seconds, {}
+        return {stage: round(seconds, 3) for stage, seconds in taken.items()}
+
+
+@dataclass(frozen=True)
+class Result:
+    """One finished round of imitation, or iteration of reinforcement learning; 0 is what an iteration began with.
+
+    steps, episodes: simulated so far. metrics: of the method, such as `labels`, the sound ones learnt from so far.
+    policy: its checkpoint. validated: None if no validation was due. seconds: by stage, 0 of one that was found
+    finished on disk.
+    """
+
+    unit: Literal["round", "iteration"]
+    number: int
+    steps: int
+    episodes: int
+    metrics: dict[str, float]
+    policy: Path
+    validated: EvalResult | None
+    seconds: dict[str, float]
+
+    @property
+    def validation(self) -> EvalResult:
+        """The validation. Raises `ManipError` if none was due."""
+        if self.validated is None:
+            raise ManipError(f"{self.unit} {self.number} was not validated")
+        return self.validated
+
+    @property
+    def labels(self) -> int:
+        """Sound labels learnt from so far."""
+        return int(self.metrics["labels"])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return one line of `metrics.jsonl`."""
+        success = None if self.validated is None else self.validated.success
+        return {
+            self.unit: self.number,
+            "steps": self.steps,
+            "episodes": self.episodes,
+            **self.metrics,
+            "validation_success": None if success is None else success.rate,
+            "validation_interval": None if success is None else list(success.interval),
+            "validation_episodes": None if success is None else success.n,
+            "seconds": self.seconds,
+        }
+
+
+def best_result(results: Iterable[Result]) -> Result:
+    """Return the highest validation success; of equals the later, which has seen more."""
+    return max(results, key=lambda result: (result.validation.success.rate, result.number))
+
+
+def validations(folder: Path) -> dict[int, EvalResult]:
+    """Return the validations of a run of reinforcement learning by iteration, in order."""
+    return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
+
+
+def best_validation(found: dict[int, EvalResult]) -> int:
+    """Return the iteration with the highest validation success, the later of equals."""
+    return max(found, key=lambda number: (found[number].success.rate, number))
+
+
+def learning_report(
+    title: str,
+    found: dict[int, EvalResult],
+    records: Sequence[Mapping[str, Any]],
+    command: str,
+    config: Mapping[str, Any],
+) -> Report:
+    """Return the report of a run. found: its validations by iteration, not none. records: lines of metrics.jsonl."""
+    best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "policy given"}
+    facts = ["The best policy was chosen on these episodes, so they flatter it; measure it by manip-il eval."]
+    if 0 in found and best:
+        facts.insert(0, compare_results(found[0], found[best], (names[0], names[best])).verdict)
+    return run_report(
+        [
+            PolicyRow(names[number], found[number], colour=DAGGER if number else CLONING)
+            for number in sorted({min(found), best, max(found)})
+        ],
+        curves=[Curve(title, (history(records, title),), costs=("steps", "seconds"))],
+        title=title,
+        verdict=f"Best {names[best]}: validation success {found[best].success}.",
+        facts=tuple(facts),
+        command=command,
+        config=config,
+        fingerprint=found[best].fingerprint,
+    )
