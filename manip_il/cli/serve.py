@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import ClassVar
 
 from manip_il.cli import common_options as common
 from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say, warn
-from manip_il.errors import UsageError
-from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 from manip_il.serve.config import ServoConfig, SessionConfig
 
 SERVO = "servo"  # among the ways in which worlds differ
-
-
-@dataclass
-class LeaderPolicyGroup:
-    """`--policy.*` of what moves the leader."""
-
-    path: Path | None = common.policy_option()
 
 
 @dataclass
@@ -33,39 +23,24 @@ class ServeOptions:
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
-    first: ClassVar[str] = "task.type cameras leader servo log output_dir"
+    first: ClassVar[str] = "task.type cameras servo log output_dir"
     command: list[str] = option(list, "a program of LeRobot's and its options, after `--`", positional=True)
     env: Given = common.env_given(robot="so101")
     cameras: list[str] = option(list, f"{common.CAMERAS_HELP}; by default no pictures")
     image: Given = common.image_given()
     vary: list[str] = option(list, "how worlds differ from episode to episode: servo, and what record takes")
     session: Given = given(SessionConfig, prefix="")
-    policy: LeaderPolicyGroup = field(default_factory=LeaderPolicyGroup)
     servos: Given = given(ServoConfig)
-
-    def check(self) -> None:
-        """Refuse what does not go together."""
-        leader = self.session.get("leader", "expert")
-        if (leader == "policy") != (self.policy.path is not None):
-            raise UsageError("--leader=policy and --policy.path=DIR go together")
-        if leader != "expert" and self.command:
-            raise UsageError(f"--leader={leader} presses no keys; with a COMMAND expected --leader=expert")
 
     def run(self) -> None:
         """Serve until the program ends, or Ctrl-C."""
         from manip_il.data.atomic import exclusive
         from manip_il.evaluation.suites import varied
-        from manip_il.learn.checkpoint import policy_cameras
         from manip_il.serve.session import serve
 
         env = common.env_config({"robot": "so101", **self.env})
-        policy = find_policy(self.policy.path) if self.policy.path is not None else None
-        cameras = policy_cameras(policy) if policy is not None else None
-        if self.cameras:
-            cameras = common.camera_config(self.cameras, self.image)
+        cameras = common.camera_config(self.cameras, self.image) if self.cameras else None
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)
-        session = SessionConfig(
-            **self.session, policy=policy, servos=ServoConfig(**self.servos), varies=SERVO in self.vary
-        )
+        session = SessionConfig(**self.session, servos=ServoConfig(**self.servos), varies=SERVO in self.vary)
         with exclusive(session.output_dir):
             serve(env, session, self.command, cameras, conditions, say, warn)

@@ -40,6 +40,7 @@ from manip_il.tasks.table import get_task, is_task
 
 Columns = dict[str, NDArray[Any]]
 _DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that what is made of a state depends on
+SERVED = "lerobot"  # `driver` of datasets that LeRobot's programs recorded behind servos
 NOTICEABLE = 0.01  # of a joint's longest step, or of the gripper's whole opening: a label that differs by less is none
 
 
@@ -158,7 +159,7 @@ def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> Info:
     The same seed gives the same scenes, and more frames begin with the same ones. Raises `NothingToLearnError` if no
     scene has a sound label.
     """
-    states = source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE]
+    columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
     drawn = {"scenes": scenes.anew, "branch_steps": scenes.branch_steps, "cameras": asdict(scenes.cameras)}
     vary = {"vary": [condition.to_json() for condition in scenes.conditions]} if scenes.conditions else {}
     seeds = scenes.numbers[::CHUNK]
@@ -167,7 +168,8 @@ def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> Info:
     spec = replace(env_spec(source.env, scenes.cameras), video=False)  # frames have nothing to do with each other
     fingerprint = env_fingerprint(source.env, scenes.cameras)
     work = partial(_draw_scenes, source.env, scenes)
-    return _write(target, spec, fingerprint, provenance, work, scenes.chunks(states))
+    pieces = scenes.chunks(columns[schema.SIM_STATE], _leads(source, columns))
+    return _write(target, spec, fingerprint, provenance, work, pieces)
 
 
 def _write[T](
@@ -238,10 +240,24 @@ def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> 
     return [replace(episode, columns={**episode.columns, **pictures})]
 
 
-def _draw_scenes(env: EnvConfig, scenes: Scenes, chunk: tuple[int, NDArray[np.float64]]) -> list[Episode]:
-    seed, states = chunk
+def _leads(source: Source, columns: Columns) -> NDArray[np.float64]:
+    """How far labels are beyond the expert's own, (T, n): for servos that sag (`manip-il serve --log=`), else 0."""
+    action = columns[schema.ACTION].astype(np.float64)
+    if source.dataset.provenance.get("driver") != SERVED:
+        return np.zeros_like(action)
+    expert = make_expert(source.env)
+    labels = [expert.label(State.from_vector(state)) for state in columns[schema.SIM_STATE]]
+    own = np.stack([label.action for label in labels])
+    return np.where(columns[schema.LABEL_VALID].reshape(-1, 1) > 0, action - own, 0.0)
+
+
+def _draw_scenes(
+    env: EnvConfig, scenes: Scenes, chunk: tuple[int, NDArray[np.float64], NDArray[np.float64]]
+) -> list[Episode]:
+    seed, states, leads = chunk
     drawer = _drawer(env, scenes)
-    made = (drawer.frames(State.from_vector(row), seed + at, seed) for at, row in enumerate(states))
+    rows = enumerate(zip(states, leads, strict=True))
+    made = (drawer.frames(State.from_vector(state), seed + at, seed, lead) for at, (state, lead) in rows)
     return [to_episode(frames) for frames in made if frames]
 
 

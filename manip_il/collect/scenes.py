@@ -57,15 +57,16 @@ class Scenes:
         """Numbers of the scenes in the stream of draws. Raises `UsageError` for more than a seed has."""
         return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
-    def chunks(self, states: F64) -> Iterator[tuple[int, F64]]:
-        """Yield the first number and the visited states of each `CHUNK` of scenes.
+    def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
+        """Yield the first number, the visited states and their leads of each `CHUNK` of scenes.
 
-        states: rows of `sim_state` (S, m), which are taken by turns, in an order that the seed draws.
+        states: rows of `sim_state` (S, m), which are taken by turns, in an order that the seed draws. leads: what is
+        added to the labels of each (S, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
         for at in range(0, self.frames, CHUNK):
             rows = np.arange(at, min(at + CHUNK, self.frames)) % len(states)
-            yield self.numbers[at], states[order[rows]]
+            yield self.numbers[at], states[order[rows]], leads[order[rows]]
 
 
 class SceneDrawer:
@@ -77,10 +78,10 @@ class SceneDrawer:
         self._expert = make_expert(config)
         self._scenes = scenes
 
-    def frames(self, visited: State, number: int, seed: int) -> list[Transition]:
+    def frames(self, visited: State, number: int, seed: int, lead: F64 | float = 0.0) -> list[Transition]:
         """Return what becomes of one visited state: one labelled frame, or those of a branch; none without a label.
 
-        number: of the scene in the stream of draws. seed: the column's.
+        number: of the scene in the stream of draws. seed: the column's. lead: added to the one frame's label, (n,).
         """
         rng = rng_for(number, "redraw")
         visited = self._with_look(replace(visited, streak=0, ever=False), number)
@@ -94,7 +95,7 @@ class SceneDrawer:
         if not label.valid:
             return []
         if self._scenes.branch_steps == 1:
-            return [self._frame(state, label, seed)]
+            return [self._frame(state, replace(label, action=label.action + lead), seed)]
         return list(branch(self._env, self._expert, state, seed, self._scenes.branch_steps))
 
     def _with_look(self, state: State, number: int) -> State:

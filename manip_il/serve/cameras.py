@@ -6,6 +6,7 @@ import base64
 import json
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -24,14 +25,12 @@ _QUALITY: list[int] = [cv2.IMWRITE_JPEG_QUALITY, 90]
 class Cameras:
     """A thread that shows a station's world on one port, `RATE` times a second.
 
-    images: the last ones, camera -> (H, W, 3). shown: how many so far; slow: rate that the machine allows,
-    where it is less [1/s]. Raises `UsageError` for a port that is taken, `RenderError` without off-screen OpenGL.
+    shown: how many so far. Raises `UsageError` for a port that is taken, `RenderError` without off-screen OpenGL.
     """
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
         self._station, self._cameras = station, cameras
-        self.shown, self.slow = 0, 0.0
-        self.images: dict[str, render.Picture] = {}
+        self.shown, self._took = 0, 0.0
         self._data = mujoco.MjData(station.env.scene.model)
         self._socket: Any = zmq.Context.instance().socket(zmq.PUB)
         self._socket.setsockopt(zmq.SNDHWM, 2)
@@ -49,11 +48,14 @@ class Cameras:
         if self._error is not None:
             raise self._error
 
-    def close(self) -> None:
-        """End the thread, and free the port."""
+    def close(self, warn: Callable[[str], None]) -> None:
+        """End the thread, free the port, and warn of a machine that was too slow."""
         self._stop.set()
         self._thread.join()
         self._socket.close()
+        if self._took > self.shown / RATE:
+            rate = self.shown / self._took
+            warn(f"pictures were drawn at {rate:.0f} a second here; choose smaller or fewer ones for {RATE}")
 
     def _run(self) -> None:
         try:
@@ -61,11 +63,8 @@ class Cameras:
             while not self._stop.wait(max(0.0, due - time.perf_counter())):
                 begun = time.perf_counter()
                 self._socket.send_string(self._message())
-                took = time.perf_counter() - begun
                 self._began.set()
-                self.shown += 1
-                if self.shown >= 10:
-                    self.slow = 1 / took if took > 1 / RATE else 0.0
+                self.shown, self._took = self.shown + 1, self._took + time.perf_counter() - begun
                 due = max(due + 1 / RATE, time.perf_counter())
         except RenderError as error:
             self._error = error
@@ -76,7 +75,7 @@ class Cameras:
     def _message(self) -> str:
         env = self._station.env
         self._data.qpos[:], self._data.mocap_pos[:] = self._station.seen
-        images = self.images = render.pictures(env.scene, self._data, self._cameras, env.looks)
+        images = render.pictures(env.scene, self._data, self._cameras, env.looks)
         # RGB goes in as it is and comes out of the client's `imdecode` as it is, so that red stays red.
         coded = {name: cv2.imencode(".jpg", one, _QUALITY)[1] for name, one in images.items()}
         texts = {name: base64.b64encode(one.tobytes()).decode() for name, one in coded.items()}

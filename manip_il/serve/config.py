@@ -60,21 +60,18 @@ class ServoConfig:
 
 @dataclass(frozen=True)
 class SessionConfig:
-    """A session: who moves the leader, how the follower's servos move, and what is kept."""
+    """A session: how the follower's servos move, when a new world is drawn, and what is kept."""
 
     output_dir: Path = option(Path("runs/serve"), "folder of the links follower and leader, and of their calibrations")
-    leader: Literal["expert", "policy", "sliders", "none"] = option("expert", "who moves the leader arm")
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
     camera_port: int = option(5599, "where the cameras are served (ZMQ)", at_least=1, at_most=65_535)
-    speed: float = option(1.0, "of time, in that of the clock", at_least=0.1, at_most=20)
-    reset: Literal["solved", "enter", "never"] = option(
-        "solved", "without a COMMAND, the world is drawn anew a second after it is solved or on Enter; on Enter; never"
+    reset: Literal["solved", "enter"] = option(
+        "solved", "without a COMMAND, the world is drawn anew on Enter, or also a second after it is solved"
     )
     intervene: float = option(
-        0.3, "with LeRobot's DAgger: correct a policy whose targets differ by more from the expert's [rad]", at_least=0
+        0.15, "with LeRobot's DAgger: correct a policy whose targets differ by more from the expert's [rad]", at_least=0
     )
     log: Path | None = option(None, "folder for journals of what the client cannot see: states and labels")
     seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
-    policy: Path | None = None  # checkpoint of a leader that is a policy
     servos: ServoConfig = field(default_factory=ServoConfig)
     varies: bool = False  # whether each world's servos are drawn anew

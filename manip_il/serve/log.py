@@ -5,6 +5,7 @@ A frame is logged when the client asks where the follower is, so that the frames
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from manip_il.collect.environments import env_fingerprint, env_spec
@@ -64,12 +65,15 @@ class SessionLog:
         env.set_state(after.state)
         reward, success = env.reward, env.solved
         env.set_state(now.state)
+        label = self._expert.label(now.state)
+        if label.valid:  # as the leader would have shown it: beyond by what the follower sags
+            label = replace(label, action=self._station.to_action(self._station.to_joints(label.action) + now.sag))
         return Transition(
             seed=self._station.seed,
             step=step,
             state=now.state,
             observation=env.observe(),
-            label=self._expert.label(now.state),
+            label=label,
             executed_action=self._station.to_action(after.told),
             actor=actor,
             reward=reward,

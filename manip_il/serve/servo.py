@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.serve.chain import CENTRE, DEAD_ZONE, MAX_TORQUE, P_GAIN, STEPS, TORQUE_LIMIT, Chain
+from manip_il.serve.bus import CENTRE, STEPS, Bus
 from manip_il.serve.config import ServoConfig
 from manip_il.sim.world import World
 
@@ -24,7 +25,7 @@ class Follower:
     Gravity pulls at the arm. A servo whose torque is off keeps its place, as if a hand held it.
     """
 
-    def __init__(self, world: World, bus: Chain, config: ServoConfig, step: float):
+    def __init__(self, world: World, bus: Bus, config: ServoConfig, step: float):
         scene, model = world.scene, world.scene.model
         self._world, self._bus, self.config, self._step = world, bus, config, step
         self.q = np.array([*scene.arm_q, *scene.gripper.q])
@@ -40,23 +41,27 @@ class Follower:
             model.body_gravcomp[model.jnt_bodyid[:]] = 0.0
             model.dof_damping[self._dof] = config.torque / config.speed  # as the motor's own voltage grows
             model.dof_frictionloss[self._dof] = config.friction
-        q = self._world.data.qpos[self.q]
-        self._at = q.copy()
-        self._coming = deque([q.copy()] * round(config.delay / self._step))
+        self._at = self._world.data.qpos[self.q]
+        self._coming = deque([self._at] * round(config.delay / self._step))
+        _place(self._bus, self.encoder())
+
+    def _registers(self, name: str) -> F64:
         with self._bus.lock:
-            for servo, encoder in zip(self._bus.servos, self.encoder(), strict=True):
-                servo.show(encoder)
-                servo.aim(encoder)
+            return np.array([servo[name] for servo in self._bus.servos], float)
+
+    @property
+    def offset(self) -> float:
+        """Angle by which the encoders read beyond the joints [rad]."""
+        return math.radians(self.config.offset)
 
     @property
     def gain(self) -> F64:
         """Stiffness of every servo at the gain that it was given [N m/rad], (n,)."""
-        share = [max(1, P_GAIN.read(one.memory)) / _FACTORY_GAIN for one in self._bus.servos]
-        return self.config.stiffness * np.array(share)
+        return self.config.stiffness * np.maximum(1, self._registers("P_Coefficient")) / _FACTORY_GAIN
 
     def encoder(self) -> list[int]:
         """Return what the encoders read."""
-        return encoder_steps(self._world.data.qpos[self.q] + math.radians(self.config.offset))
+        return encoder_steps(self._world.data.qpos[self.q] + self.offset)
 
     def sag(self) -> F64:
         """Return how far the joints are from their goals under gravity, at rest [rad], (n,)."""
@@ -65,19 +70,16 @@ class Follower:
     def goal(self) -> F64:
         """Return the joints that the servos were told last to go to [rad], (n,)."""
         with self._bus.lock:
-            told = np.array([one.goal for one in self._bus.servos])
-        return (told - CENTRE) * STEP - math.radians(self.config.offset)
+            return _joints([one.goal for one in self._bus.servos]) - self.offset
 
     def command(self) -> None:
         """Give the motors what the registers say: once every `step` seconds."""
-        data, model, servos = self._world.data, self._world.model, self._bus.servos
+        data, model = self._world.data, self._world.model
         q = data.qpos[self.q]
         with self._bus.lock:
-            on = np.array([one.has_torque for one in servos])
-            goal = (np.array([one.goal for one in servos]) - CENTRE) * STEP - math.radians(self.config.offset)
-            dead = STEP * np.array([DEAD_ZONE.read(one.memory) for one in servos])
-            limit = np.array([min(MAX_TORQUE.read(one.memory), TORQUE_LIMIT.read(one.memory)) for one in servos]) / 1000
-            gain = self.gain
+            on, gain, goal = self._registers("Torque_Enable") > 0, self.gain, self.goal()
+            dead = STEP * self._registers("CW_Dead_Zone")
+            limit = np.minimum(self._registers("Max_Torque_Limit"), self._registers("Torque_Limit")) / 1000
         self._coming.append(goal)
         goal = self._coming.popleft()
         play = math.radians(self.config.play) / 2
@@ -107,23 +109,20 @@ class Leader:
     With torque on they go to what is written to them, as when a program hands over.
     """
 
-    def __init__(self, bus: Chain, q: F64):
+    def __init__(self, bus: Bus, q: F64):
         self._bus = bus
         self.place(q)
 
     def place(self, q: F64) -> None:
         """Put the joints there at once [rad], (n,)."""
         self.q = np.array(q)
-        with self._bus.lock:
-            for servo, encoder in zip(self._bus.servos, encoder_steps(self.q), strict=True):
-                servo.show(encoder)
-                servo.aim(encoder)
+        _place(self._bus, encoder_steps(self.q))
 
     def move(self, q: F64, most: float) -> None:
         """Move the joints towards `q` by at most so much each [rad]; those with torque on, to their goals."""
         with self._bus.lock:
-            goals = (np.array([one.goal for one in self._bus.servos]) - CENTRE) * STEP
-            wanted = np.where([one.has_torque for one in self._bus.servos], goals, q)
+            goals = _joints([one.goal for one in self._bus.servos])
+            wanted = np.where([one["Torque_Enable"] > 0 for one in self._bus.servos], goals, q)
             self.q = self.q + np.clip(wanted - self.q, -most, most)
             for servo, encoder in zip(self._bus.servos, encoder_steps(self.q), strict=True):
                 servo.show(encoder)
@@ -132,3 +131,15 @@ class Leader:
 def encoder_steps(q: F64) -> list[int]:
     """Return what encoders read of joints that stand at `q` [rad], (n,)."""
     return [int(one) for one in np.rint(CENTRE + np.asarray(q) / STEP)]
+
+
+def _joints(encoder: Sequence[int]) -> F64:
+    return (np.array(encoder) - CENTRE) * STEP
+
+
+def _place(bus: Bus, encoder: Sequence[int]) -> None:
+    """Let servos stand, and be told to stand, there."""
+    with bus.lock:
+        for servo, at in zip(bus.servos, encoder, strict=True):
+            servo.show(at)
+            servo.aim(at)

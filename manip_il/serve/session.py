@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 from manip_il.errors import ManipError
-from manip_il.learn.policy import LearnedPolicy
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.cameras import Cameras
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.log import SessionLog
-from manip_il.serve.movers import ExpertMover, policy_mover, slider_mover
 from manip_il.serve.operator import HELD, URGENT, Operator
-from manip_il.serve.station import Mover, Station
+from manip_il.serve.station import Station
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig
@@ -39,8 +39,11 @@ def serve(
     cameras: what is shown; None for none. conditions: what worlds differ in. say, warn: called with lines for the user.
     Raises `UsageError` for a robot without Feetech servos or a port that is taken, `ManipError` if the program failed.
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sys.setswitchinterval(5e-4)  # of threads [s]: a bus waits for no other
     with contextlib.suppress(OSError):  # a servo answers within milliseconds, whatever else runs
         os.nice(-URGENT)
+        Path("/proc/self/autogroup").write_text("-20")  # Linux weighs sessions before it weighs processes
     with contextlib.ExitStack() as stack:
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
@@ -50,33 +53,24 @@ def serve(
         there = set(log.seeds if log is not None else [])
         seeds = (seed for seed in stream_seeds("demonstrations", BLOCK, config.seed) if seed not in there)
         station.reset(next(seeds))
-        shown = Cameras(station, cameras, config.camera_port) if cameras else None
-        if shown is not None:
-            stack.callback(shown.close)
-        expert = ExpertMover(station)
-        station.mover = _mover(station, config, expert, shown)
+        if cameras is not None:
+            shown = Cameras(station, cameras, config.camera_port)
+            stack.callback(shown.close, warn)
         for line in described(station, config, cameras):
             say(line)
         if command:
-            operator = Operator(command, station, expert, seeds, log, config.intervene)
+            operator = Operator(command, station, seeds, log, config.intervene)
             stack.callback(operator.kill)
-            _operate(operator)
+            try:
+                station.run(operator.each_step)
+            except KeyboardInterrupt:
+                operator.stop()
+                station.run(operator.each_step)
             say(f"{command[0]} ended; episodes solved {operator.solved}, not solved {operator.failed}")
             if operator.status:
                 raise ManipError(f"{command[0]} failed with exit code {operator.status}")
         else:
             _stand(station, config, seeds, log, say)
-        if shown is not None and shown.slow:
-            warn(f"pictures were drawn at {shown.slow:.0f} a second here; choose smaller or fewer ones for 30")
-
-
-def _mover(station: Station, config: SessionConfig, expert: ExpertMover, cameras: Cameras | None) -> Mover:
-    if config.leader == "sliders":
-        return slider_mover(station)
-    if config.policy is not None:
-        policy = LearnedPolicy.load(config.policy, task=station.env.task_description)
-        return policy_mover(station, policy, cameras)
-    return expert if config.leader == "expert" else lambda station: None
 
 
 def described(station: Station, config: SessionConfig, cameras: CameraConfig | None) -> list[str]:
@@ -99,25 +93,16 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
     ]
 
 
-def _operate(operator: Operator) -> None:
-    """Run the program; Ctrl-C presses escape once, so that it saves what it has."""
-    try:
-        operator.station.run(operator.each_step)
-    except KeyboardInterrupt:
-        operator.stop()
-        operator.station.run(operator.each_step)
-
-
 def _stand(station: Station, config: SessionConfig, seeds: Iterator[int], log: SessionLog | None, say: Say) -> None:
     """Serve whoever connects, until Ctrl-C."""
-    held, listens = round(HELD * station.env.config.control_hz), sys.stdin.isatty() and config.reset != "never"
+    station.mover = station.expert
     if log is not None:
         log.begin()
         station.on_read = log.frame
 
     def each_step() -> bool:
-        pressed = listens and select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline()
-        if pressed or (config.reset == "solved" and station.solved >= held):
+        pressed = sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline()
+        if pressed or (config.reset == "solved" and station.solved_for >= HELD):
             say(f"seed {station.seed}: {'solved' if station.env.solved else 'left'}; a new world")
             if log is not None:
                 log.end(keep=True)

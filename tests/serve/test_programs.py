@@ -1,0 +1,119 @@
+"""LeRobot's own programs, unmodified, run to their end against the arm: their keys are pressed for them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from manip_il.cli.main import main
+from manip_il.data.journal import list_episodes, read_journal
+from manip_il.mdp import Actor, Episode
+
+pytestmark = pytest.mark.slow
+Run = Callable[..., list[Episode]]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """Runs a program against `lift`; returns what was logged. arms: that it opens."""
+
+    def run(program: str, *words: str, arms: str = "follower leader", served: tuple[str, ...] = ()) -> list[Episode]:
+        root, path = tmp_path / "arm", Path(sys.executable).with_name(program)
+        robot = ["--robot.type=so101_follower", f"--robot.port={root}/follower", "--robot.id=follower"]
+        teleop = ["--teleop.type=so101_leader", f"--teleop.port={root}/leader", "--teleop.id=leader"]
+        robot, teleop = [*robot, f"--robot.calibration_dir={root}"], [*teleop, f"--teleop.calibration_dir={root}"]
+        options = [*(robot if "follower" in arms else []), *(teleop if "leader" in arms else []), *words]
+        own = ["serve", "--task.type=lift", f"--output_dir={root}", f"--log={tmp_path}/log", *served]
+        assert main([*own, "--", str(path), *options]) == 0
+        return [read_journal(path)[1] for path in list_episodes(tmp_path / "log")]
+
+    return run
+
+
+def dataset(folder: Path, name: str, episodes: int) -> list[str]:
+    """Options of the dataset that a program is to write."""
+    options = {"repo_id": f"local/{name}", "root": str(folder / name), "single_task": "lift", "push_to_hub": "false"}
+    return [*(f"--dataset.{key}={value}" for key, value in options.items()), f"--dataset.num_episodes={episodes}"]
+
+
+def test_record_keeps_solved_episodes_with_the_frames_of_the_log(run: Run, tmp_path: Path):
+    """Beside LeRobot's dataset are states and labels, of which `data build` makes one of ours."""
+    logged = run("lerobot-record", *dataset(tmp_path, "t", 2), "--play_sounds=false")
+    recorded = LeRobotDataset("local/t", root=tmp_path / "t")
+    assert recorded.num_episodes == len(logged) == 2
+    assert all(episode.success for episode in logged)
+    states = np.stack(recorded.hf_dataset["observation.state"])
+    assert np.abs(states[:10] - logged[0].columns["observation.state"][:10]).max() < 0.2  # a step of the encoder
+    assert main(["data", "build", f"{tmp_path}/log", f"{tmp_path}/ours"]) == 0
+
+
+def test_teleoperate_follows_the_expert_from_world_to_world(run: Run):
+    logged = run("lerobot-teleoperate", "--fps=30", "--teleop_time_s=10")
+    assert len(logged) >= 2
+    assert logged[0].success
+    assert {*np.concatenate([one.columns["actor"] for one in logged]).ravel()} == {Actor.EXPERT}
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A checkpoint of a policy that sees one small picture and has hardly learnt."""
+    folder = tmp_path_factory.mktemp("policy")
+    size = ["--cameras=front", "--image.height=32", "--image.width=32"]
+    env = ["--robot.type=so101", "--task.type=lift", "--workers=1"]
+    assert main(["record", *env, *size, "--dataset.num_episodes=2", f"--dataset.root={folder}/data"]) == 0
+    fit = ["--policy.type=cnn", "--policy.channels=[4,4]", "--policy.keypoints=4", "--policy.width=16", "--steps=2"]
+    assert main(["train", f"--dataset.root={folder}/data", *fit, f"--output_dir={folder}/run"]) == 0
+    return f"{folder}/run/checkpoints/last/pretrained_model"
+
+
+def rollout(policy: str, port: int, strategy: str) -> list[str]:
+    """Options of `lerobot-rollout`."""
+    camera = f"type: zmq, server_address: 127.0.0.1, port: {port}, camera_name: front, width: 32, height: 32, fps: 30"
+    return [
+        "--env.discover_packages_path=manip_il.lerobot_plugin",
+        f"--policy.path={policy}",
+        f"--strategy.type={strategy}",
+        f"--robot.cameras={{front: {{{camera}}}}}",
+        "--device=cpu",
+        "--play_sounds=false",
+    ]
+
+
+def pictures(port: int, horizon: int) -> tuple[str, ...]:
+    """Options of `serve` for a policy that sees; an attempt lasts two horizons at most."""
+    sizes = ["--image.height=32", "--image.width=32", f"--env.horizon={horizon}"]
+    return ("--cameras=front", *sizes, f"--camera_port={port}")
+
+
+@pytest.mark.gl
+def test_rollout_lets_a_policy_drive(run: Run, policy: str):
+    words = rollout(policy, 5631, "base")
+    logged = run("lerobot-rollout", *words, "--duration=5", arms="follower", served=pictures(5631, 30))
+    assert len(logged) >= 2
+    assert {*np.concatenate([one.columns["actor"] for one in logged]).ravel()} == {Actor.LEARNER}
+
+
+@pytest.mark.gl
+def test_episodic_rollout_keeps_what_is_not_solved(run: Run, policy: str, tmp_path: Path):
+    words = [*rollout(policy, 5632, "episodic"), *dataset(tmp_path, "rollout_t", 2)]
+    logged = run("lerobot-rollout", *words, arms="follower", served=pictures(5632, 30))
+    assert LeRobotDataset("local/rollout_t", root=tmp_path / "rollout_t").num_episodes == len(logged) == 2
+    assert not any(episode.success for episode in logged)
+
+
+@pytest.mark.gl
+def test_dagger_corrects_a_policy_that_gets_nowhere(run: Run, policy: str, tmp_path: Path):
+    """LeRobot's dataset holds the correction alone, the log the whole attempt, labelled in every frame."""
+    words = [*rollout(policy, 5633, "dagger"), *dataset(tmp_path, "rollout_t", 1)]
+    logged = run("lerobot-rollout", *words, served=pictures(5633, 75))
+    actors = logged[0].columns["actor"].ravel()
+    assert actors[0] == Actor.LEARNER
+    assert logged[0].columns["label_valid"].all()
+    corrected = LeRobotDataset("local/rollout_t", root=tmp_path / "rollout_t")
+    assert corrected.num_episodes == 1
+    assert abs(len(corrected) - np.sum(actors == Actor.EXPERT)) <= 2
