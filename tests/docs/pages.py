@@ -13,7 +13,7 @@ from manip_il.cli.main import COMMANDS, load
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
     "README.md",
-    *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/*.md")),
+    *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md")),
     "benchmarks/README.md",
     "datasets/README.md",
 )
