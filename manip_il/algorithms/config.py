@@ -12,7 +12,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.option import check_bounds, option
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
     from manip_il.collect.query import Query
@@ -130,8 +130,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.disturbed_share and self.env.robot == STOCK:
-            raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
+        if self.disturbed_share and self.env.robot in STOCK:
+            raise UsageError(f"disturbed_share is {self.disturbed_share}; {self.env.robot} is unmodified, expected 0")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
             raise UsageError("redraw is for policies on pictures, with --label=per_state")
         if self.method not in ALGORITHMS:

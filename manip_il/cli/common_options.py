@@ -31,7 +31,7 @@ _TRUST = (
     "only on the command line"
 )
 _CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras view, clutter, late"
-CAMERAS_HELP = "any of front, side, wrist"
+CAMERAS_HELP = "any of front, side, wrist, of aloha top, angle, front_close, left_wrist, right_wrist, ..."
 OWN_ROBOT_HELP = "its YAML, if the dataset's robot does not ship"
 OWN_TASK_HELP = "its Python file, if the dataset's task does not ship"
 OWN_OBJECT_HELP = "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh"
@@ -59,10 +59,16 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
     return make_config(**values)
 
 
-def camera_config(names: Iterable[str], sizes: Given, look: Look | None = None, *, small: bool = False) -> CameraConfig:
-    """Return the cameras of `--cameras`, by default all, and `--image.*`; `UsageError` for a wrong value."""
+def camera_config(
+    names: Iterable[str], sizes: Given, look: Look | None = None, *, robot: str = "", small: bool = False
+) -> CameraConfig:
+    """Return the cameras of `--cameras`, by default all, and `--image.*`; `UsageError` for a wrong value.
+
+    robot: the one that they look at; of a stock one, the first is taken by default.
+    """
     sizes = (SMALL if small else {}) | sizes
-    return CameraConfig(tuple(names) or CAMERAS, **sizes, look=look or Look())
+    known = stock.ROBOTS[robot].cameras[:1] if robot in stock.ROBOTS else CAMERAS
+    return CameraConfig(tuple(names) or known or CAMERAS, **sizes, look=look or Look())
 
 
 def image_given(*, small: bool = False) -> Any:
@@ -153,9 +159,9 @@ def own_names(robot: str, task: str, shape: str = "") -> str:
     from manip_il.sim.mesh import mesh_path, nameable
 
     own = ""
-    if robot not in (*ROBOTS, stock.ROBOT):
+    if robot not in (*ROBOTS, *stock.ROBOTS):
         arms = {servos.robot_type: name for name in ROBOTS if (servos := get_robot(name).lerobot) is not None}
         own = f" --robot.type={arms.get(robot) or Path(robot).with_suffix('.yaml')}"  # LeRobot has names of its own
-    if task.partition(":")[0] not in (*NAMES, *stock.STOCK, "unknown"):
+    if task.partition(":")[0] not in (*NAMES, *stock.STOCK, *stock.ALOHA_TASKS, "unknown"):
         own += f" --task.type={Path(task).with_suffix('.py')}"
     return own + (f" --task.object={nameable(shape)}" if mesh_path(shape) else "")

@@ -87,8 +87,8 @@ class DaggerOptions:
         from manip_il.evaluation.suites import varied
 
         policy, start = round_policy(self.fit.get("policy", {}))
-        observation, cameras = self._pictures(start)
         env = common.env_config(self.env)
+        observation, cameras = self._pictures(start, env.robot)
         of_fit: Given = {"policy": policy, "observation": observation, "trust": self.trust}
         config = RunConfig(
             env=env,
@@ -105,12 +105,12 @@ class DaggerOptions:
         check_given(config)
         return config
 
-    def _pictures(self, start: Path | None) -> tuple[str | None, CameraConfig | None]:
+    def _pictures(self, start: Path | None, robot: str) -> tuple[str | None, CameraConfig | None]:
         """Return observation and cameras: those given, else those of the policy to begin with."""
         observation = self.fit.get("observation")
         sees = self.fit.get("policy", {}).get("type") == "cnn" and observation != "state"
         given = self.cameras or sees
-        cameras = common.camera_config(self.cameras, self.image, small=True) if given else None
+        cameras = common.camera_config(self.cameras, self.image, robot=robot, small=True) if given else None
         if start is not None:
             from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 

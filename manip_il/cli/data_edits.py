@@ -126,8 +126,8 @@ class RenderOptions:
         """Render every episode; TARGET appears when all are there."""
         from manip_il.collect.edits import render_dataset
 
-        cameras = common.camera_config(self.cameras, self.image, self.look)
         with self.edit.open(self.source, self.target, f"render {self.source}") as (source, target):
+            cameras = common.camera_config(self.cameras, self.image, self.look, robot=source.env.robot)
             info = render_dataset(source, cameras, target)
         say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.target}")
 
@@ -189,10 +189,10 @@ class RedrawOptions:
         from manip_il.collect.scenes import CHUNK, Scenes
         from manip_il.evaluation.suites import varied
 
-        cameras = common.camera_config(self.cameras, self.image, small=True)
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
         require_dataset(root)
         with self.edit.open(root, self.target, f"redraw {root}", -(-self.frames // CHUNK)) as (source, target):
+            cameras = common.camera_config(self.cameras, self.image, robot=source.env.robot, small=True)
             conditions = varied(self.vary, source.env, sees=True)
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)

@@ -15,7 +15,7 @@ from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
 from manip_il.errors import UsageError
 from manip_il.option import option
-from manip_il.tasks.stock.table import ROBOT
+from manip_il.tasks.stock.table import ROBOTS
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
@@ -160,6 +160,6 @@ class EvalOptions:
         if result.failures:
             phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
             say(f"failures by the phase that they ended in: {phases}")
-        if result.robot == ROBOT:
+        if result.robot in ROBOTS:
             say(f"return: {mean(episode.ret for episode in result.episodes):.2f}")
         say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

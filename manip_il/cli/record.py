@@ -85,7 +85,7 @@ class RecordOptions:
         from manip_il.evaluation.suites import varied
 
         env = common.env_config(self.env)
-        cameras = common.camera_config(self.cameras, self.image) if self.cameras else None
+        cameras = common.camera_config(self.cameras, self.image, robot=env.robot) if self.cameras else None
         conditions = varied(self.vary, env, sees=cameras is not None)
         return RolloutJob(env, hold=HOLD, cameras=cameras, conditions=conditions)
 

@@ -15,13 +15,13 @@ from manip_il.errors import UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
+    from manip_il.collect.rollout import Environment
     from manip_il.evaluation.watch import RerunLog, WindowScreen
-    from manip_il.sim.env import ManipEnv
     from manip_il.tasks.config import EnvConfig
 
 HOLD = 10  # control steps that an episode goes on for after success
 IN_A_FILE = 3  # episodes, if nobody says how many
-SIZE = (240, 320)  # of pictures that no policy looks at [pixels]
+SIZE = {"height": 240, "width": 320}  # of pictures that no policy looks at [pixels]
 
 
 @dataclass
@@ -56,26 +56,28 @@ class ViewOptions:
     def run(self) -> None:
         """Run episodes and show them."""
         from manip_il.cli.inputs import open_driver
+        from manip_il.collect.environments import make_env
         from manip_il.collect.job import RolloutJob, observed_cameras, run_steps
         from manip_il.evaluation.suites import suite_conditions
         from manip_il.evaluation.watch import outcome
         from manip_il.mdp import LONGEST_EPISODE
         from manip_il.seeding import BLOCK, stream_seeds
-        from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
+        from manip_il.sim.config import FILM, Look
         from manip_il.sim.window import has_display
-        from manip_il.tasks.envs import env_of
+        from manip_il.tasks.stock.table import ROBOTS as STOCK
 
         in_window, sliders = self.output is None and has_display(), self.policy.type == "sliders"
         if sliders and not in_window:
             raise UsageError("--policy.type=sliders needs a window: a DISPLAY, and no --output")
         env, driver, cameras = open_driver(self.policy.path, self.policy.type or "expert", self.env, trust=self.trust)
+        in_window = in_window and env.robot not in STOCK
         if cameras is None and not in_window:  # pictures for people, with shadows if nobody waits
-            cameras = CameraConfig(CAMERAS, *SIZE, FILM if self.output else Look())
+            cameras = common.camera_config((), SIZE, FILM if self.output else Look(), robot=env.robot)
         if sliders and not self.env.get("horizon"):
             env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
         conditions = suite_conditions(self.suite, env, sees=cameras is not None)
         job = RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
-        world = env_of(env, observed_cameras(job), conditions)
+        world = make_env(env, observed_cameras(job), conditions)
         seeds = stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)
         with contextlib.closing(self._screen(world, env, in_window)) as screen:
             for step in run_steps(job, [world], seeds, screen.act):
@@ -86,10 +88,11 @@ class ViewOptions:
         if self.output is not None:
             say(f"next: rerun {self.output}")
 
-    def _screen(self, env: ManipEnv, config: EnvConfig, in_window: bool) -> WindowScreen | RerunLog:
+    def _screen(self, env: Environment, config: EnvConfig, in_window: bool) -> WindowScreen | RerunLog:
         from manip_il.evaluation.watch import RerunLog, WindowScreen
+        from manip_il.sim.env import ManipEnv
 
-        if in_window:
+        if in_window and isinstance(env, ManipEnv):
             return WindowScreen(env, sliders=self.policy.type == "sliders")
         log = RerunLog(config, self.output)
         if log.address:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, make_expert
+from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, make_env, make_expert
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
@@ -34,8 +34,7 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.mesh import is_stored, nameable
 from manip_il.sim.variation import OLDER
 from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import env_of
-from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 from manip_il.tasks.table import get_task, is_task
 
 Columns = dict[str, NDArray[Any]]
@@ -69,8 +68,8 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
         raise ManipError(
             f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
-    lacking = [] if robot or is_robot(spec.robot) or spec.robot == STOCK else [f"--robot.type=PATH/{spec.robot}.yaml"]
-    lacking += [] if task or is_task(spec.task) or spec.robot == STOCK else [f"--task.type=PATH/{spec.task}.py"]
+    lacking = [] if robot or is_robot(spec.robot) or spec.robot in STOCK else [f"--robot.type=PATH/{spec.robot}.yaml"]
+    lacking += [] if task or is_task(spec.task) or spec.robot in STOCK else [f"--task.type=PATH/{spec.task}.py"]
     lacking += [] if shape or not is_stored(spec.object) else [f"--task.object={nameable(spec.object)}"]
     if lacking:
         what = f"the robot {spec.robot!r} and the task {spec.task!r}" + (f" with {spec.object}" if spec.object else "")
@@ -215,9 +214,9 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
 
     An environment with these cameras gives the same bytes in these states. Raises `RenderError` without OpenGL.
     """
-    if env.robot == STOCK:
+    if env.robot in STOCK and not STOCK[env.robot].cameras:
         raise RenderError(f"{env.robot} has no cameras here")
-    view, spec, rows = env_of(env, cameras), env_spec(env, cameras), len(states)
+    view, spec, rows = make_env(env, cameras), env_spec(env, cameras), len(states)
     found: Columns = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
     found |= {key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys}
     for row, state in enumerate(states):
@@ -225,7 +224,8 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
         seen = view.observe()
         for name in cameras.names:
             found[schema.IMAGES + name][row] = seen.images[name]
-            found[schema.KEYPOINTS + name][row] = seen.keypoints[name].ravel()
+        for key, name in spec.keypoint_keys.items():
+            found[key][row] = seen.keypoints[name].ravel()
     return found
 
 

@@ -30,50 +30,53 @@ from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
 from manip_il.tasks.own import source_hash
-from manip_il.tasks.stock.environment import ACTIONS, described_stock, make_stock, require_no_cameras
-from manip_il.tasks.stock.expert import StockExpert
-from manip_il.tasks.stock.table import ACTION_MEANING, PHASES, STATE_NAMES, get_stock
-from manip_il.tasks.stock.table import ROBOT as STOCK
-from manip_il.tasks.stock.table import STOCK as STOCK_TASKS
+from manip_il.tasks.stock.environment import check_cameras, described_stock, make_stock, stock_actions
+from manip_il.tasks.stock.expert import stock_expert
+from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.tasks.stock.table import get_stock
 from manip_il.tasks.table import TASKS, get_task, is_task
 
 
 def is_known(robot: str, task: str, shape: str = "") -> bool:
     """Return whether there is an environment of this robot, task and object here."""
-    return task in STOCK_TASKS if robot == STOCK else is_robot(robot) and is_task(task) and not is_stored(shape)
+    if robot in STOCK:
+        return task in STOCK[robot].tasks
+    return is_robot(robot) and is_task(task) and not is_stored(shape)
 
 
 def make_env(
     config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
 ) -> Environment:
     """Make an environment. Raises `UsageError` for cameras or conditions that it does not have."""
-    if config.robot == STOCK:
-        return make_stock(config.task, cameras, conditions)
+    if config.robot in STOCK:
+        return make_stock(config, cameras, conditions)
     return env_of(config, cameras, conditions)
 
 
 @lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
     """Make the expert of an environment, or return the one that was made."""
-    return StockExpert(config.task) if config.robot == STOCK else Expert(config_scene(config))
+    return stock_expert(config.robot, config.task) if config.robot in STOCK else Expert(config_scene(config))
 
 
 @cache
 def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
     """Return names, sizes and rate that a dataset or policy for this environment must share."""
-    if config.robot == STOCK:
-        require_no_cameras(cameras)
-        stock = get_stock(config.task)
+    check_cameras(config.robot, cameras)
+    if config.robot in STOCK:
+        stock, robot = get_stock(config.task, config.robot), STOCK[config.robot]
         return RobotTaskSpec(
-            robot=STOCK,
+            robot=config.robot,
             task=stock.name,
             fps=config.control_hz,
-            joint_names=STATE_NAMES,
+            joint_names=robot.joint_names,
             environment_state_names=stock.observed,
-            sim_state_size=described_stock(config.task).state_size,
+            sim_state_size=described_stock(config.robot, config.task).state_size,
             instruction=stock.instruction,
-            action_meaning=ACTION_MEANING,
-            phases=PHASES,
+            action_meaning=robot.action_meaning,
+            phases=stock.phases,
+            cameras=cameras.names if cameras else (),
+            image_size=cameras.size if cameras else (0, 0),
         )
     scene, task = config_scene(config), get_task(config.task, config.object)
     servos = scene.robot.lerobot
@@ -97,7 +100,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
 
 def env_actions(config: EnvConfig) -> ActionSpace:
     """Return names, bounds and scale of an environment's actions, (n,)."""
-    return ACTIONS if config.robot == STOCK else config_scene(config).actions
+    return stock_actions(config.robot) if config.robot in STOCK else config_scene(config).actions
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
@@ -111,7 +114,7 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
 @cache
 def _fingerprint(config: EnvConfig) -> dict[str, str]:
     settings, own = asdict(config), dict[str, str]()
-    if config.robot != STOCK:
+    if config.robot not in STOCK:
         task = get_task(config.task, config.object)
         settings["task"], _, argument = task.name.partition(":")
         settings |= {"reward": argument} if argument else {}  # as it was called when carry alone had one
@@ -120,5 +123,8 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
     if not config.object:  # as before there was any
         del settings["object"]
-    model = described_stock(config.task).model_bytes if config.robot == STOCK else config_scene(config).model_bytes()
+    if config.robot in STOCK:
+        model = described_stock(config.robot, config.task).model_bytes
+    else:
+        model = config_scene(config).model_bytes()
     return environment_fingerprint(model, settings) | own

@@ -20,7 +20,7 @@ from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.shape import draws_shape
 from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 if TYPE_CHECKING:  # torch only where a learner drives
     from manip_il.learn.policy import LearnedPolicy
@@ -86,7 +86,7 @@ class RolloutJob:
         if self.policy is None:
             return 1  # alone, an environment has the processor's cache
         varies = draws_shape(self.env.object) or any(one.changes_model() for one in self.conditions)
-        return min(self.batch, OWN_MODELS) if varies or self.env.robot == STOCK else self.batch
+        return min(self.batch, OWN_MODELS) if varies or self.env.robot in STOCK else self.batch
 
     def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:
         """An episode's frames as columns, with what the expert gives as `label` has it."""

@@ -18,12 +18,12 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State, Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import World
-from manip_il.tasks.stock.environment import StockEnv
-from manip_il.tasks.stock.expert import StockExpert
+from manip_il.tasks.stock.base import StockEnvironment
+from manip_il.tasks.stock.expert import StockLabeller
 
 F64 = NDArray[np.float64]
-Environment = ManipEnv | StockEnv
-Labeller = Expert | StockExpert
+Environment = ManipEnv | StockEnvironment
+Labeller = Expert | StockLabeller
 GROWTH = 0.01  # of the share of a task that is done: less is no progress
 
 

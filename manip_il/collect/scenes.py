@@ -8,23 +8,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import lru_cache
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.environments import make_expert
+from manip_il.collect.environments import make_env, make_expert
 from manip_il.collect.query import branch
 from manip_il.mdp import Actor, Label, State, Transition
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import PICTURED, Condition, draw
 from manip_il.sim.config import CameraConfig
+from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import TakesArgument
 from manip_il.sim.variation import completed, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.envs import env_of
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time
@@ -73,8 +73,7 @@ class SceneDrawer:
     """Draws, labels and pictures scenes of one environment."""
 
     def __init__(self, config: EnvConfig, scenes: Scenes):
-        self._env = env_of(config, scenes.cameras)
-        self._task, self._shape = self._env.scene.task, config.object
+        self._env, self._shape = make_env(config, scenes.cameras), config.object
         self._expert = make_expert(config)
         self._scenes = scenes
 
@@ -100,6 +99,8 @@ class SceneDrawer:
 
     def _with_look(self, state: State, number: int) -> State:
         """The state with the looks of a frame; as it was where nothing is drawn."""
+        if not isinstance(self._env, ManipEnv):  # which looks one way
+            return state
         conditions, shape = self._scenes.conditions, self._shape
         drawn = draw(conditions, number, shape).values if conditions else {}
         variation = completed(state.variation, self._env.scene.nominal)
@@ -114,17 +115,19 @@ class SceneDrawer:
 
     def redrawn(self, visited: State, rng: np.random.Generator) -> State | None:
         """Return a scene with other goals and other places of what is untouched; None for one that cannot be."""
-        world = self._env.world
+        if not isinstance(self._env, ManipEnv):
+            return self._env.redrawn(visited, rng)
+        world, task = self._env.world, self._env.scene.task
         world.restore(visited.physics, visited.variation)
-        free = self._untouched(world)
-        poses = self._task.draw(rng, world).poses
-        kept = self._task.argument_bodies if isinstance(self._task, TakesArgument) else ()
+        free, markers = self._untouched(world), _markers(world.model)
+        poses = task.draw(rng, world).poses
+        kept = task.argument_bodies if isinstance(task, TakesArgument) else ()
         new_goals, moved = rng.uniform() < GOALS, list[int]()
         for name, (at, turn) in poses.items():
             body = world.scene.model.body(name).id
             if name in kept:
                 continue
-            if body in self._markers:
+            if body in markers:
                 if new_goals:
                     world.place(name, at, turn)
             elif body in free and rng.uniform() < OBJECTS:
@@ -135,13 +138,6 @@ class SceneDrawer:
         roots, depths = _contacts(world)
         overlaps = np.isin(roots, moved).any(axis=1) & (roots[:, 0] != roots[:, 1]) & (depths > _DEEP)
         return None if overlaps.any() else replace(visited, physics=world.physics())
-
-    @cached_property
-    def _markers(self) -> set[int]:
-        """Bodies that show goals: starts place them, and nothing touches them."""
-        model = self._env.scene.model
-        solid = set(model.body_rootid[model.geom_bodyid[model.geom_contype > 0]].tolist())
-        return {body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and body not in solid}
 
     def _untouched(self, world: World) -> set[int]:
         """Objects and furniture, as bodies, that touch nothing but what is fixed to the world, and rest."""
@@ -154,6 +150,13 @@ class SceneDrawer:
             if world.at_rest(name) and math.dist(world.pose(name).position.tolist(), ee) > _UNTOUCHED
         }
         return (free | {body for body in range(model.nbody) if model.body_mocapid[body] >= 0}) - touched
+
+
+@lru_cache(1)
+def _markers(model: mujoco.MjModel) -> set[int]:
+    """Bodies that show goals: starts place them, and nothing touches them."""
+    solid = set(model.body_rootid[model.geom_bodyid[model.geom_contype > 0]].tolist())
+    return {body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and body not in solid}
 
 
 def _near_hand(world: World, at: F64, rng: np.random.Generator) -> F64:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, OlderSchemaError, UnknownName
 from manip_il.mdp import KEYPOINTS, Episode
+from manip_il.tasks.stock.table import TWO_ARMS
 
 STATE = "observation.state"
 ENVIRONMENT_STATE = "observation.environment_state"
@@ -33,7 +34,7 @@ BETA = "beta"
 OWN_OBJECT = "the task's own"  # what an empty name of an object means
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
 SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as LeRobot's recorder has them
-JOINT_TARGETS = (OPENINGS, SERVOS)
+JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
 LEROBOT_TYPES = {"so_follower": "so101"}  # robots of another name here, by their `robot_type`
 VERSION = 2  # of these columns and what they mean: 2 has progress, whole states and named phases
 MOST_FPS = 10_000  # control steps a second

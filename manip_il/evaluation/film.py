@@ -28,6 +28,7 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import Progress
 from manip_il.mdp import Episode
 from manip_il.sim.config import FILM, CameraConfig
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 FILM_EVERY = 2  # control steps a frame of film
 _SIZE = (240, 320)  # height and width [pixels]
@@ -53,8 +54,9 @@ class Shot:
         """Return the film, whose poster is its last frame; `RenderError` without off-screen OpenGL."""
         env, fps = self.job.env, self.job.env.control_hz // FILM_EVERY or 1
         states = self.episode.columns[schema.SIM_STATE][::FILM_EVERY]
-        pictures = render_states(env, CameraConfig(("front",), *_SIZE, FILM), states)
-        frames = list(pictures[schema.IMAGES + "front"])
+        camera = next(iter(STOCK[env.robot].cameras if env.robot in STOCK else ()), "front")
+        pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
+        frames = list(pictures[schema.IMAGES + camera])
         chosen = np.unique(np.linspace(0, len(frames) - 1, self.stills).round().astype(int)) if self.stills else []
         stills = tuple(Still(f"{one / fps:.1f} s", encode_jpeg(frames[one])) for one in chosen)
         return Film(self.title, encode_mp4(frames, fps), self.caption, encode_jpeg(frames[-1]), stills)

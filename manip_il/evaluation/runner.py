@@ -31,7 +31,7 @@ from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene
 from manip_il.tasks.stock.environment import described_stock
-from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
@@ -104,7 +104,9 @@ def evaluate(
 
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
     """Return how long after success an evaluation's episodes end; stock environments run to their own end."""
-    return None if env.robot == STOCK else hold
+    if env.robot not in STOCK:
+        return hold
+    return 0 if STOCK[env.robot].ends_solved else None
 
 
 def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
@@ -141,12 +143,12 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
     The first object that the episode is about is called `object`; `goal` is where it, or the hand, is to go.
     """
     state = State.from_vector(sim_state)
-    found = _stock_positions(env.task, state) if env.robot == STOCK else _positions(env, state)
+    found = _stock_positions(env, state) if env.robot in STOCK else _positions(env, state)
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
 
 
-def _stock_positions(task: str, state: State) -> dict[str, F64]:
-    env = described_stock(task)
+def _stock_positions(config: EnvConfig, state: State) -> dict[str, F64]:
+    env = described_stock(config.robot, config.task)
     env.set_state(state)
     return env.positions
 

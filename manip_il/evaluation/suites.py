@@ -12,7 +12,7 @@ from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
 from manip_il.sim.conditions import Condition, merged
 from manip_il.sim.shape import draws_shape
 from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import STOCK
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 SUITES = {
     "nominal": ("nominal",),
@@ -78,7 +78,7 @@ def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition 
     from manip_il.sim.task import TakesShape
     from manip_il.tasks.table import get_task  # here, as a wrong name needs no simulator
 
-    if env.task in STOCK:  # which takes none
+    if env.robot in STOCK:  # which takes none
         return None if condition.ranges else condition
     task = get_task(env.task, env.object)
     if "shape" in condition.ranges and isinstance(task, TakesShape) and not draws_shape(env.object):

@@ -1,4 +1,4 @@
-"""Differential inverse kinematics of one arm on mink; the only file that imports mink."""
+"""Differential inverse kinematics of one arm on mink."""
 
 from __future__ import annotations
 

@@ -34,6 +34,7 @@ class Episodes:
 
 
 CAMERAS = ("front", "side", "wrist")
+OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # of stock robots
 MIN_SIDE, MAX_SIDE = 16, 2048  # of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 
@@ -77,7 +78,7 @@ class CameraConfig:
 
     def __post_init__(self) -> None:
         for name in self.names:
-            if name not in CAMERAS:
+            if name not in (*CAMERAS, *OTHERS):
                 raise UnknownName("camera", name, CAMERAS)
         if not self.names or len(set(self.names)) < len(self.names):
             raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, each once")
@@ -91,3 +92,10 @@ class CameraConfig:
     def size(self) -> tuple[int, int]:
         """Height and width."""
         return self.height, self.width
+
+
+def require_cameras(cameras: CameraConfig | None, known: tuple[str, ...]) -> None:
+    """Raise `UnknownName` for cameras that an environment has not."""
+    for name in cameras.names if cameras else ():
+        if name not in known:
+            raise UnknownName("camera", name, known)

@@ -17,7 +17,7 @@ from manip_il.mdp import Observation, State
 from manip_il.robots.robot import Robot
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
-from manip_il.sim.config import CameraConfig, Episodes, Look
+from manip_il.sim.config import CAMERAS, CameraConfig, Episodes, Look, require_cameras
 from manip_il.sim.events import Events
 from manip_il.sim.points import points_in
 from manip_il.sim.posture import draw_posture
@@ -65,6 +65,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._task = task
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)
+        require_cameras(cameras, CAMERAS)
         check_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode, self._window = render_mode, None
         self.cameras = cameras.names if cameras else ()

@@ -16,12 +16,12 @@ from manip_il.tasks.stock import table as stock
 
 LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
 ROBOT_HELP = (
-    f"{', '.join(ROBOTS)}, the path of the YAML of an arm of your own, or {stock.ROBOT}: "
-    "gymnasium-robotics' own Fetch environments, unmodified"
+    f"{', '.join(ROBOTS)}, the path of the YAML of an arm of your own, or {stock.ROBOT} or {stock.ALOHA}: "
+    "gymnasium-robotics' own Fetch and gym_aloha's two arms, unmodified"
 )
 TASK_HELP = (
     f"{', '.join((*NAMES, *SEVERAL))}; the path of a Python file with a task of your own; of {stock.ROBOT} "
-    f"{', '.join(stock.STOCK)}"
+    f"{', '.join(stock.STOCK)}; of {stock.ALOHA} {', '.join(stock.ALOHA_TASKS)}"
 )
 
 
@@ -61,10 +61,10 @@ def complete(config: EnvConfig) -> EnvConfig:
     """Return settings with what is 0 or empty as robot and task have it; raises what `make_config` raises."""
     from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy
 
-    config = _of_stock(config) if config.robot == stock.ROBOT else _with_task(config)
+    config = _of_stock(config) if config.robot in stock.ROBOTS else _with_task(config)
     if not 1 <= config.control_hz <= MOST_HZ:
         raise UsageError(f"control_hz is {config.control_hz}; expected 1 to {MOST_HZ}")
-    if config.robot != stock.ROBOT:
+    if config.robot not in stock.ROBOTS:
         config = _with_limits(config)
     if not 0 < config.tolerance < 1:
         raise UsageError(f"tolerance is {config.tolerance} m; expected between 0 and 1")
@@ -105,17 +105,13 @@ def _with_limits(config: EnvConfig) -> EnvConfig:
 
 def _of_stock(config: EnvConfig) -> EnvConfig:
     """Return settings with those of the stock environments; `UsageError` where there are others, but for 0."""
-    stock.get_stock(config.task)
+    robot = stock.ROBOTS[config.robot]
+    stock.get_stock(config.task, config.robot)
     if config.object:
-        raise UsageError(f"object is {config.object}; {stock.ROBOT} is unmodified, leave --task.object out")
-    own = {
-        "control_hz": stock.CONTROL_HZ,
-        "tolerance": stock.TOLERANCE,
-        "success_steps": 1,
-        "horizon": stock.HORIZON,
-    }
-    for name, value in own.items():
+        raise UsageError(f"object is {config.object}; {config.robot} is unmodified, leave --task.object out")
+    for name, value in robot.fixed.items():
         given = getattr(config, name)
         if given not in (0, value):
-            raise UsageError(f"{name} is {given:g}; {stock.ROBOT} is unmodified, expected {value:g}")
-    return replace(config, **own)
+            raise UsageError(f"{name} is {given:g}; {config.robot} is unmodified, expected {value:g}")
+    settings: dict[str, Any] = {"horizon": config.horizon or robot.horizon, **robot.fixed}
+    return replace(config, **settings)

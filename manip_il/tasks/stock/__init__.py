@@ -1,4 +1,4 @@
-"""Stock benchmark environments: `FetchReach-v4` and siblings of gymnasium-robotics, as they are.
+"""Stock benchmark environments: `FetchReach-v4` and siblings of gymnasium-robotics, as they are; `aloha/` has two arms.
 
 - `--robot.type=fetch_stock --task.type=FetchPush-v4` chooses one. `collect/environments.py`
   chooses between these and our scenes.

@@ -1,4 +1,4 @@
-"""One stock environment under this program's interface; nothing of it is changed."""
+"""One Fetch environment of gymnasium-robotics under this program's interface; nothing of it is changed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 
 # First: it chooses the OpenGL that mujoco takes on import.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CameraConfig
-from manip_il.tasks.stock.table import ROBOT, STATE_NAMES, TOLERANCE, StockTask, get_stock
+from manip_il.sim.config import CAMERAS, CameraConfig, require_cameras
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.stock.base import WHOLE, StockEnvironment
+from manip_il.tasks.stock.table import ALOHA, ROBOTS, STATE_NAMES, TOLERANCE, StockTask, get_stock
 
 F64 = NDArray[np.float64]
-_WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class StockActions(ActionSpace):
@@ -38,32 +39,24 @@ _ONES = np.ones(len(STATE_NAMES))
 ACTIONS = StockActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False]))
 
 
-class StockEnv:
-    """An environment of gymnasium-robotics whose state is saved and restored bit for bit. task: its name."""
-
-    world = None  # its expert restores states
+class StockEnv(StockEnvironment):
+    """An environment of gymnasium-robotics. task: its name."""
 
     def __init__(self, task: str):
-        self.task = get_stock(task)
-        self.task_description = self.task.instruction
+        found = get_stock(task)
+        assert isinstance(found, StockTask)
+        self.task, self.task_description = found, found.instruction
         self._env = _make(self.task)
         self.model: mujoco.MjModel = self._env.model
         self.data: mujoco.MjData = self._env.data
-        self._size = mujoco.mj_stateSize(self.model, _WHOLE)
         self._env._mujoco_step = self._run_physics
         self.start(0)
-
-    def __reduce__(self) -> NoReturn:
-        raise ManipError("an environment of gymnasium-robotics cannot be copied or pickled; use get_state()")
 
     def start(self, seed: int) -> None:
         """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
         self._env.reset(seed=seed)
-        self._step, self._streak, self._ever, self.reward = 0, 0, False, 0.0
+        self._begin()
         self._remember()
-
-    def begin_step(self) -> None:
-        """Leave the world as it is: nothing disturbs it."""
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
         """Apply one action (4,) for one control step; returns it.
@@ -73,16 +66,8 @@ class StockEnv:
         _, reward, _, _, info = self._env.step(ACTIONS.clip(action, self._step))
         if self.task.blocked:  # it has computed all poses again
             self._remember()
-        self.reward = float(reward)
-        self._step += 1
-        self._streak = self._streak + 1 if info["is_success"] else 0
-        self._ever = self._ever or self.solved
+        self._count(float(reward), bool(info["is_success"]))
         return action
-
-    @property
-    def solved(self) -> bool:
-        """State of the task: within 5 cm of the goal after the last step."""
-        return self._streak > 0
 
     @property
     def progress(self) -> float:
@@ -126,36 +111,24 @@ class StockEnv:
 
     def get_state(self) -> State:
         """Return everything that the future depends on; `set_state` restores it bit for bit."""
-        physics = np.empty(self._size)
-        mujoco.mj_getState(self.model, self.data, physics, _WHOLE)
-        return State(np.concatenate([physics, *self._begun]), self.goal.copy(), self._step, self._streak, self._ever)
+        return State(
+            np.concatenate([self._physics(), *self._begun]), self.goal.copy(), self._step, self._streak, self._ever
+        )
 
     def set_state(self, state: State) -> None:
         """Restore a state of the same task. Raises `MismatchError` for another one's."""
-        size, nq = self._size, self.model.nq
+        size, nq = mujoco.mj_stateSize(self.model, WHOLE), self.model.nq
         if len(state.physics) != (expected := size + nq + self.model.nv) or len(state.variation) != 3:
             raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, expected)
         physics = state.physics[:size].copy()
         self._begun = (state.physics[size : size + nq].copy(), state.physics[size + nq :].copy())
-        mujoco.mj_setState(self.model, self.data, physics, _WHOLE)
+        mujoco.mj_setState(self.model, self.data, physics, WHOLE)
         self.data.qpos[:], self.data.qvel[:] = self._begun
         mujoco.mj_fwdPosition(self.model, self.data)
         mujoco.mj_fwdVelocity(self.model, self.data)
-        mujoco.mj_setState(self.model, self.data, physics, _WHOLE)
+        mujoco.mj_setState(self.model, self.data, physics, WHOLE)
         self._env.goal = state.variation.copy()
-        self._step, self._streak, self._ever, self.reward = state.step, state.streak, state.ever, 0.0
-
-    @property
-    def state_size(self) -> int:
-        """Length of `State.to_vector`."""
-        return len(self.get_state().to_vector())
-
-    @property
-    def model_bytes(self) -> bytes:
-        """Compiled model of the environment."""
-        buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
-        mujoco.mj_saveModel(self.model, None, buffer)
-        return buffer.tobytes()
+        self._begin(state)
 
     @property
     def positions(self) -> dict[str, F64]:
@@ -173,27 +146,44 @@ class StockEnv:
         mujoco.mj_step(self.model, self.data, nstep=1)
 
 
-def make_stock(task: str, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> StockEnv:
-    """Make an environment. Raises `UsageError` for cameras, or conditions that change it."""
-    require_no_cameras(cameras)
+def make_stock(
+    config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
+) -> StockEnvironment:
+    """Make an environment. Raises `UsageError` for cameras that it has not, or conditions that change it."""
+    check_cameras(config.robot, cameras)
     if changed := [one.name for one in conditions if one.ranges]:
         raise UsageError(
-            f"{ROBOT} is unmodified and takes no {', '.join(changed)}; use --suite=nominal, for manip-il dagger "
+            f"{config.robot} is unmodified and takes no {', '.join(changed)}; use --suite=nominal, for manip-il dagger "
             "--disturbed_share=0"
         )
-    return StockEnv(task)
+    if config.robot == ALOHA:
+        from manip_il.tasks.stock.aloha.environment import AlohaEnv  # here, as its package need not be installed
+
+        return AlohaEnv(config.task, cameras)
+    return StockEnv(config.task)
 
 
-def require_no_cameras(cameras: CameraConfig | None) -> None:
-    """Raise `UsageError` for cameras."""
-    if cameras is not None:
-        raise UsageError(f"{ROBOT} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
+def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
+    """Raise `UsageError` for cameras that a robot, stock or not, has not."""
+    known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
+    if cameras is not None and not known:
+        raise UsageError(f"{robot} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
+    require_cameras(cameras, known)
 
 
 @cache
-def described_stock(task: str) -> StockEnv:
+def described_stock(robot: str, task: str) -> StockEnvironment:
     """Return an environment for descriptions, which no episode runs in."""
-    return StockEnv(task)
+    return make_stock(EnvConfig(robot=robot, task=task))
+
+
+def stock_actions(robot: str) -> ActionSpace:
+    """Return names, bounds and scale of a stock robot's actions, (n,)."""
+    if robot == ALOHA:
+        from manip_il.tasks.stock.aloha.environment import aloha_actions
+
+        return aloha_actions()
+    return ACTIONS
 
 
 def _make(task: StockTask) -> Any:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from manip_il.errors import UnknownName
+from manip_il.sim.config import OTHERS
 
 ROBOT = "fetch_stock"
 CONTROL_HZ, HORIZON = 25, 50
@@ -28,6 +30,7 @@ class StockTask:
     cls: str
     has_object: bool = True
     blocked: bool = True
+    phases: tuple[str, ...] = PHASES
 
     @property
     def observed(self) -> tuple[str, ...]:
@@ -63,8 +66,124 @@ STOCK: dict[str, StockTask] = {
 }
 
 
-def get_stock(name: str) -> StockTask:
+ALOHA = "aloha"
+TWO_ARMS = "joint position targets [rad], gripper command [0 to 1], of two arms"
+SIDES = ("left", "right")
+_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
+ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  # as in `lerobot/aloha_sim_*`
+
+
+@dataclass(frozen=True)
+class Held:
+    """Facts of an object. open: half the gap of fingers that may come over it; thin: that cannot hold it [m].
+
+    long: its own x is the axis that it is named by.
+    """
+
+    open: float
+    thin: float
+    long: bool = False
+
+
+@dataclass(frozen=True)
+class AlohaTask:
+    """One task of `gym_aloha`. own: its name of it. module: of its ladders. grasped: the hand that takes each object.
+
+    inserted: an object and the one that it goes into.
+    """
+
+    name: str
+    instruction: str
+    own: str
+    module: str
+    objects: Mapping[str, Held]
+    grasped: Mapping[str, str]
+    rungs: Mapping[str, tuple[str, ...]]
+    inserted: tuple[str, ...] = ()
+
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """None, then every pair of a left and a right hand's rung, the first ones of both first."""
+        left, right = (self.rungs[side] for side in SIDES)
+        return ("none", *(f"{one}, {other}" for one in left for other in right))
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """Names of `environment_state`, (k,): lengths [m], entries of rotations, and 1 for what touches."""
+        names = [name for side in SIDES for name in _vectors(f"{side}_ee", f"{side}_ahead", f"{side}_across")]
+        for thing in self.objects:
+            names += [*_vectors(thing, f"{thing}_ahead", f"{thing}_up"), f"{thing}_on_table"]
+            for side in SIDES:
+                names += _vectors(f"{thing}_from_{side}")
+                names += [f"{thing}_touched.{side}.{finger}" for finger in SIDES]
+        if self.inserted:
+            one, other = self.inserted
+            names += _vectors(f"{one}_from_{other}", f"{one}_ahead_in_{other}")
+        return tuple(names)
+
+
+ALOHA_TASKS: dict[str, AlohaTask] = {
+    "AlohaTransferCube-v0": AlohaTask(
+        "AlohaTransferCube-v0",
+        "Pick up the cube with the right arm and transfer it to the left arm.",
+        "transfer_cube",
+        "transfer",
+        {"box": Held(0.027, 0.017)},
+        {"box": "right"},
+        {"left": ("wait", "come", "close", "hold"), "right": ("approach", "grasp", "carry", "release")},
+    ),
+    "AlohaInsertion-v0": AlohaTask(
+        "AlohaInsertion-v0",
+        "Insert the peg into the socket.",
+        "insertion",
+        "insertion",
+        {"peg": Held(0.018, 0.0075, long=True), "socket": Held(0.026, 0.019, long=True)},
+        {"peg": "right", "socket": "left"},
+        {"left": ("approach", "grasp", "carry"), "right": ("approach", "grasp", "carry", "align", "insert")},
+        ("peg", "socket"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class StockRobot:
+    """The environments of one package. fixed: settings of `EnvConfig` that cannot be others; horizon: by default.
+
+    cameras: of the environment, the one that is taken by default first.
+    """
+
+    tasks: Mapping[str, StockTask | AlohaTask]
+    joint_names: tuple[str, ...]
+    action_meaning: str
+    horizon: int
+    fixed: Mapping[str, float]
+    cameras: tuple[str, ...] = ()
+    ends_solved: bool = field(default=False, kw_only=True)
+
+
+ROBOTS = {
+    ROBOT: StockRobot(
+        STOCK,
+        STATE_NAMES,
+        ACTION_MEANING,
+        HORIZON,
+        {"control_hz": CONTROL_HZ, "tolerance": TOLERANCE, "success_steps": 1, "horizon": HORIZON},
+    ),
+    ALOHA: StockRobot(
+        ALOHA_TASKS,
+        ALOHA_NAMES,
+        TWO_ARMS,
+        400,  # as LeRobot's environment; an episode that is registered with gymnasium has 300
+        {"control_hz": 50, "tolerance": TOLERANCE, "success_steps": 1},  # its own reward says what is solved
+        OTHERS,
+        ends_solved=True,
+    ),
+}
+
+
+def get_stock(name: str, robot: str = ROBOT) -> StockTask | AlohaTask:
     """Return the table's entry; raises `UnknownName`."""
-    if name not in STOCK:
-        raise UnknownName(f"task of {ROBOT}", name, STOCK)
-    return STOCK[name]
+    tasks = ROBOTS[robot].tasks
+    if name not in tasks:
+        raise UnknownName(f"task of {robot}", name, tasks)
+    return tasks[name]

@@ -1,0 +1,171 @@
+"""One environment of `gym_aloha` under this program's interface; nothing of it is changed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+# First: it chooses the OpenGL that mujoco takes on import.
+import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
+from manip_il.errors import ManipError, MismatchError, RenderError
+from manip_il.mdp import Observation, State
+from manip_il.robots.action_space import ActionSpace
+from manip_il.sim.config import CameraConfig
+from manip_il.sim.gl import remedy
+from manip_il.tasks.stock.aloha.scene import Parts, Scene
+from manip_il.tasks.stock.base import WHOLE, StockEnvironment
+from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, ALOHA_TASKS, AlohaTask, get_stock
+
+F64 = NDArray[np.float64]
+INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
+MOST_REWARD = 4
+GRIPPERS = np.array([6, 13])
+DRAWN = 0.1  # what `random_near` turns a joint by, at most [rad]
+_DEEP = 1e-3  # what is redrawn may overlap with something by so much [m]
+_BLANK = np.zeros((1, 1, 3), np.uint8)
+
+
+class AlohaActions(ActionSpace):
+    """Joint targets [rad] and gripper commands, 0 to 1, of two arms."""
+
+    def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
+        """Draw joint targets near the measured joints in `state` (14,), the grippers anywhere."""
+        action = np.asarray(state, np.float64) + rng.uniform(-DRAWN, DRAWN, len(self))
+        action[GRIPPERS] = rng.uniform(0.0, 1.0, len(GRIPPERS))
+        return action
+
+
+class AlohaEnv(StockEnvironment):
+    """An environment of `gym_aloha`. task: its name. cameras: what is pictured in every step.
+
+    Raises `ManipError` where the package is not installed.
+    """
+
+    def __init__(self, task: str, cameras: CameraConfig | None = None):
+        found = get_stock(task, ALOHA)
+        assert isinstance(found, AlohaTask)
+        self.task, self.task_description, self._cameras = found, found.instruction, cameras
+        self._env = _gym_aloha().AlohaEnv(found.own, obs_type="pixels_agent_pos")
+        self.physics = self._env._env.physics
+        self.draw = self.physics.render
+        self.physics.render = lambda **_: _BLANK  # it would draw three pictures in every step, whatever is observed
+        self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
+        self.actions = _actions(self.model)
+        self._parts = Parts(self.model, found)
+        self.start(0)
+
+    def start(self, seed: int) -> None:
+        """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
+        self._env.reset(seed=seed)
+        self._begin()
+
+    def advance(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Apply one action (14,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
+        _, reward, _, _, info = self._env.step(self.actions.clip(action, self._step))
+        self._count(float(reward), bool(info["is_success"]))
+        return action
+
+    @property
+    def progress(self) -> float:
+        """Share of the environment's highest reward that a state has."""
+        return float(self._env._env.task.get_reward(self.physics)) / MOST_REWARD
+
+    def scene(self, kind: type[Scene] = Scene) -> Scene:
+        """Return what is read of the state."""
+        return kind(self._parts, self.data)
+
+    def measured(self) -> F64:
+        """Return joints [rad] and grippers, 0 to 1, (14,)."""
+        return self._env._env.task.get_qpos(self.physics)
+
+    def observe(self) -> Observation:
+        """Return joints and grippers, (14,), what is read of the scene, (k,), and pictures."""
+        state, environment = self.measured().astype(np.float32), self.scene().observed().astype(np.float32)
+        return Observation(state, environment, self._pictures() if self._cameras else {})
+
+    def get_state(self) -> State:
+        """Return everything that the future depends on; `set_state` restores it bit for bit."""
+        return State(self._physics(), np.empty(0), self._step, self._streak, self._ever)
+
+    def set_state(self, state: State) -> None:
+        """Restore a state of the same task. Raises `MismatchError` for another one's."""
+        if len(state.physics) != (expected := mujoco.mj_stateSize(self.model, WHOLE)):
+            raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, expected)
+        mujoco.mj_setState(self.model, self.data, state.physics, WHOLE)
+        mujoco.mj_forward(self.model, self.data)
+        self._begin(state)
+
+    @property
+    def positions(self) -> dict[str, F64]:
+        """Positions (3,) [m] of the right hand and the objects, of which the first is called `object`."""
+        scene = self.scene()
+        names = ["object", *list(scene.things)[1:]]
+        things = zip(names, scene.things.values(), strict=True)
+        return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
+
+    def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
+        """Return a state with other places of the objects that no finger touches; None for one that cannot be."""
+        self.set_state(state)
+        scene, moved = self.scene(), list[int]()
+        self._env.reset(seed=int(rng.integers(2**32)))
+        fresh = self.data.qpos.copy()
+        self.set_state(state)
+        for name in self.task.objects:
+            if not any(touch for side in scene.hands for touch in scene.touches(side, name)):
+                joint = self.model.body(name).jntadr[0]
+                at, speed = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint]
+                if scene.on_table(name):
+                    self.data.qpos[at : at + 2] = fresh[at : at + 2]
+                    self.data.qvel[speed : speed + 6] = 0
+                    moved.append(self.model.body(name).id)
+        mujoco.mj_forward(self.model, self.data)
+        contact = self.data.contact
+        bodies = self.model.geom_bodyid[contact.geom]
+        if (np.isin(bodies, moved).any(axis=1) & (contact.dist < -_DEEP)).any():
+            return None
+        return replace(state, physics=self._physics())
+
+    def _pictures(self) -> dict[str, NDArray[np.uint8]]:
+        assert self._cameras is not None
+        painter = _painter(self.task.name)
+        painter.set_state(self.get_state())
+        height, width = self._cameras.size
+        try:
+            return {name: painter.draw(height=height, width=width, camera_id=name) for name in self._cameras.names}
+        except Exception as error:  # what OpenGL and its bindings raise
+            raise RenderError(f"{ALOHA} cannot be drawn ({error}); {remedy()}") from error
+
+
+@cache
+def _painter(task: str) -> AlohaEnv:
+    """The environment that draws a task's states in this process: one OpenGL context, and not one an environment."""
+    return AlohaEnv(task)
+
+
+def _gym_aloha() -> Any:
+    try:
+        return import_module("gym_aloha.env")
+    except ModuleNotFoundError as error:
+        raise ManipError(f"{ALOHA} needs {error.name}, which is not installed: {INSTALL}") from error
+
+
+@cache
+def aloha_actions() -> ActionSpace:
+    """Return names, bounds and scale of the actions, (14,)."""
+    return AlohaEnv(next(iter(ALOHA_TASKS))).actions
+
+
+def _actions(model: mujoco.MjModel) -> ActionSpace:
+    """The actuators' own bounds: MuJoCo keeps to them, and the environment's -1 to 1 is not meant."""
+    chosen = [*range(7), *range(8, 15)]  # the right finger of a hand does as the left one
+    low, high = model.actuator_ctrlrange[chosen].T.copy()
+    low[GRIPPERS], high[GRIPPERS] = 0.0, 1.0
+    is_joint = np.ones(len(chosen), bool)
+    is_joint[GRIPPERS] = False
+    return AlohaActions(ALOHA_NAMES, low, high, np.where(is_joint, DRAWN, 1.0), is_joint)

@@ -1,0 +1,129 @@
+"""The expert of two arms: a label over both hands, a function of the state alone."""
+
+from __future__ import annotations
+
+import math
+from importlib import import_module
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.mdp import Label, State
+from manip_il.robots.site_ik import Costs, SiteIK, turned_towards
+from manip_il.tasks.stock.aloha.environment import AlohaEnv
+from manip_il.tasks.stock.aloha.ladder import Target
+from manip_il.tasks.stock.aloha.scene import Hand, Scene
+from manip_il.tasks.stock.table import SIDES, AlohaTask
+
+F64 = NDArray[np.float64]
+
+POSITION, ORIENTATION, POSTURE = 1.0, 0.3, 0.003  # costs [1/m], [1/rad], [1/rad]
+ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # pull on the forearm's roll where the wrist is straight, for a wrist up and down
+FOREARM_ROLL, WRIST = 3, 4
+MOST_STEP, MOST_TURN = 0.10, 0.5  # of a hand, towards its target [m], [rad]
+FALLEN = -0.02  # an object under this height has left the table [m]
+REACH = (0.2, 0.68)  # of a hand that takes something from the table, from its arm's foot [m]
+CREEPS = 0.95  # share of the friction's lead below which a joint creeps
+BREAKAWAY = 1.5  # step of a joint per lead beyond it
+
+
+class AlohaExpert:
+    """Labels any state of one task. The same state gives bit-equal labels in any order and process."""
+
+    def __init__(self, task: str):
+        self._env = AlohaEnv(task)
+        module = import_module(f"manip_il.tasks.stock.aloha.{self._env.task.module}")
+        self._kind: type[Scene] = module.KIND
+        self._rungs = module.RUNGS
+        self._pairs = {pair: number for number, pair in enumerate(self._env.task.phases)}
+        self._arms = {side: _Arm(self._env, number, side) for number, side in enumerate(SIDES)}
+
+    def label(self, state: State, world: object | None = None) -> Label:
+        """Return the expert's action in `state`, (14,). Raises `MismatchError` for another task's."""
+        env = self._env
+        env.set_state(state)
+        scene = env.scene(self._kind)
+        if reason := self._unsound(scene):
+            return self._still(reason)
+        rungs = {side: next(rung for rung in self._rungs[side] if rung.holds(scene)) for side in SIDES}
+        action = np.empty(len(env.actions))
+        for number, (side, rung) in enumerate(rungs.items()):
+            target = rung.target(scene)
+            command = self._arms[side].command(scene.hands[side], target)
+            if command is None:
+                return self._still(f"inverse kinematics of the {side} arm has no solution")
+            action[7 * number : 7 * number + 7] = *command, target.gripper
+        phase = self._pairs[", ".join(rung.name for rung in rungs.values())]
+        return Label(np.clip(action, env.actions.low, env.actions.high), phase, True, 0.0)
+
+    def _unsound(self, scene: Scene) -> str:
+        task: AlohaTask = scene.task
+        for name, side in task.grasped.items():
+            position = scene.things[name].position
+            if position[2] < FALLEN:
+                return f"{name} off the table"
+            near, far = REACH
+            if not near < math.dist(position[:2], self._arms[side].foot) < far:
+                return f"{name} out of the {side} arm's reach"
+        return ""
+
+    def _still(self, reason: str) -> Label:
+        actions = self._env.actions
+        return Label(np.clip(self._env.measured(), actions.low, actions.high), 0, False, 1.0, reason)
+
+
+class _Arm:
+    """One arm: from a target of its hand to targets of its joints, (6,) [rad]."""
+
+    def __init__(self, env: AlohaEnv, number: int, side: str):
+        model, self._data = env.model, env.data
+        self._joints = joints = np.arange(8 * number, 8 * number + 6)
+        self.foot = model.body(f"vx300s_{side}").pos[:2].tolist()
+        constants = import_module("gym_aloha.constants")
+        costs = Costs(POSITION, ORIENTATION, POSTURE, _pull_on_roll)
+        self._ik = SiteIK(_alone(side), f"cali_{side}_site1", np.array(constants.START_ARM_POSE[:6]), costs)
+        self._gain = model.actuator_gainprm[joints, 0]
+        self._breakaway = model.dof_frictionloss[joints] / self._gain  # lead at which a joint overcomes friction [rad]
+        # Below it MuJoCo's friction, an impedance of 0.9 within 0.02 s, lets through what makes a joint creep.
+        softness = self._gain * model.dof_invweight0[joints] * (0.1 / 0.9) * (CREEPS * constants.DT) / 2 * constants.DT
+        self._creep = 1 - np.exp(-softness)  # step per lead [rad/rad]
+
+    def command(self, hand: Hand, target: Target) -> F64 | None:
+        """Return joint targets (6,) [rad] one step towards a target; None where there is no way."""
+        way = target.position - hand.position
+        length = float(np.linalg.norm(way))
+        position = hand.position + way * min(1.0, MOST_STEP / max(length, MOST_STEP))
+        step = self._ik.step(hand.q, position, turned_towards(hand.rotation, target.rotation, MOST_TURN))
+        if step is None:
+            return None
+        step *= min(1.0, target.longest / max(float(np.abs(step).max()), target.longest))
+        gravity = self._data.qfrc_bias[self._joints] / self._gain
+        return hand.q + self._lead(step) + gravity
+
+    def _lead(self, step: F64) -> F64:
+        """How far targets have to lead joints (6,) for them to make a step (6,) against friction [rad]."""
+        size, most = np.abs(step), CREEPS * self._breakaway
+        crept = self._creep * most
+        return np.sign(step) * np.where(size <= crept, size / self._creep, most + (size - crept) / BREAKAWAY)
+
+
+def _pull_on_roll(q: F64) -> F64:
+    """Costs that keep the forearm from winding around where the wrist is straight, (6,) [1/rad]."""
+    costs = np.zeros(len(q))
+    costs[FOREARM_ROLL] = ROLL * math.exp(-((q[WRIST] / STRAIGHT[int(q[WRIST] <= 0)]) ** 2))
+    return costs
+
+
+def _alone(side: str) -> mujoco.MjModel:
+    """One arm's model, with nothing else and without fingers."""
+    assets = import_module("gym_aloha.constants").ASSETS_DIR
+    spec = mujoco.MjSpec.from_file(str(assets / "bimanual_viperx_transfer_cube.xml"))
+    other = next(one for one in SIDES if one != side)
+    fingers = [f"vx300s_{side}/{finger}_finger_link" for finger in SIDES]
+    bodies = [spec.body(name) for name in ("box", "table", f"vx300s_{other}", *fingers)]
+    for part in [*spec.actuators, *spec.keys, *spec.cameras, *bodies]:
+        spec.delete(part)
+    for geom in list(spec.geoms):
+        spec.delete(geom)
+    return spec.compile()

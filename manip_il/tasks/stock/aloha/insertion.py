@@ -1,0 +1,110 @@
+"""The left hand takes the socket and the right one the peg; they meet in the air, and the peg goes in."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.robots.rotations import angle_between
+from manip_il.tasks.stock.aloha.ladder import ARM, PITCH, Rung, Target, always, approach, close_on, move_object
+from manip_il.tasks.stock.aloha.scene import Scene, Thing, Z, cross, pitched
+
+F64 = NDArray[np.float64]
+
+PEG, SOCKET = "peg", "socket"
+OF = {"left": SOCKET, "right": PEG}
+MEETING = np.array([-0.06, 0.5, 0.10])  # place of the socket where the peg goes in [m]
+WAITING = np.array([0.17, 0.0, 0.0])  # of the peg, from there [m]
+AT_MEETING, LEVEL = 0.03, 0.2  # how far the socket is off there, and off level, at most when the peg comes [m], [rad]
+BEFORE, DEEP = 0.135, 0.085  # of the peg before the socket, and in it, along its axis; it meets the pin at 0.10 [m]
+SLOPE, TOLERANCE = 8.0, 0.003  # of the funnel: the way back for what the peg is aside, but for so much [m]
+ADVANCE = 0.05  # of the peg in a step, at most [m]
+LOW, HIGH = 0.015, 0.055  # heights between which an object that is lifted begins to go sideways [m]
+INSERTED = 0.03  # longest step of a joint with the peg before the socket [rad]
+CARRIED = 0.04  # and before that [rad]
+
+
+class Insertion(Scene):
+    """A state of the peg's insertion."""
+
+    def __init__(self, *of: object):
+        super().__init__(*of)  # type: ignore[arg-type]
+        self.has = {side: self.holds(side, name) for side, name in OF.items()}
+
+    @cached_property
+    def grasps(self) -> dict[str, F64]:
+        """Rotations of the hands that take their objects from the table, (3, 3) each."""
+        found = dict[str, F64]()
+        for side, name in OF.items():
+            across, outward = cross(Z, self.things[name].axes[:, 0]), self.hands[side].outward
+            found[side] = pitched(across * math.copysign(1.0, across @ outward), PITCH)
+        return found
+
+    @cached_property
+    def ready(self) -> bool:
+        """The socket is held where the peg goes in."""
+        socket = self.things[SOCKET]
+        if not self.has["left"] or self.on_table(SOCKET):
+            return False
+        near = np.linalg.norm(socket.position - MEETING) < AT_MEETING
+        return bool(near) and angle_between(socket.frame, np.eye(3)) < LEVEL
+
+    @cached_property
+    def depth(self) -> float:
+        """Next place of the peg along the socket's axis: straight in, or back before it where it is aside [m]."""
+        peg, socket = self.things[PEG], self.things[SOCKET]
+        frame = socket.frame
+        off = frame.T @ (peg.position - socket.position)
+        aside = math.hypot(off[1], off[2]) + ARM * math.acos(min(1.0, float(frame[:, 0] @ peg.frame[:, 0])))
+        back = min(BEFORE, DEEP + SLOPE * max(0.0, aside - TOLERANCE))
+        return max(back, off[0] - ADVANCE)
+
+
+def _lifted_to(thing: Thing, to: F64) -> F64:
+    """Where an object goes on its way to a place (3,): up first [m]."""
+    share = min(1.0, max(0.0, (thing.position[2] - LOW) / (HIGH - LOW)))
+    way = share * (to - thing.position)
+    return np.array([thing.position[0] + way[0], thing.position[1] + way[1], to[2]])
+
+
+def _carry(side: str, to: F64) -> Rung:
+    def target(scene: Insertion) -> Target:
+        place = _lifted_to(scene.things[OF[side]], to)
+        return move_object(scene, side, OF[side], place, np.eye(3), CARRIED)
+
+    return Rung("carry", lambda scene: scene.has[side], target)
+
+
+def _insert(scene: Insertion) -> Target:
+    socket = scene.things[SOCKET]
+    frame = socket.frame
+    return move_object(scene, "right", PEG, socket.position + scene.depth * frame[:, 0], frame, INSERTED)
+
+
+def _before(side: str) -> tuple[Rung, ...]:
+    """The rungs of either hand that has not got its object."""
+    name = OF[side]
+    return (
+        Rung(
+            "grasp",
+            lambda scene: scene.is_at_grasp(side, name, scene.grasps[side]),
+            lambda scene: close_on(scene, side, name, scene.grasps[side]),
+        ),
+        Rung("approach", always, lambda scene: approach(scene, side, name, scene.grasps[side])),
+    )
+
+
+RUNGS = {
+    "left": (_carry("left", MEETING), *_before("left")),
+    "right": (
+        Rung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
+        Rung("align", lambda one: one.has["right"] and one.ready, _insert),
+        _carry("right", MEETING + WAITING),
+        *_before("right"),
+    ),
+}
+
+KIND = Insertion

@@ -1,0 +1,135 @@
+"""The right hand takes the cube from the table and hands it to the left one, in the air."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.tasks.stock.aloha.ladder import (
+    CLOSED,
+    FAST,
+    OPEN,
+    PITCH,
+    Rung,
+    Target,
+    always,
+    approach,
+    close_on,
+)
+from manip_il.tasks.stock.aloha.scene import LIFTED, Scene, X, Z, ahead_across, nearest, pitched
+
+F64 = NDArray[np.float64]
+
+CUBE = "box"
+MEETING = np.array([0.0, 0.5, 0.25])  # place of the cube where it is handed over [m]
+WAITING = np.array([-0.12, 0.0, 0.0])  # of the left hand, from there [m]
+NEAR = 0.1  # of the cube from the meeting, where the left hand sets out [m]
+KEPT_OFF, ARRIVED = 0.12, 0.02  # the left hand stays back by twice what the cube has to go, but for so much [m]
+LEFT_CLOSED = 0.025  # half the gap of left fingers that hold it [m]
+OPENED, OPENING = 0.022, 0.004  # half the gap of right fingers that let it go, and the span over which they do [m]
+CLEAR = 0.12  # of the right hand from the cube, in the end [m]
+CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest steps [rad]
+
+
+class Transfer(Scene):
+    """A state of the cube's transfer."""
+
+    @cached_property
+    def cube(self) -> F64:
+        """Middle of the cube, (3,) [m]."""
+        return self.things[CUBE].position
+
+    @cached_property
+    def right_grasp(self) -> F64:
+        """Rotation of the right hand that takes the cube from the table, (3, 3)."""
+        axes = self.things[CUBE].axes
+        level = axes[:, np.abs(axes.T @ nearest(axes, Z)) < 0.5]
+        return pitched(nearest(level, self.right.outward), PITCH)
+
+    @cached_property
+    def left_grasp(self) -> F64:
+        """Rotation of the left hand that takes it from the right one: its fingers cross the other's, (3, 3)."""
+        axes = self.things[CUBE].axes
+        between = int(np.abs(self.right.rotation[:, 1] @ axes).argmax())
+        free = np.delete(axes, between, axis=1)
+        ahead = nearest(free, X)
+        across = nearest(free[:, np.abs(free.T @ ahead) < 0.5], Z)
+        return ahead_across(ahead, across)
+
+    @cached_property
+    def lifted(self) -> bool:
+        """The cube has left the table."""
+        return bool(self.cube[2] > LIFTED) and not self.on_table(CUBE)
+
+    @cached_property
+    def right_holds(self) -> bool:
+        """The right hand has the cube."""
+        return self.holds("right", CUBE)
+
+    @cached_property
+    def left_holds(self) -> bool:
+        """The left hand has the cube, in the air."""
+        return self.lifted and self.holds("left", CUBE) and all(self.touches("left", CUBE))
+
+    @cached_property
+    def to_go(self) -> float:
+        """Way of the cube to where it is handed over [m]."""
+        return float(np.linalg.norm(self.cube - MEETING))
+
+
+def _is_handed(scene: Transfer) -> bool:
+    return scene.left_holds and scene.left.gap < LEFT_CLOSED
+
+
+def _let_go(scene: Transfer) -> Target:
+    """Open, then back off."""
+    hand = scene.right
+    share = max(0.0, min(1.0, (hand.gap - OPENED) / OPENING))
+    way = max(0.0, CLEAR - abs(hand.sees(scene.cube)[0]))
+    return Target(hand.position - share * way * hand.rotation[:, 0], hand.rotation, OPEN, PARTING)
+
+
+def _carry(scene: Transfer) -> Target:
+    hand = scene.right
+    return Target(hand.position + MEETING - scene.cube, pitched(hand.outward, PITCH), CLOSED, CARRIED)
+
+
+def _left_may_close(scene: Transfer) -> bool:
+    return scene.lifted and scene.is_at_grasp("left", CUBE, scene.left_grasp)
+
+
+def _is_brought(scene: Transfer) -> bool:
+    return scene.right_holds and scene.lifted and scene.to_go < NEAR
+
+
+def _come(scene: Transfer) -> Target:
+    back = min(KEPT_OFF, 2 * max(0.0, scene.to_go - ARRIVED))
+    return approach(scene, "left", CUBE, scene.left_grasp, back, HANDED)
+
+
+def _wait(scene: Transfer) -> Target:
+    return Target(MEETING + WAITING, ahead_across(X, Z), OPEN, FAST)
+
+
+RUNGS = {
+    "left": (
+        Rung("hold", lambda one: one.left_holds, lambda one: Target(one.left.position, one.left.rotation, CLOSED)),
+        Rung("close", _left_may_close, lambda one: close_on(one, "left", CUBE, one.left_grasp, CARRIED)),
+        Rung("come", _is_brought, _come),
+        Rung("wait", always, _wait),
+    ),
+    "right": (
+        Rung("release", _is_handed, _let_go),
+        Rung("carry", lambda one: one.right_holds, _carry),
+        Rung(
+            "grasp",
+            lambda one: one.is_at_grasp("right", CUBE, one.right_grasp),
+            lambda one: close_on(one, "right", CUBE, one.right_grasp),
+        ),
+        Rung("approach", always, lambda one: approach(one, "right", CUBE, one.right_grasp)),
+    ),
+}
+
+KIND = Transfer
