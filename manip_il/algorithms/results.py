@@ -32,7 +32,7 @@ class Watch:
     on_step: Callable[[], None] = lambda: None  # of anything else
 
 
-class Clock:
+class Stopwatch:
     """Seconds by stage."""
 
     def __init__(self) -> None:

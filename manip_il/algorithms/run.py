@@ -21,7 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from manip_il.algorithms.results import VALIDATION, Clock, Result, Watch, best_result, best_validation, validations
+from manip_il.algorithms.results import VALIDATION, Result, Stopwatch, Watch, best_result, best_validation, validations
 from manip_il.algorithms.rounds import (
     DATASET,
     JOURNALS,
@@ -71,7 +71,7 @@ class Run:
 
     def __init__(self, config: Any, folder: Path, engine: Engine, watch: Watch | None = None):
         self.config, self.folder = config, folder
-        self._engine, self._watch, self._clock = engine, watch or Watch(), Clock()
+        self._engine, self._watch, self._clock = engine, watch or Watch(), Stopwatch()
         self._made: dict[int, Rollouts] = {}
         self._held_out_steps = 0
         self._fitted: Fitted | None = None

@@ -1,16 +1,10 @@
-"""A `pretrained_model` folder, opened once and checked before anything in it is loaded: it is data from anywhere.
-
-LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
-`trust_remote_code`, which runs Python from the named repository. Policies that are built from their own configuration
-and weights alone are listed in `PLAIN`, the steps of their processors in `_STEPS`; all others need `--trust=true`.
-"""
+"""A `pretrained_model` folder, opened once and checked before anything in it is loaded."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,21 +12,14 @@ from typing import Any
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, OWN_OBJECT, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
+from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE
+from manip_il.learn.trust import CONFIG, DECODER, LARGEST_JSON, processor_steps, read_config, require_trust
 from manip_il.sim.config import CameraConfig, Look
 
-CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
+META_FILE = "manip_il.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that carry an action space
-
 _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
-_PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
-_LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
 _PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
-_STEPS = (  # of LeRobot's default processors, and ours: they load nothing
-    *("rename_observations_processor", "to_batch_processor", "device_processor"),
-    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
-)
 _MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled")
 _MUST_AGREE = {
     "robot": "robot",
@@ -125,7 +112,7 @@ def read_origin(path: Path) -> Origin | None:
     if not file.is_file():
         return None
     try:
-        return Origin(**checks.read_json(file, "what a policy was trained for", _LARGEST_JSON))
+        return Origin(**checks.read_json(file, "what a policy was trained for", LARGEST_JSON))
     except (ManipError, TypeError) as error:
         line = checks.one_line(error)
         raise ManipError(f"{file} cannot be read ({line}); train again, or restore the file") from error
@@ -158,7 +145,7 @@ class Checkpoint:
         """
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
-        processors = {name: _processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
+        processors = {name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
         try:
             inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
             action = math.prod(outputs[ACTION][1])
@@ -216,7 +203,7 @@ class Checkpoint:
 
     def require_trust(self, trust: bool) -> None:
         """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
-        steps = [step for steps in self.processors.values() for step in steps if step["registry_name"] not in _STEPS]
+        steps = [step for steps in self.processors.values() for step in steps]
         require_trust(self.config, str(self.path), trust, steps)
 
     def require_processors(self) -> None:
@@ -254,55 +241,6 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
         raise ManipError(f"{policy}: its pictures cannot be rendered ({error}); see its {META_FILE}") from error
 
 
-@contextmanager
-def in_one_line(what: str) -> Iterator[None]:
-    """Turn errors of every kind, which others' code raises for files from anywhere, into `ManipError`: `what: ...`."""
-    try:
-        yield
-    except ManipError:
-        raise
-    except Exception as error:
-        raise ManipError(f"{what}: {type(error).__name__}: {checks.one_line(error)}") from error
-
-
-def require_trust(
-    settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
-) -> None:
-    """Raise `ManipError` unless a policy loads nothing by name, or `trust` is given; names what may be loaded.
-
-    settings: its options with `type`, as `config.json` has them. source: of them, for the message. steps: of its
-    processors that load something.
-    """
-    kind, named = settings["type"], list[Any]()
-    if kind not in PLAIN or settings.get("vision_encoder_name"):
-        named += [value for name, value in settings.items() if "name" in name or "path" in name]
-    for step in steps:
-        named += [step["registry_name"], *step["config"].values()]
-    texts = sorted({value for value in named if isinstance(value, str)})
-    if (kind not in PLAIN or texts) and not trust:
-        raise ManipError(
-            f"{source} is a policy of type {kind!r} that would load what it names ({checks.shorten(texts)}): this "
-            "fetches files and may run code that comes with them; if you trust its source, add --trust=true"
-        )
-
-
-def read_config(path: Path) -> dict[str, Any]:
-    """Return the `config.json` of a folder that is whole and holds no pickle; else raise `ManipError`."""
-    if not (path / CONFIG).is_file():
-        raise ManipError(f"no {CONFIG} in {path}; expected LeRobot's pretrained_model folder")
-    for file in sorted(path.rglob("*")):
-        if file.suffix.lower() in _PICKLES:
-            raise ManipError(
-                f"{file} is a pickle, which may run any code when it is read: convert it to safetensors and remove it"
-            )
-    if not (path / WEIGHTS).is_file():
-        raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
-    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json", _LARGEST_JSON)
-    if not isinstance(config.get("type"), str):
-        raise ManipError(f"{path / CONFIG} is not a LeRobot policy's: it names no type")
-    return config
-
-
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Name -> kind and shape of a policy's inputs or outputs."""
     return {key: (str(value["type"]), tuple(map(int, value["shape"]))) for key, value in features.items()}
@@ -316,27 +254,3 @@ def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tup
     if space not in ACTION_SPACES:
         raise UnknownName("action space", checks.shorten(space), ACTION_SPACES)
     return space, str(options.get("robot", ""))
-
-
-def _processor_steps(path: Path) -> list[dict[str, Any]]:
-    """The steps that a processor's file names.
-
-    Refuses a step by import path, as LeRobot would import and call whatever a downloaded file names, and a state
-    outside of the folder.
-    """
-    values = checks.read_json(path, "a processor of LeRobot's", _LARGEST_JSON)
-    try:
-        return [_step(path, step) for step in values["steps"]]
-    except (ManipError, KeyError, TypeError, AttributeError) as error:
-        raise ManipError(f"{path} cannot be read: {checks.one_line(error)}") from error
-
-
-def _step(path: Path, step: dict[str, Any]) -> dict[str, Any]:
-    if "registry_name" not in step:
-        raise ManipError(f"it asks to run {checks.shorten(step.get('class'))}; only registered steps are loaded")
-    known = {"registry_name": str(step["registry_name"]), "config": checks.mapping("config", step.get("config", {}))}
-    if "state_file" in step:
-        known["state_file"] = checks.name("state_file", step["state_file"])
-        if not (path.parent / known["state_file"]).is_file():
-            raise ManipError(f"no {known['state_file']} beside it")
-    return known

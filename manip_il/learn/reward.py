@@ -19,8 +19,9 @@ from torch import Tensor, nn
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, read_config, read_origin
+from manip_il.learn.checkpoint import META_FILE, Origin, read_origin
 from manip_il.learn.network import read_weights, threads
+from manip_il.learn.trust import CONFIG, WEIGHTS, read_config
 
 F32 = NDArray[np.float32]
 PREFERENCE = "preference"  # its type, in config.json

@@ -6,7 +6,6 @@ the episode is the nearest one inside, and `<column>_is_pad` says so.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,11 +19,12 @@ from numpy.typing import NDArray
 
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.joined import JoinedDatasets
-from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, STATS, TASK_INDEX, TIMESTAMP
+from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP
 from manip_il.data.schema import ACTION, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
-from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.learn.checkpoint import in_one_line
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.trust import in_one_line
+from manip_il.mdp import require_finite
 
 I64 = NDArray[np.int64]
 Table = Mapping[str, NDArray[Any]]
@@ -137,12 +137,11 @@ class Samples:
 
 @dataclass(frozen=True)
 class TrainingData(Samples):
-    """The data of one fit. train, held_out: samples; table: columns that are learnt from; digest: of all of it."""
+    """The data of one fit. train, held_out: samples; table: columns that are learnt from."""
 
     train: I64
     held_out: I64
     table: Table
-    digest: str
 
 
 def load_data(
@@ -166,7 +165,8 @@ def load_data(
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
     table = joined_columns(meta.roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
-    require_finite(table, numbers)
+    for key in numbers:
+        require_finite(f"column {key}", table[key])
     if encode is not None:
         table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])
         meta.stats |= column_statistics({ACTION: table[ACTION]})
@@ -184,31 +184,7 @@ def load_data(
         train=usable[train],
         held_out=usable[held_out],
         table=table,
-        digest=_digest(meta.roots, table),
     )
-
-
-def _digest(roots: Sequence[Path], table: Table) -> str:
-    """SHA-256 of the columns and of the datasets' statistics, which stand for the pictures."""
-    digest = hashlib.sha256()
-    for root in roots:
-        path = root / STATS
-        digest.update(path.read_bytes() if path.exists() else b"")
-    for key, column in table.items():
-        digest.update(key.encode())
-        digest.update(np.ascontiguousarray(column))
-    return digest.hexdigest()
-
-
-def require_finite(table: Table, keys: Sequence[str]) -> None:
-    """Raise `NotFiniteError` naming column and row unless all values of these columns are finite."""
-    for key in keys:
-        values = np.asarray(table[key])
-        rows = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
-        if len(rows) == 0:
-            continue
-        row = int(rows[0])
-        raise NotFiniteError(f"column {key}, row {row}: {values[row]} is not finite")
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import hashlib
 import math
 import time
 from collections import defaultdict
@@ -30,11 +29,11 @@ from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
 from manip_il.data.joined import JoinedDatasets
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Augment, Order, generator_of, pictures_to_float
-from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
+from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
@@ -51,6 +50,7 @@ from manip_il.learn.training_state import (
     read_step,
     write_own_files,
 )
+from manip_il.learn.trust import in_one_line
 
 _METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # that LeRobot's update fills in
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
@@ -64,8 +64,8 @@ class Trainer:
     the same bits, resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size`
     samples a step.
 
-    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is resumed
-    on other data, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.
+    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data that is not
+    finite, and what the policy refuses as `ManipError`.
     """
 
     def __init__(
@@ -100,11 +100,6 @@ class Trainer:
         )
         self.meta.table = self.data.table
         drawn = weights[self.data.train] if weights is not None else sources.row_weights(self.data.train)
-        self.digest = self.data.digest
-        if drawn is not None:
-            self.digest = hashlib.sha256(self.digest.encode() + drawn.tobytes()).hexdigest()
-        if checkpoint is not None and (learnt := read_step(checkpoint).get("data")) != self.digest:
-            raise MismatchError("training data", f"checkpoint {checkpoint}", learnt, "this run", self.digest)
         self._augment = Augment() if config.augments else None
         options = {"eval_split": config.eval_split, "augment": asdict(self._augment) if self._augment else None}
         self.origin = Origin.of(
@@ -229,13 +224,12 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of this step and make it the last one."""
         if self.accelerator.is_main_process:
-            own = {"data": self.digest, "batch_size": self.batch_size}
             pipeline = copy.copy(self.pipeline)
             pipeline.output_dir = _portable(self.output_dir)
             with new_checkpoint(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
                 save_checkpoint(new, self.step, pipeline, self.unwrapped, *state, *processors)
-                write_own_files(new, self.origin, read_step(new) | own)
+                write_own_files(new, self.origin, read_step(new) | {"batch_size": self.batch_size})
         self.accelerator.wait_for_everyone()
 
     def _augmented(self, batch: Batch) -> Batch:

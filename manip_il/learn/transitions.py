@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
-from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
-from manip_il.learn.samples import Table, require_finite
-from manip_il.mdp import Actor
+from manip_il.errors import NothingToLearnError, UsageError
+from manip_il.learn.samples import Table
+from manip_il.mdp import Actor, require_finite
 
 F32 = NDArray[np.float32]
 _TELLING = (LABEL_VALID, ACTOR, SUCCESS)  # columns that say whether an episode is a demonstration
@@ -39,21 +39,12 @@ _TELLING = (LABEL_VALID, ACTOR, SUCCESS)  # columns that say whether an episode 
 class Transitions:
     """Steps of episodes, N rows. states, next_states: (N, d + 1), raw inputs and the flag of the absorbing state.
 
-    actions: (N, n), normalised as the policy's head has them, within their range. Raises `MismatchError` if lengths
-    differ, `NotFiniteError` for a number that is none.
+    actions: (N, n), normalised as the policy's head has them, within their range.
     """
 
     states: F32
     actions: F32
     next_states: F32
-
-    def __post_init__(self) -> None:
-        for name in ("actions", "next_states"):
-            if len(getattr(self, name)) != len(self.states):
-                raise MismatchError("rows", "states", len(self.states), name, len(getattr(self, name)))
-        for name in ("states", "actions", "next_states"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise NotFiniteError(f"{name} of transitions hold a number that is not finite")
 
     def __len__(self) -> int:
         return len(self.states)
@@ -125,7 +116,8 @@ def read_demonstrations(
     raises.
     """
     table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
-    require_finite(table, (STATE, ENVIRONMENT_STATE, ACTION))
+    for name in (STATE, ENVIRONMENT_STATE, ACTION):
+        require_finite(f"column {name}", table[name])
     pieces = _episodes(table)
     kept = [piece for piece in pieces if _is_demonstration(table, piece)]
     if not kept:

@@ -14,8 +14,8 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.learn.samples import require_finite
 from manip_il.learn.sources import check_same_sources
+from manip_il.mdp import require_finite
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 _ROUNDS = "round_*/dataset"  # of a run
@@ -61,7 +61,8 @@ def read_frames(root: Path) -> Frames:
     needed = [schema.STATE, schema.ENVIRONMENT_STATE, action]
     more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in there]
     table = dataset.columns([*needed, *more, EPISODE_INDEX])
-    require_finite(table, [*needed, *(name for name in more if name == schema.PROGRESS)])
+    for name in (*needed, *more):
+        require_finite(f"{root}, column {name}", table[name])
     state, environment, executed = (np.ascontiguousarray(table[name], np.float32) for name in needed)
     progress, success = table.get(schema.PROGRESS), table.get(schema.SUCCESS)
     return Frames(

@@ -13,7 +13,7 @@ import pytest
 from manip_il.algorithms.agent import Agent
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.ppo import ppo
-from manip_il.algorithms.results import Clock, Result, best_validation, validations
+from manip_il.algorithms.results import Result, Stopwatch, best_validation, validations
 from manip_il.algorithms.run import Run
 from manip_il.cli.main import main
 from manip_il.collect.workers import Engine
@@ -136,10 +136,10 @@ def test_no_file_of_a_run_names_the_machines_folders(config, tmp_path):
 
 def test_what_cannot_begin_is_refused(config, cloned):
     with pytest.raises(UsageError, match=r"give --dataset\.root=DIR or --init=RUN"):
-        Agent(replace(config, datasets=()), Clock())
+        Agent(replace(config, datasets=()), Stopwatch())
     with pytest.raises(MismatchError, match=r"joint_delta, --action_space has ee_delta"):
-        Agent(replace(config, start=cloned, action_space="ee_delta"), Clock())
+        Agent(replace(config, start=cloned, action_space="ee_delta"), Stopwatch())
     with pytest.raises(UsageError, match="episodes is 5; expected a multiple"):
-        Agent(replace(config, episodes=5), Clock())
+        Agent(replace(config, episodes=5), Stopwatch())
     with pytest.raises(UsageError, match="episode_steps is 10; expected at least"):
-        Agent(replace(config, episode_steps=10), Clock())
+        Agent(replace(config, episode_steps=10), Stopwatch())

@@ -16,12 +16,13 @@ import pytest
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import Checkpoint, Origin, read_origin, require_trust
+from manip_il.learn.checkpoint import Checkpoint, Origin, read_origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_class, policy_config, policy_types
 from manip_il.learn.names import PLAIN
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
+from manip_il.learn.trust import require_trust
 from manip_il.tasks.config import make_config
 
 from .tiny_policies import ACT, CNN, edit_config, observations, refused, write_checkpoint

@@ -16,6 +16,7 @@ from manip_il.learn.losses import (
     floored_log_std,
     make_head,
 )
+from manip_il.learn.network import Shape
 
 N = 3
 
@@ -130,4 +131,4 @@ def test_two_ways_are_kept_apart_by_mixture_and_categorical_alone(loss, on_a_mod
 
 def test_unknown_loss_names_the_nearest():
     with pytest.raises(UnknownName, match="did you mean 'mixture'"):
-        head_for("mixtur")
+        Shape(loss="mixtur")

@@ -15,7 +15,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from manip_il.errors import MismatchError, NotFiniteError, UsageError
-from manip_il.learn.checkpoint import CONFIG, Checkpoint
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
 from manip_il.learn.losses import LOSSES
@@ -23,6 +23,7 @@ from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.network import threads
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
+from manip_il.learn.trust import CONFIG
 
 from ..damage import edit_json
 from .tiny_policies import observations

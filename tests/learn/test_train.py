@@ -152,17 +152,13 @@ def test_frames_without_a_valid_label_do_not_touch_the_weights(table, write, fit
     assert all(torch.equal(a[key], b[key]) for key in a)
 
 
-def test_a_run_is_neither_trained_over_nor_continued_as_another(fit, write, table, tmp_path, weights):
+def test_a_finished_run_is_neither_trained_over_nor_changed_by_resuming(fit, tmp_path, weights):
     before = weights(fit(ACT))
     assert sorted(path.name for path in (tmp_path / "run/checkpoints").iterdir()) == ["000002", "000004", "last"]
     after = weights(fit(ACT, resume=True))
     assert all(torch.equal(before[key], after[key]) for key in before)
     with pytest.raises(FolderExistsError, match="--resume=true"):
         fit(ACT)
-    with pytest.raises(MismatchError, match="training data"):
-        fit(ACT, data=write(table), resume=True)
-    with pytest.raises(MismatchError, match="training data"):
-        fit(ACT, weights=np.ones(240), resume=True)
 
 
 def test_a_half_written_checkpoint_is_passed_over(fit, tmp_path, weights):
@@ -191,14 +187,14 @@ def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(fit):
 
 
 @pytest.mark.parametrize("key", ["observation.state", "observation.environment_state", "action"])
-def test_nan_is_refused_with_column_episode_and_frame(key, table, write, fit):
+def test_nan_is_refused_with_column_and_frame(key, table, write, fit):
     data = write(table)
     [file] = data.datasets[0].data_files
     columns = pq.read_table(file).to_pydict()
     columns[key][47][1] = math.nan
     stored = pq.read_table(file)
     pq.write_table(type(stored).from_pydict(columns, schema=stored.schema), file)
-    with pytest.raises(NotFiniteError, match=rf"{key}, row 47"):
+    with pytest.raises(NotFiniteError, match=rf"column {key}: nan at frame 47"):
         fit(data=data)
 
 
