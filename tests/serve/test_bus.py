@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from serial import Serial
 
 from manip_il.serve.bus import CENTRE, Bus
 
@@ -95,15 +96,36 @@ def test_garbage_is_not_answered_and_what_follows_is(bus: Bus):
         assert found == right * (len(found) // len(right))
 
 
+_OPENER = """
+import sys
+from serial import Serial
+port = Serial(sys.argv[1], timeout=float(sys.argv[2]))
+port.write(bytes.fromhex(sys.argv[3]))
+print(port.read(6).hex(), flush=True)
+sys.stdin.readline()
+"""
+
+
+def opener(bus: Bus, patience: float) -> subprocess.Popen[str]:
+    """A program that opens the port, pings, prints the answer, and closes the port when it is told to."""
+    words = [sys.executable, "-c", _OPENER, str(bus.path), str(patience), packet(1, PING).hex()]
+    return subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
 def test_of_two_programs_on_a_port_the_second_gets_no_answer(bus: Bus):
-    refused = list[str]()
+    """And who comes after both is answered again, also if they ended at once, which the kernel makes one event."""
+    refused, answer = list[str](), packet(1, 0).hex() + "\n"
     bus.on_refusal = refused.append
-    with Serial(str(bus.path), timeout=2.0) as first:
-        first.write(packet(1, PING))
-        assert first.read(6) == packet(1, 0)
-        with Serial(str(bus.path), timeout=0.3) as second:
-            second.write(packet(1, PING))
-            assert second.read(6) == b""
-        assert "another program" in refused[0]
-        first.write(packet(1, PING))
-        assert first.read(6) == packet(1, 0)
+    with opener(bus, 2.0) as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == answer
+        with opener(bus, 0.3) as second:
+            assert second.stdout is not None
+            assert second.stdout.readline() == "\n"
+            for one in (first, second):
+                one.kill()
+    assert "another program" in refused[0]
+    with opener(bus, 2.0) as third:
+        assert third.stdout is not None
+        assert third.stdout.readline() == answer
+        third.kill()
