@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +27,7 @@ from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import FILM
 from manip_il.sim.posture import Pair, meeting_at
-from manip_il.sim.render import Line, Overview, marked_picture
+from manip_il.sim.render import Overview, framed_picture
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.task import TakesShape, Task
 from manip_il.sim.variation import widest_grasp
@@ -44,8 +43,6 @@ ENOUGH = 0.95  # share of a workspace that a robot reaches, of one that suits it
 LOW = 0.03  # height of what lies on the table [m]
 _ROOM = 0.13  # of the map around the workspace [m]
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
-_AXES = ((0.85, 0.12, 0.12, 1.0), (0.10, 0.62, 0.20, 1.0), (0.10, 0.30, 0.90, 1.0))  # x red, y green, z blue
-_SPACE = (0.05, 0.45, 0.75, 1.0)
 
 
 @dataclass(frozen=True)
@@ -177,7 +174,7 @@ def check_report(
         f"Starts: of {STARTS} that are drawn, how many find a place within reach before one does not. Random actions: "
         "a tenth of the control steps, the gripper's too. Intervals are Wilson's score intervals."
     )
-    home = "Of ee, x is red, y (the fingers' way) green, z (out of the hand) blue; the workspace is blue."
+    home = "Of ee, x is red, y (the fingers' way) green, z (out of the hand) blue."
     reach = (
         f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table: where "
         "it is green."
@@ -276,7 +273,7 @@ def _task_advice(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
 
 
 def looks(name: str) -> tuple[Still, ...]:
-    """Return pictures of a robot at home, with its frame `ee` and its workspace drawn into them.
+    """Return pictures of a robot at home, with the axes of its frame `ee`.
 
     Raises `RenderError` without off-screen OpenGL.
     """
@@ -285,11 +282,8 @@ def looks(name: str) -> tuple[Still, ...]:
     data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
     data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
     mujoco.mj_forward(scene.model, data)
-    ee, rotation = data.site_xpos[scene.ee_site].copy(), data.site_xmat[scene.ee_site].reshape(3, 3)
-    lines = [Line(ee, ee + 0.06 * axis, colour, 0.0035) for axis, colour in zip(rotation.T, _AXES, strict=True)]
     (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
     corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]
-    lines += [Line(a, b, _SPACE, 0.003) for a, b in itertools.pairwise(corners)]
     points = np.vstack([data.xpos[1:], corners])
     points = points[np.abs(points).max(axis=1) < 3]  # without what was put out of sight
     low, high = points.min(axis=0), points.max(axis=0)
@@ -301,5 +295,5 @@ def looks(name: str) -> tuple[Still, ...]:
     )
     data.mocap_pos[:, 2] = -9.0  # goals: out of sight
     return tuple(
-        Still(words, encode_jpeg(marked_picture(scene, data, view, (480, 640), FILM, lines))) for view, words in views
+        Still(words, encode_jpeg(framed_picture(scene, data, view, (480, 640), FILM))) for view, words in views
     )

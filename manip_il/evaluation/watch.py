@@ -40,7 +40,7 @@ class WindowScreen:
         phase = f"  {self._phases[step.label.phase]}" if step.label else ""
         solved = "  solved" if step.success else ""
         text = f"seed {step.seed}  step {step.step + 1}{phase}  progress {100 * self._env.progress:.0f} %{solved}"
-        self._window.show(self._env.data, self._env.looks, text)
+        self._window.show(self._env.data, self._env.world.variation, text)
         self._window.pull(self._env.data)
         return self._window.is_open
 

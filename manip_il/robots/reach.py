@@ -10,8 +10,6 @@ import contextlib
 import hashlib
 import math
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -46,7 +44,6 @@ STRETCH = 0.02  # it still gets there less exactly [m]
 _LEAN = 0.13  # how much farther a hand that leans gets, sideways [m]
 _MOST_LEAN = 1.0  # of the hand of an arm that cannot hold it upright [rad]
 _BLOCKED = 0.1  # what a posture in which the robot meets itself counts for [m]
-_BROKEN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)  # what a file that is no map raises
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +98,7 @@ class Reach:
     def has(self, position: Sequence[float] | F64) -> bool:
         """Return whether the hand gets to `position` [m], (3,), and all around it within a cell of the map."""
         cells, (x, y, z), (first_x, first_y, first_z) = self._arrives, position, self._corner
-        x, y, z = (
-            math.floor((x - first_x) / _CELL),
-            math.floor((y - first_y) / _CELL),
-            math.floor((z - first_z) / _CELL),
-        )
+        x, y, z = (math.floor(at / _CELL) for at in (x - first_x, y - first_y, z - first_z))
         if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
             return False
         return cells[x][y][z]
@@ -143,7 +136,7 @@ def reach_of(robot: Robot) -> Reach:
 def kept_reach(robot: Robot) -> Reach | None:
     """Return a robot's map from where it is kept; None where it is not."""
     path = _place(robot)
-    with contextlib.suppress(*_BROKEN), np.load(path) as kept:
+    with contextlib.suppress(Exception), np.load(path) as kept:  # numpy raises many kinds for a file that is no map
         return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
     return None
 

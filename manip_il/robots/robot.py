@@ -1,32 +1,171 @@
-"""A robot: an arm with a gripper, by the names in its MJCF."""
+"""A robot: an arm with a gripper, by the names in its MJCF, in the parts that its YAML has."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from manip_il.errors import ManipError, UnknownName
-from manip_il.robots.files import ModelFiles
-from manip_il.robots.parts import (
-    RATE,
-    TABLE_BEYOND,
-    CameraPose,
-    Costs,
-    EndEffector,
-    GripperConfig,
-    LeRobotConfig,
-    Table,
-    Workspace,
-)
-from manip_il.robots.reading import require_lengths
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
+from manip_il import checks
+from manip_il.errors import ManipError, UnknownName
+from manip_il.robots.files import ModelFiles, require_lengths
+
+F64 = NDArray[np.float64]
+TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
+RATE = 20  # control steps a second of a robot that says no other
+_MOST_HZ = 500
+GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
 FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # on the model, where the YAML does not say them
 UPRIGHT_JOINTS = 6  # with fewer, a hand cannot point down everywhere
+YAWS = ("world", "shoulder")
+WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, in the frame `ee` [m]
+
+
+@dataclass(frozen=True)
+class EndEffector:
+    """Frame `ee`: between the fingertips, z out of the hand, y along the fingers' motion.
+
+    With the hand straight down at zero yaw its axes are world x, -y, -z. position [m] and quaternion (wxyz) in `body`.
+    lowest: of the frame over the table [m]: the fingertips just clear it.
+    """
+
+    body: str
+    position: tuple[float, ...]
+    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    lowest: float = 0.021
+
+    def __post_init__(self) -> None:
+        require_lengths(self, position=3, quaternion=4)
+
+
+@dataclass(frozen=True)
+class GripperConfig:
+    """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch things.
+
+    finger_mass: of every finger in place of the model's [kg]. force: the most of a driven joint, by default 40 N of one
+    that slides and 10 N m of one that turns [N or N m]. files: of a gripper that has a model of its own, whose
+    names begin with `gripper/`; position [m] and quaternion (wxyz): of that model in the hand's body.
+    """
+
+    joints: tuple[str, ...]
+    closed: tuple[float, ...]
+    open: tuple[float, ...]
+    fingers: tuple[str, ...]
+    finger_mass: float | None = None
+    force: float | None = None
+    files: ModelFiles | None = None
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        require_lengths(self, closed=len(self.joints), open=len(self.joints), position=3, quaternion=4)
+        if len(self.fingers) < 2:
+            raise ManipError(f"fingers names {len(self.fingers)}; expected two or more bodies")
+        for joint, at, to in zip(self.joints, self.closed, self.open, strict=True):
+            if at == to:
+                raise ManipError(f"closed and open are both {at:g} for joint {joint!r}; expected two places")
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Volume in which tasks take place: +- half_width about the centre on the table, up to a height over it [m]."""
+
+    centre: tuple[float, ...]
+    half_width: float = 0.15
+    height: float = 0.45
+
+    def __post_init__(self) -> None:
+        require_lengths(self, centre=2)
+        if not 0.02 <= min(self.half_width, self.height) <= max(self.half_width, self.height) <= 2:
+            raise ManipError(f"half_width is {self.half_width:g}, height {self.height:g}; expected 0.02 to 2 m")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Table of a scene: its lengths along x and y, and the height of its top over the floor [m]."""
+
+    size: tuple[float, ...] = (0.9, 1.2)
+    height: float = 0.4
+
+    def __post_init__(self) -> None:
+        require_lengths(self, size=2)
+        if self.height <= 0:
+            raise ManipError(f"height is {self.height:g}; expected more than 0 m")
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """Place of a camera and of what it looks at in the world, (3,) [m], and its view up and down [deg].
+
+    z = 0 is the table's top, x points away from the robot. Looking straight down, x is up in the picture.
+    """
+
+    position: tuple[float, ...]
+    target: tuple[float, ...]
+    fovy: float = 42.0
+
+    def __post_init__(self) -> None:
+        require_lengths(self, position=3, target=3)
+        if np.linalg.norm(np.subtract(self.position, self.target)) < 0.01:
+            raise ManipError("position and target are the same place; expected a direction to look in")
+
+    @property
+    def quaternion(self) -> tuple[float, ...]:
+        """Axes of the camera as MuJoCo has them, wxyz: x right, y up, z back."""
+        back = np.subtract(self.position, self.target)
+        back = back / np.linalg.norm(back)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([0.0, -1.0, 0.0])
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, np.stack([right, np.cross(back, right), back], axis=1).flatten())
+        return tuple(quaternion.tolist())
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Costs of inverse kinematics, beside 1 for a metre off the hand's position.
+
+    orientation: of a radian off its rotation; leaning: the same of a hand that leans to get farther; posture: of a
+    radian of a joint off home.
+    """
+
+    orientation: float = 0.2
+    leaning: float = 0.04
+    posture: float = 0.01
+
+
+@dataclass(frozen=True)
+class LeRobotConfig:
+    """A robot as LeRobot's recorder knows it.
+
+    robot_type: in `meta/info.json`. names: of its servos, the arm's from base to hand, then the gripper's. gripper:
+    where the gripper's driven joint stands at 0 and at 100 [rad]. fps: frames a second.
+    """
+
+    robot_type: str
+    names: tuple[str, ...]
+    gripper: tuple[float, ...]
+    fps: int = RATE
+
+    def __post_init__(self) -> None:
+        checks.name("robot_type", self.robot_type)
+        checks.whole("fps", self.fps, 1, _MOST_HZ)
+        if len(set(self.gripper)) != 2:
+            raise ManipError(f"gripper is {list(self.gripper)}; expected two places, at 0 and at 100 [rad]")
+
+    def percent(self, joint: F64) -> F64:
+        """Return the gripper's numbers, 0 to 100, where its driven joint stands at `joint` [rad]."""
+        at_0, at_100 = self.gripper
+        return 100 * (joint - at_0) / (at_100 - at_0)
+
+
 UPRIGHT = Costs()
 SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # of an arm that cannot
 TABLE = Table()
-YAWS = ("world", "shoulder")
 
 
 @dataclass(frozen=True)
@@ -38,8 +177,8 @@ class Robot:
     added to its inertia [kg m^2]. base: of the root body [m]. fixed: where joints stand that are neither the arm's
     nor the gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
     yaw: where a hand's yaw is zero, along the world's x or straight ahead of the shoulder. wrist_camera: the
-    model's own, on its hand. cameras: of the scene, where they do not stand as for every robot: front, side. table: of
-    the scene.
+    model's own, on its hand, or where one is in the frame `ee` [m]. cameras: of the scene, where they do not stand as
+    for every robot: front, side. table: of the scene.
     colours: red, green and blue of meshes without contacts, by patterns of names, later ones first. lerobot: how
     LeRobot's recorder writes it, where its servos' numbers are wanted in place of [rad] and [m].
     """
@@ -57,7 +196,7 @@ class Robot:
     workspace: Workspace
     costs: Costs = UPRIGHT
     yaw: str = "world"
-    wrist_camera: str = ""
+    wrist_camera: tuple[float, ...] | str = WRIST_CAMERA
     cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
     table: Table = TABLE
     base: tuple[float, ...] | None = None
@@ -69,6 +208,8 @@ class Robot:
     def __post_init__(self) -> None:
         count = len(self.joints)
         require_lengths(self, home=count, gains=count, forces=count, armature=count)
+        if not isinstance(self.wrist_camera, str):
+            require_lengths(self, wrist_camera=3)
         if both := set(self.joints) & set(self.gripper.joints):
             raise ManipError(f"joints and gripper.joints both name {min(both)!r}; expected every joint in one of them")
         if (named := len(self.joint_names)) != count + 1:

@@ -13,8 +13,7 @@ import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.parts import GRIPPER, GripperConfig
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
 
 PLAIN = mujoco.MjSpec()  # its defaults are for what we add to a model, whose own may name a material or a range
 _KV_PER_KP = 1 / 20  # [s]: a time constant of one control step at 20 Hz
@@ -24,7 +23,8 @@ _HINGE_GAINS = (20.0, 0.5, 10.0)  # kp [N m/rad], kv [N m s/rad], torque [N m] o
 _FINGER_ARMATURE, _FINGER_DAMPING = 0.2, 10.0  # [kg], [N s/m]
 _LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # of a linkage's joint [kg m^2], [N m s/rad]
 _HINGE_ARMATURE, _HINGE_DAMPING = 0.005, 0.1  # [kg m^2], [N m s/rad]
-WRIST = "wrist"  # the camera that a robot may keep
+WRIST = "wrist"  # the camera on the hand
+_TILT, _FOVY = 0.45, 70.0  # of one that we put there: towards the fingertips [rad]; what it sees up and down [deg]
 _OF_A_SCENE = ("fusestatic", "discardvisual", "settotalmass", "alignfree", "saveinertial")  # of a compiler's options
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -83,7 +83,8 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
 
     Raises `UsageError` naming a joint, body or file that is not there, and what is.
     """
-    spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, robot.wrist_camera)
+    camera = robot.wrist_camera if isinstance(robot.wrist_camera, str) else ""
+    spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, camera)
     require(robot.name, "joint", (*robot.joints, *robot.gripper.joints), spec.joints)
     require(robot.name, "body", (robot.hand, robot.ee.body, *robot.gripper.fingers), spec.bodies)
     _require_moved(robot, spec)
@@ -103,6 +104,22 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
         body.mass, body.inertia = robot.gripper.finger_mass, np.full(3, 1e-4)
     _paint(robot, spec)
     return spec
+
+
+def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence[float]) -> None:
+    """Add the camera `wrist` to an arm, at a place (3,) [m] in the frame `ee`, tilted to the fingertips.
+
+    model: the arm compiled. The camera looks along its -z, and its x is the hand's y.
+    """
+    rotation, quat, side, site = np.zeros(9), np.zeros(4), np.sign(place[0]), model.site("ee")
+    mujoco.mju_quat2Mat(rotation, site.quat)
+    back = np.array([side * np.sin(_TILT), 0, -np.cos(_TILT)])
+    right = np.array([0.0, side, 0.0])
+    axes = np.stack([right, np.cross(back, right), back], axis=1)
+    rotation = rotation.reshape(3, 3)
+    mujoco.mju_mat2Quat(quat, (rotation @ axes).flatten())
+    hand: Any = spec.site("ee")
+    hand.parent.add_camera(PLAIN.default, name=WRIST, pos=site.pos + rotation @ np.array(place), quat=quat, fovy=_FOVY)
 
 
 def arm_model(robot: Robot) -> mujoco.MjModel:

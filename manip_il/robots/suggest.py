@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import textwrap
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,16 @@ _HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # in 
 _REACHES, _HALF = 0.5, 0.18  # of the workspace's centre and half width, in lengths of the arm
 _WIDEST, _HIGHEST = 0.15, 0.45  # of a workspace: half its width, its height [m]
 _ROUND = 0.01  # what lengths are rounded to [m]
+_FIRST_LINE = (
+    "# A first YAML, from what the model shows. Look it over: manip-il view --robot.type=THIS_FILE (docs/robots.md)"
+)
+_NOTES = {
+    "hand": "body that carries the gripper",
+    "joints": "what drives the fingers",
+    "closed": "where they are then: [m] where they slide, [rad] where they turn",
+    "fingers": "bodies that touch things",
+    "centre": "on the table, x away from the base [m]",
+}
 
 
 @dataclass(frozen=True)
@@ -194,36 +204,15 @@ def _rounded(length: float) -> float:
 
 def yaml_of(found: Suggestion, model: str, gripper: str = "") -> str:
     """Return the YAML of a suggestion, each line with what it means. model, gripper: paths as the YAML has them."""
-    unit = "where they are then: [m] where they slide, [rad] where they turn"
-    own = [_line("model", gripper, "a gripper with a model of its own, put onto the hand")] if gripper else []
-    hand = [
-        *own,
-        _line("joints", found.joints, "what drives the fingers"),
-        _line("closed", found.closed, unit),
-        _line("open", found.open, unit),
-        _line("fingers", found.fingers, "bodies that touch things"),
-    ]
-    space = [
-        _line("centre", found.centre, "on the table, x away from the base"),
-        _line("half_width", found.half_width),
-        _line("height", found.height),
-    ]
-    return f"""\
-# A first YAML, from what the model shows. Look it over, then: manip-il view --robot.type=THIS_FILE (docs/robots.md)
-{_line("model", model)}{_line("hand", found.hand, "body that carries the gripper")}gripper:
-{textwrap.indent("".join(hand), "  ")}workspace: # [m]
-{textwrap.indent("".join(space), "  ")}"""
-
-
-def _line(key: str, value: Any, note: str = "") -> str:
-    """`key: value # note` in YAML, numbers to five digits."""
-    text = yaml.safe_dump({key: _plain(value)}, default_flow_style=True, width=math.inf, sort_keys=False)
-    return f"{text.strip()[1:-1]}{f' # {note}' if note else ''}\n"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(one) for one in value]
-    return float(f"{value:.5g}") + 0.0 if isinstance(value, float) else value  # no -0
+    ends = {name: [float(f"{one:.5g}") + 0.0 for one in getattr(found, name)] for name in ("closed", "open")}  # no -0
+    own = {"model": gripper} if gripper else {}
+    tree = {
+        "model": model,
+        "hand": found.hand,
+        "gripper": own | {"joints": list(found.joints), **ends, "fingers": list(found.fingers)},
+        "workspace": {"centre": list(found.centre), "half_width": found.half_width, "height": found.height},
+    }
+    text = yaml.safe_dump(tree, default_flow_style=None, width=math.inf, sort_keys=False)
+    for key, note in _NOTES.items():
+        text = re.sub(rf"(?m)^( *{key}:.*)$", lambda line, note=note: f"{line[1]} # {note}", text, count=1)
+    return f"{_FIRST_LINE}\n{text}"

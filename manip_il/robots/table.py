@@ -14,10 +14,8 @@ from manip_il import checks
 from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
-from manip_il.robots.files import KEYS, ModelFiles
-from manip_il.robots.parts import GRIPPER, CameraPose, Costs, GripperConfig
-from manip_il.robots.reading import read
-from manip_il.robots.robot import FOUND, UPRIGHT, Robot, costs_of, yaw_of
+from manip_il.robots.files import KEYS, ModelFiles, read
+from manip_il.robots.robot import FOUND, GRIPPER, UPRIGHT, CameraPose, Costs, GripperConfig, Robot, costs_of, yaw_of
 
 SUFFIXES = (".yaml", ".yml")
 SCENE_CAMERAS = ("front", "side")  # that a YAML may place

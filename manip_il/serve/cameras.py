@@ -75,7 +75,7 @@ class Cameras:
     def _message(self) -> str:
         env = self._station.env
         self._data.qpos[:], self._data.mocap_pos[:] = self._station.seen
-        images = render.pictures(env.scene, self._data, self._cameras, env.looks)
+        images = render.pictures(env.scene, self._data, self._cameras, env.world.variation)
         # RGB goes in as it is and comes out of the client's `imdecode` as it is, so that red stays red.
         coded = {name: cv2.imencode(".jpg", one, _QUALITY)[1] for name, one in images.items()}
         texts = {name: base64.b64encode(one.tobytes()).decode() for name, one in coded.items()}

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UnknownName
 from manip_il.mdp import Observation, State
 from manip_il.robots.robot import Robot
 from manip_il.seeding import rng_for
@@ -25,8 +25,8 @@ from manip_il.sim.render import Picture, pictures, projections
 from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task, ask, instruction_in
-from manip_il.sim.variation import drawn_in, with_drawn
-from manip_il.sim.window import Window, check_render_mode
+from manip_il.sim.variation import with_drawn
+from manip_il.sim.window import Window, require_display
 from manip_il.sim.world import Scene, World
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
@@ -66,7 +66,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)
         require_cameras(cameras, CAMERAS)
-        check_render_mode(render_mode, self.metadata["render_modes"])
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UnknownName("render_mode", render_mode, self.metadata["render_modes"])
+        if render_mode == "human":
+            require_display()
         self.render_mode, self._window = render_mode, None
         self.cameras = cameras.names if cameras else ()
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
@@ -237,7 +240,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         if self.render_mode == "human":
             if self._window is None:
                 self._window = Window(self.scene, self.config.control_hz)
-            self._window.show(self.data, self.looks)
+            self._window.show(self.data, self.world.variation)
         if self.render_mode != "rgb_array":
             return None
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
@@ -248,13 +251,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             self._window.close()
             self._window = None
 
-    @property
-    def looks(self) -> Drawn:
-        """Appearance of the episode's world: what pictures of it depend on beside poses."""
-        return Drawn(self.drawn.condition, drawn_in(self.world.variation, self.scene.nominal))
-
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        return pictures(self.scene, self.data, cameras, self.looks)
+        return pictures(self.scene, self.data, cameras, self.world.variation)
 
     def _keypoints(self, cameras: CameraConfig) -> dict[str, F32]:
         points = np.stack([*points_in(self.world).values()])
@@ -292,8 +290,8 @@ def environment_state(world: World) -> F32:
     """Return the numbers that the task observes, float32 (k,). Raises `ManipError` if their names have changed."""
     numbers: list[float] = []  # of few entries a list is faster than numpy
     observed = world.scene.task.observe(world)
-    if tuple(observed) != _observed_names(world.scene):
-        names = ", ".join(_observed_names(world.scene))
+    if tuple(observed) != tuple(_observed(world.scene)):
+        names = ", ".join(_observed(world.scene))
         raise ManipError(f"{world.scene.name}: observed {', '.join(observed)}, and before {names}; expected the same")
     for value in observed.values():
         numbers += value.tolist() if isinstance(value, np.ndarray) and value.ndim else [float(value)]
@@ -301,18 +299,17 @@ def environment_state(world: World) -> F32:
 
 
 @lru_cache(SCENES_KEPT)
-def _observed_names(scene: Scene) -> tuple[str, ...]:
+def _observed(scene: Scene) -> dict[str, F64 | float]:
+    """What the task observes of the model as compiled."""
     world = World(scene)
     world.update()
-    return tuple(scene.task.observe(world))
+    return dict(scene.task.observe(world))
 
 
 @lru_cache(SCENES_KEPT)
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
     """Return names of the vector's k entries; lengths in [m]."""
-    world = World(scene)
-    world.update()
     names: list[str] = []
-    for name, value in scene.task.observe(world).items():
+    for name, value in _observed(scene).items():
         names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
     return tuple(names)

@@ -289,7 +289,5 @@ def _place(world: World, name: str, pose: F64) -> bool:
     """Put an object at rest at `pose` (7,); false where it would stand inside something."""
     world.place(name, pose[:3], pose[3:])
     _settle(world)
-    geoms = world.scene.objects[name].geoms
-    return all(
-        contact.dist > _OVERLAP for contact in world.data.contact if contact.geom1 in geoms or contact.geom2 in geoms
-    )
+    geom = world.scene.objects[name].geom
+    return all(contact.dist > _OVERLAP for contact in world.data.contact if geom in (contact.geom1, contact.geom2))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
@@ -18,11 +17,8 @@ from manip_il import checks
 from manip_il.errors import UsageError, shorten
 
 SUFFIXES = (".stl", ".obj")
-SPLIT = "coacd"  # the word for contacts of several convex pieces, and the package that finds them
-MOST_FACES = 200_000
-_LARGEST = 100_000_000  # of a file [bytes]
-_SEED = 0  # of the pieces
-_TEXT = re.compile(rf"mesh:(?P<path>.+?)(?P<length>:\d*\.?\d+)?(?P<split>:{SPLIT})?", re.DOTALL)
+MOST_FACES = 200_000  # MuJoCo's
+_TEXT = re.compile(r"mesh:(?P<path>.+?)(?P<length>:\d*\.?\d+)?", re.DOTALL)
 _HASH = re.compile(r"#[0-9a-f]{12}$")
 
 
@@ -31,7 +27,7 @@ class Mesh:
     """A closed mesh about its centre of mass: vertices (n, 3) [m], faces (m, 3), volume [m^3].
 
     sha256: of the file. text: what means it, with its path; stored: the same with its name and hash, as datasets have
-    it. pieces: vertices (k, 3) of convex pieces that touch in place of its hull, none for the hull.
+    it.
     """
 
     text: str
@@ -40,7 +36,6 @@ class Mesh:
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     volume: float
-    pieces: tuple[NDArray[np.float64], ...]
 
     @property
     def lengths(self) -> tuple[float, float, float]:
@@ -50,7 +45,7 @@ class Mesh:
 
 
 def parse_mesh(text: str) -> Mesh:
-    """Return the mesh that `mesh:PATH`, `mesh:PATH:LENGTH` or one of these with `:coacd` means, read once.
+    """Return the mesh that `mesh:PATH` or `mesh:PATH:LENGTH` means, read once.
 
     LENGTH: of its longest side [m]; without one the file is in metres. Raises `UsageError`.
     """
@@ -58,8 +53,7 @@ def parse_mesh(text: str) -> Mesh:
         raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
     if _HASH.search(path):
         raise UsageError(f"object {text} is a mesh whose name alone is known here; give --task.object={nameable(text)}")
-    _, length, split = _TEXT.fullmatch(text).groups("")  # pyright: ignore[reportOptionalMemberAccess]  # as above
-    return _read(path, float(length[1:] or 0), bool(split))
+    return _read(path, float(text.removeprefix(f"mesh:{path}")[1:] or 0))
 
 
 def mesh_path(text: str) -> str | None:
@@ -84,31 +78,26 @@ def moved(text: str, path: Path) -> str:
 
 
 @cache
-def _read(name: str, length: float, split: bool) -> Mesh:
+def _read(name: str, length: float) -> Mesh:
     path = Path(name)
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"object is mesh:{name}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
     if not path.is_file():
         raise UsageError(f"{name} does not exist; expected a mesh, an STL or OBJ file")
-    if path.stat().st_size > _LARGEST:
-        raise UsageError(f"{name} has {path.stat().st_size:,} bytes; expected at most {_LARGEST:,}")
     content = path.read_bytes()
     solid = _solid(name, content, path.suffix.lower())
     scale = length / solid.extents.max() if length else 1.0
     vertices, volume = (solid.vertices - solid.center_mass) * scale, float(solid.volume) * scale**3
     digest = hashlib.sha256(content).hexdigest()
-    ending = (f":{length:g}" if length else "") + (f":{SPLIT}" if split else "")
-    pieces = _pieces(vertices, solid.faces) if split else ()
+    ending = f":{length:g}" if length else ""
     text, stored = f"mesh:{name}{ending}", f"mesh:{path.name}#{digest[:12]}{ending}"
-    return Mesh(text, stored, digest, vertices, np.asarray(solid.faces), volume, pieces)
+    return Mesh(text, stored, digest, vertices, np.asarray(solid.faces), volume)
 
 
 def _solid(name: str, content: bytes, suffix: str) -> Any:
     """The closed surface in a file, whose faces look outwards; raises `UsageError`."""
     import trimesh  # here, as it takes a third of a second
 
-    if (faces := _count_faces(content, suffix)) > MOST_FACES:
-        raise UsageError(f"{name} has {faces:,} faces; expected at most {MOST_FACES:,}: simplify it first")
     try:
         found = trimesh.load_mesh(
             BytesIO(content), file_type=suffix[1:], **({"skip_materials": True} if suffix == ".obj" else {})
@@ -116,8 +105,10 @@ def _solid(name: str, content: bytes, suffix: str) -> Any:
         solid = trimesh.Trimesh(found.vertices, found.faces)
     except Exception as error:
         raise UsageError(f"{name} is no mesh that can be read: {checks.one_line(error)}") from error
-    if not len(solid.faces) or not np.isfinite(solid.vertices).all():
-        raise UsageError(f"{name} is no mesh: it has no faces, or points that are no numbers")
+    if not len(solid.faces):
+        raise UsageError(f"{name} is no mesh: it has no faces")
+    if len(solid.faces) > MOST_FACES:
+        raise UsageError(f"{name} has {len(solid.faces):,} faces; expected at most {MOST_FACES:,}: simplify it first")
     if not solid.is_watertight:
         edges = np.unique(solid.edges_sorted, axis=0, return_counts=True)[1]
         raise UsageError(
@@ -131,20 +122,3 @@ def _solid(name: str, content: bytes, suffix: str) -> Any:
     if not solid.volume > 1e-9 * solid.extents.max() ** 3:
         raise UsageError(f"{name} has a volume of {solid.volume:g}; expected a solid")
     return solid
-
-
-def _count_faces(content: bytes, suffix: str) -> int:
-    """Faces that a file says it has, before anything is made of it."""
-    if suffix == ".obj":
-        return content.count(b"\nf ")
-    count = int.from_bytes(content[80:84], "little")
-    return count if len(content) == 84 + 50 * count else content.count(b"facet normal")
-
-
-def _pieces(vertices: NDArray[np.float64], faces: Sequence[Any]) -> tuple[NDArray[np.float64], ...]:
-    try:
-        import coacd  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise UsageError(f":{SPLIT} needs a package that is not installed; pip install {SPLIT}") from None
-    coacd.set_log_level("error")
-    return tuple(np.asarray(one) for one, _ in coacd.run_coacd(coacd.Mesh(vertices, faces), seed=_SEED))

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
-from manip_il.robots.parts import GRIPPER
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import GRIPPER, Robot
 from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]

@@ -49,7 +49,7 @@ class Prop(NamedTuple):
         scene.ngeom += 1
 
 
-def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] = (0, 0)) -> list[Prop]:
+def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
     """Return what is only seen of a scene's world. clutter: how many things, and the seed of what they are and where.
 
     Poses of mocap bodies and joints in `data` must be up to date.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import math
 import os
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,26 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
-from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.gl import context_class, remedy
 from manip_il.sim.props import Prop, props
 from manip_il.sim.scene import camera_id
+from manip_il.sim.variation import part
 from manip_il.sim.view import ViewModel
 from manip_il.sim.world import Scene
 
+F64 = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 _FINER = 2  # drawn so much finer each way, then averaged: cheaper than OpenGL's antialiasing, which repeats the meshes
 _MAX_GEOMS = 1_000
-
-
-class Line(NamedTuple):
-    """A line drawn into a picture: its ends (3,) in the world [m], red, green, blue and opacity, its thickness [m]."""
-
-    start: NDArray[np.float64]
-    end: NDArray[np.float64]
-    colour: tuple[float, float, float, float]
-    thickness: float
+_EE = 4  # group of the site `ee`, the robot's only one
+_AXES = 0.06, 0.006  # length and thickness of its axes [m]
 
 
 class Overview(NamedTuple):
@@ -45,15 +38,16 @@ class Overview(NamedTuple):
 
 
 def pictures(
-    scene: Scene, data: mujoco.MjData, cameras: CameraConfig, drawn: Drawn = NOMINAL_VALUES
+    scene: Scene, data: mujoco.MjData, cameras: CameraConfig, variation: F64 | None = None
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    A picture depends on `qpos`, the goal and what the episode draws alone: it has the same bytes in any order.
+    variation: of the world (v,), else the scene's own. A picture depends on `qpos`, mocap bodies and that alone: it has
+    the same bytes in any order.
     Raises `RenderError`, which says what to unset or install, where there is no off-screen OpenGL.
     """
     renderer = _process.renderer(scene, cameras.look)
-    renderer.pose(data, drawn)
+    renderer.pose(data, scene.nominal if variation is None else variation)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
 
@@ -67,21 +61,17 @@ def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
 
 
-def marked_picture(
-    scene: Scene,
-    data: mujoco.MjData,
-    camera: str | Overview,
-    size: tuple[int, int],
-    look: Look,
-    lines: Sequence[Line],
+def framed_picture(
+    scene: Scene, data: mujoco.MjData, camera: str | Overview, size: tuple[int, int], look: Look
 ) -> Picture:
-    """Return what a camera, or somebody outside, sees of the physics in `data`, with lines drawn into it.
+    """Return what a camera, or somebody outside, sees of the physics in `data`, with the axes of `ee` drawn in.
 
-    size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures` raises.
+    x is red, y green, z blue. size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures`
+    raises.
     """
     renderer = _process.renderer(scene, look)
-    renderer.pose(data, NOMINAL_VALUES)
-    return renderer.picture(camera, size, lines)
+    renderer.pose(data, scene.nominal)
+    return renderer.picture(camera, size, axes=True)
 
 
 def close() -> None:
@@ -96,6 +86,8 @@ class _Renderer:
         self._view = ViewModel(scene, look)
         self._model = self._view.model
         self._data, self._props = mujoco.MjData(self._model), list[Prop]()
+        scale = self._model.vis.scale
+        scale.framelength, scale.framewidth = np.array(_AXES) / self._model.stat.meansize
         self._of = scene
         self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
@@ -106,26 +98,25 @@ class _Renderer:
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
             raise RuntimeError("it has no off-screen buffers")
 
-    def pose(self, data: mujoco.MjData, drawn: Drawn) -> None:
-        """Put everything where `data` has it, and apply what the episode draws."""
-        self._view.apply(drawn)
+    def pose(self, data: mujoco.MjData, variation: F64) -> None:
+        """Put everything where `data` has it, and apply how a world of a variation (v,) looks."""
+        self._view.apply(variation)
         self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
-        self._props = props(self._of, self._data, drawn.values.get("clutter", (0, 0)))
+        self._props = props(self._of, self._data, part(variation, "clutter"))
 
-    def picture(self, camera: str | Overview, size: tuple[int, int], lines: Sequence[Line] = ()) -> Picture:
+    def picture(self, camera: str | Overview, size: tuple[int, int], *, axes: bool = False) -> Picture:
         height, width = (_FINER * side for side in size)
         self._make_room(height, width)
         seen_by = self._camera if isinstance(camera, str) else _free_camera(camera)
         if isinstance(camera, str):
             seen_by.fixedcamid = self._cameras[camera]
-        everything = mujoco.mjtCatBit.mjCAT_ALL
+        everything, frame = mujoco.mjtCatBit.mjCAT_ALL, mujoco.mjtFrame
+        self._option.frame, self._option.sitegroup[_EE] = (frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE), axes
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, seen_by, everything, self._scene)
         for prop in self._props:
             prop.add_to(self._scene)
-        for line in lines:
-            _add_line(self._scene, line)
         fine = np.empty((height, width, 3), dtype=np.uint8)
         view = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(view, self._scene, self._context)
@@ -157,14 +148,6 @@ def _free_camera(view: Overview) -> mujoco.MjvCamera:
     camera.lookat[:] = view.at
     camera.distance, camera.azimuth, camera.elevation = view.distance, view.azimuth, view.elevation
     return camera
-
-
-def _add_line(scene: Any, line: Line) -> None:
-    kind, geom = mujoco.mjtGeom.mjGEOM_CAPSULE, scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(line.colour, np.float32))
-    mujoco.mjv_connector(geom, kind, line.thickness, line.start, line.end)
-    geom.emission, geom.category = 0.6, mujoco.mjtCatBit.mjCAT_DECOR  # seen in the dark, and without a shadow
-    scene.ngeom += 1
 
 
 class _Process:

@@ -59,9 +59,9 @@ class Hull:
     where it rests; the first is that in which it lies as it was made, or the nearest to that.
     """
 
-    def __init__(self, model: mujoco.MjModel, body: int, geoms: Sequence[int], lowest: float, widest: float):
-        """Take the meshes of a body, and a gripper that opens to `widest` [m], with `ee` no lower than `lowest` [m]."""
-        points = _few(np.concatenate([_vertices(model, geom) for geom in geoms]))
+    def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
+        """Take the mesh of a body, and a gripper that opens to `widest` [m], with `ee` no lower than `lowest` [m]."""
+        points = _few(_vertices(model, geom))
         self._hull, self._centre, self._gripper = ConvexHull(points), model.body_ipos[body].copy(), (lowest, widest)
         self._rests: dict[int, Rest] = {}
         self.downs = _resting(self._hull, self._centre)

@@ -15,11 +15,9 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.action_space import ActionSpace, ServoUnits
 from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
-from manip_il.robots.parts import TABLE_BEYOND, CameraPose
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import TABLE_BEYOND, CameraPose, Robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
-from manip_il.robots.spec import arm_spec, copy_options
-from manip_il.robots.wrist_camera import add_wrist_camera
+from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.posture import require_free_home
@@ -72,8 +70,8 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     arm = arm_spec(robot)
     arm_alone = arm.copy().compile()
     _add_pedestal(spec, arm_alone, robot)
-    if not robot.wrist_camera:
-        add_wrist_camera(arm, arm_alone, robot)
+    if not isinstance(robot.wrist_camera, str):
+        add_wrist_camera(arm, arm_alone, robot.wrist_camera)
     copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_cameras(spec, robot)
@@ -96,7 +94,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
     objects = _objects(model)
     gripper = Gripper(robot, model, PREFIX)
     hulls = {
-        name: Hull(model, one.body, one.geoms, robot.ee.lowest, gripper.most)
+        name: Hull(model, one.body, one.geom, robot.ee.lowest, gripper.most)
         for name, one in objects.items()
         if _is_mesh(model, one.geom)
     }
@@ -144,9 +142,7 @@ def _objects(model: mujoco.MjModel) -> dict[str, Object]:
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             body = int(model.jnt_bodyid[joint])
             name, geom = model.body(body).name, int(model.body_geomadr[body])
-            parts = range(geom, geom + (model.body_geomnum[body] if _is_mesh(model, geom) else 1))
-            geoms = tuple(one for one in parts if model.geom_contype[one])
-            objects[name] = Object(name, body, geom, geoms, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+            objects[name] = Object(name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
     return objects
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError
-from manip_il.sim.config import CAMERAS
 from manip_il.sim.shape import Shape, contact
 
 F64 = NDArray[np.float64]
@@ -58,14 +57,12 @@ _NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # how the episode began, a
 class Object:
     """A free body of a compiled model, and its first geom: what shows its shape.
 
-    geoms: those of its geoms that touch others; of primitives the first. q, v: starts of its free joint in qpos and
-    qvel.
+    q, v: starts of its free joint in qpos and qvel.
     """
 
     name: str
     body: int
     geom: int
-    geoms: tuple[int, ...]
     q: int
     v: int
 
@@ -79,6 +76,11 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
     return np.concatenate([*parts, NOTHING_DRAWN])
 
 
+def part(variation: F64, name: str) -> F64:
+    """Return the numbers of a variation (v,) that have a name in `_WORLD`, as a view."""
+    return variation[len(variation) - WORLD_SIZE :][_PLACES[name]]
+
+
 def completed(variation: F64, like: F64) -> F64:
     """Return a variation (v,) as it is now. like: the scene's own, (v,).
 
@@ -90,16 +92,6 @@ def completed(variation: F64, like: F64) -> F64:
     if variation.shape != like.shape:
         raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
     return variation
-
-
-def check(variation: F64, like: F64) -> None:
-    """Raise `ManipError` for a variation (v,) that no world can have. like: the scene's own, (v,)."""
-    shape = float(variation[len(like) - WORLD_SIZE :][_PLACES["shape"]][0])
-    if shape not in (_OWN, *_KINDS):
-        raise ManipError(f"a variation whose shape is {shape}; expected a geom type of {', '.join(GEOMS)}, or {_OWN}")
-    like = like if shape == _OWN else with_drawn(like, {"shape": _KINDS[shape]})
-    if (variation[like > 0] <= 0).any():
-        raise ManipError(f"a variation of {variation}; expected lengths, masses, frictions and factors above 0")
 
 
 def same_physics(variation: F64, other: F64) -> bool:
@@ -122,30 +114,6 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     return np.concatenate([_objects_with(base[:split], drawn), world])
 
 
-def drawn_in(variation: F64, like: F64) -> dict[str, Any]:
-    """Return what was drawn of a variation (v,), by the names of `Condition`: the inverse of `with_drawn`.
-
-    Without masses and frictions, which the objects' own numbers have. like: the scene's own, (v,).
-    """
-    split, found = len(like) - WORLD_SIZE, dict[str, Any]()
-    shape = float(variation[split:][_PLACES["shape"]][0])
-    if shape != _OWN:
-        found["shape"], like = _KINDS[shape], with_drawn(like, {"shape": _KINDS[shape]})
-    sizes, own = (one[:split].reshape(-1, PER_OBJECT)[:, _SIZE] for one in (variation, like))
-    if not np.array_equal(sizes, own):
-        found["size"] = 2 * float(sizes[0].max())
-    for name, place in _PLACES.items():
-        value, nothing = variation[split:][place].tolist(), _WORLD[name]
-        if tuple(value) == nothing or name == "shape":
-            continue
-        what, _, camera = name.partition(".")
-        if camera:
-            found.setdefault(what, {one: [0.0] * 3 for one in CAMERAS})[camera] = value
-        else:
-            found[name] = value if len(value) > 1 else value[0]
-    return found
-
-
 def _value(name: str, drawn: Mapping[str, Any]) -> Any:
     """Return what is drawn by the name of a state's numbers, of a camera where that names one; None for nothing."""
     what, _, camera = name.partition(".")
@@ -153,7 +121,7 @@ def _value(name: str, drawn: Mapping[str, Any]) -> Any:
     return value.get(camera) if camera and value is not None else value
 
 
-def resized(size: F64, drawn: Mapping[str, Any]) -> F64:
+def _resized(size: F64, drawn: Mapping[str, Any]) -> F64:
     """Return a `geom_size` (3,) [m] with the shape and the size that are drawn, if any; see `Shape.of_width`."""
     if "shape" in drawn:
         return _padded(Shape.of_width(drawn["shape"], drawn.get("size", _width(size))).size)
@@ -172,7 +140,7 @@ def _padded(size: Sequence[float]) -> F64:
 def _objects_with(objects: F64, drawn: Mapping[str, Any]) -> F64:
     rows = objects.copy().reshape(-1, PER_OBJECT)
     for row in rows:
-        row[_SIZE] = resized(row[_SIZE], drawn)
+        row[_SIZE] = _resized(row[_SIZE], drawn)
         if "shape" in drawn:
             row[_MASS] = Shape.of_width(drawn["shape"], _width(row[_SIZE])).mass
     if "mass" in drawn:
@@ -180,6 +148,13 @@ def _objects_with(objects: F64, drawn: Mapping[str, Any]) -> F64:
     if "friction" in drawn:
         rows[:, _FRICTION] = drawn["friction"]
     return rows.reshape(-1)
+
+
+def seen_objects(variation: F64) -> tuple[F64, int | None]:
+    """Return `geom_size` of a variation's objects, (o, 3) [m], and MuJoCo's type of their geoms; None: their own."""
+    shape = float(part(variation, "shape")[0])
+    sizes = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)[:, _SIZE]
+    return sizes, None if shape == _OWN else int(shape)
 
 
 def apply(
@@ -195,16 +170,16 @@ def apply(
     follows from masses.
     """
     split = len(variation) - WORLD_SIZE
-    _apply_dynamics(model, plain, motors, variation[split:])
-    shape = float(variation[split:][_PLACES["shape"]][0])
+    _apply_dynamics(model, plain, motors, variation)
+    shape = float(part(variation, "shape")[0])
     _apply_shape(model, plain, objects, None if shape == _OWN else _KINDS[shape])
     _apply_objects(model, plain, objects, variation[:split].reshape(-1, PER_OBJECT))
 
 
-def _apply_dynamics(model: mujoco.MjModel, plain: mujoco.MjModel, motors: NDArray[np.int64], world: F64) -> None:
+def _apply_dynamics(model: mujoco.MjModel, plain: mujoco.MjModel, motors: NDArray[np.int64], variation: F64) -> None:
     """Multiply the arm's damping and gains: kv with the root of kp's factor, which keeps the damping ratio."""
     changed: Any = model
-    damping, gain = (float(world[_PLACES[name]][0]) for name in ("joint_damping", "actuator_gain"))
+    damping, gain = (float(part(variation, name)[0]) for name in ("joint_damping", "actuator_gain"))
     dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
     changed.dof_damping[dofs] = plain.dof_damping[dofs] * damping
     changed.actuator_gainprm[motors, 0] = plain.actuator_gainprm[motors, 0] * gain  # kp
@@ -238,9 +213,8 @@ def _apply_objects(
         changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
         # Of two geoms that touch, the larger friction counts unless one has priority: here the drawn one counts.
         drawn = friction != plain.geom_friction[one.geom, 0]
-        for geom in one.geoms:
-            changed.geom_friction[geom, 0] = friction
-            changed.geom_priority[geom] = 1 if drawn else plain.geom_priority[geom]
+        changed.geom_friction[one.geom, 0] = friction
+        changed.geom_priority[one.geom] = 1 if drawn else plain.geom_priority[one.geom]
 
 
 def _apply_size(changed: Any, plain: mujoco.MjModel, one: Object, kind: int, size: F64) -> None:

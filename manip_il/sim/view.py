@@ -8,7 +8,7 @@ A software renderer pays for every triangle, and the Panda's meshes have 136,040
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -16,10 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.sim.conditions import PICTURED, Drawn
 from manip_il.sim.config import CAMERAS, Look
 from manip_il.sim.scene import SCENES_KEPT, SEEN, TABLE, camera_id
-from manip_il.sim.variation import GEOMS, resized
+from manip_il.sim.variation import part, seen_objects
 from manip_il.sim.world import Scene
 
 F64 = NDArray[np.float64]
@@ -59,53 +58,45 @@ class ViewModel:
         self._light(look.brightness, look.light_turn)
         self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
         self._headlight = [colour.copy() for colour in self._headlight_colours()]
-        self._applied: dict[str, Any] = {}
+        self._applied = scene.nominal
 
-    def apply(self, drawn: Drawn) -> None:
-        """Apply what an episode draws to the next pictures. None of it lies on the graphics card."""
-        values = {name: drawn.values[name] for name in ("shape", "size", *PICTURED) if name in drawn.values}
-        if values == self._applied:
+    def apply(self, variation: F64) -> None:
+        """Apply how a world of a variation (v,) looks to the next pictures. None of it lies on the graphics card."""
+        if np.array_equal(variation, self._applied):
             return
         for name, plain in self._plain.items():
             getattr(self.model, name)[:] = plain
         for colour, plain in zip(self._headlight_colours(), self._headlight, strict=True):
             colour[:] = plain
-        self._shape_objects(values)
-        self._paint(self._objects, values.get("colour"))
-        self._paint(self._table, values.get("table"))
-        for camera in CAMERAS:
-            self._move_camera(camera, values.get("camera_shift", {}), values.get("camera_turn", {}))
-        self._light(drawn.number("brightness", 1.0), drawn.number("light_turn"))
-        self._applied = values
+        sizes, kind = seen_objects(variation)
+        self.model.geom_size[self._objects] = sizes
+        if kind is not None:
+            self.model.geom_type[self._objects] = kind
+        self._paint(self._objects, part(variation, "colour"))
+        self._paint(self._table, part(variation, "table"))
+        for name in CAMERAS:
+            self._move_camera(name, part(variation, f"camera_shift.{name}"), part(variation, f"camera_turn.{name}"))
+        self._light(float(part(variation, "brightness")[0]), float(part(variation, "light_turn")[0]))
+        self._applied = variation.copy()
 
     def _headlight_colours(self) -> list[Any]:
         lamp = self.model.vis.headlight
         return [lamp.ambient, lamp.diffuse, lamp.specular]
 
-    def _shape_objects(self, drawn: Mapping[str, Any]) -> None:
-        for geom in self._objects:
-            self.model.geom_size[geom] = resized(self.model.geom_size[geom], drawn)
-            if "shape" in drawn:
-                self.model.geom_type[geom] = GEOMS[drawn["shape"]]
+    def _paint(self, geoms: Sequence[int], colour: F64) -> None:
+        if (colour >= 0).all():
+            self.model.geom_matid[geoms] = -1  # a material's colour would hide the geom's
+            self.model.geom_rgba[geoms] = [*colour, 1.0]
 
-    def _paint(self, geoms: Sequence[int], colour: Sequence[float] | None) -> None:
-        if colour is None:
-            return
-        for geom in geoms:
-            self.model.geom_matid[geom] = -1  # a material's colour would hide the geom's
-            self.model.geom_rgba[geom] = [*colour, 1.0]
-
-    def _move_camera(self, name: str, shifts: Mapping[str, Any], turns: Mapping[str, Any]) -> None:
+    def _move_camera(self, name: str, shift: F64, turn: F64) -> None:
+        """Move a camera [m], and turn it [deg], in its own frame."""
         camera = camera_id(self.model, name)
-        quat, turn, moved = self.model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
-        if name in shifts:
-            mujoco.mju_rotVecQuat(moved, np.asarray(shifts[name]), quat)
-            self.model.cam_pos[camera] += moved
-        if name in turns:
-            vector = np.deg2rad(turns[name])
-            angle = float(np.linalg.norm(vector))
-            mujoco.mju_axisAngle2Quat(turn, vector / angle if angle else np.array([1.0, 0, 0]), angle)
-            mujoco.mju_mulQuat(self.model.cam_quat[camera], quat, turn)
+        quat, turned, moved = self.model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
+        mujoco.mju_rotVecQuat(moved, shift, quat)
+        self.model.cam_pos[camera] += moved
+        if angle := float(np.linalg.norm(np.deg2rad(turn))):
+            mujoco.mju_axisAngle2Quat(turned, np.deg2rad(turn) / angle, angle)
+            mujoco.mju_mulQuat(self.model.cam_quat[camera], quat, turned)
 
     def _light(self, brightness: float, light_turn: float) -> None:
         """Multiply every lamp by a factor, and turn those that stand in the world about the vertical [deg]."""

@@ -12,22 +12,19 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import RenderError, UnknownName
-from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
+from manip_il.errors import RenderError
 from manip_il.sim.config import FILM
 from manip_il.sim.view import ViewModel
 from manip_il.sim.world import STATE_KIND, Scene
 
 F64 = NDArray[np.float64]
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
-_INSTEAD = 'use render_mode="rgb_array", or manip-il view --output=FILE.rrd'
 _LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # height [m], [m], [deg]: the camera at first
 _CLOSING = 5.0  # longest time that closing takes [s]
 
@@ -39,24 +36,14 @@ def has_display() -> bool:
 
 def require_display() -> None:
     """Raise `RenderError` unless a window can be opened: MuJoCo's viewer would wait for ever."""
-    if not has_display():
-        raise RenderError(f"no display: neither {' nor '.join(DISPLAYS)} is set; {_INSTEAD}")
     import glfw  # MuJoCo's own; it warns where there is no display
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        opened = glfw.init()
+        opened = has_display() and glfw.init()
     if not opened:
-        named = ", ".join(f"{name}={os.environ[name]}" for name in DISPLAYS if os.environ.get(name))
-        raise RenderError(f"no window can be opened on the display ({named}); unset it, or {_INSTEAD}")
-
-
-def check_render_mode(mode: str | None, known: Sequence[str]) -> None:
-    """Raise `UnknownName` for a render_mode that is not known, `RenderError` for `human` without a display."""
-    if mode not in (None, *known):
-        raise UnknownName("render_mode", mode, known)
-    if mode == "human":
-        require_display()
+        named = ", ".join(f"{name}={os.environ.get(name, '')}" for name in DISPLAYS)
+        raise RenderError(f'no display: {named}; use render_mode="rgb_array", or manip-il view --output=FILE.rrd')
 
 
 class Clock:
@@ -105,12 +92,12 @@ class Window:
         """False once somebody has closed it."""
         return self._handle.is_running()
 
-    def show(self, data: mujoco.MjData, drawn: Drawn = NOMINAL_VALUES, text: str = "") -> None:
-        """Show the world as `data` has it, then wait for real time. drawn: how it looks. text: in the upper left."""
+    def show(self, data: mujoco.MjData, variation: F64, text: str = "") -> None:
+        """Show a world of a variation (v,) as `data` has it, then wait for real time. text: in the upper left."""
         if not self.is_open:
             return
         with self._handle.lock():
-            self._view.apply(drawn)
+            self._view.apply(variation)
             mujoco.mj_getState(self._model, data, self._state, STATE_KIND)
             mujoco.mj_setState(self._model, self._data, self._state, STATE_KIND)
             mujoco.mj_forward(self._model, self._data)

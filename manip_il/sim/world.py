@@ -120,14 +120,10 @@ class World:
     # Physics
 
     def vary(self, variation: F64) -> None:
-        """Give the model what of `variation` (v,) is physics.
-
-        Raises what `variation.completed` and `variation.check` raise.
-        """
+        """Give the model what of `variation` (v,) is physics. Raises `MismatchError` for one of another length."""
         variation = variations.completed(variation, self.scene.nominal)
         if variation.tobytes() == self.variation.tobytes():
             return
-        variations.check(variation, self.scene.nominal)
         self._cache.clear()
         self._poses.clear()
         self._ee = None
@@ -297,8 +293,8 @@ class World:
 
     def touched(self, name: str) -> bool:
         """Return whether every finger touches an object."""
-        geoms = self.scene.objects[name].geoms
-        return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geoms))
+        geom = self.scene.objects[name].geom
+        return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geom))
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:
         """Return the ways from an object's centre to the nearest points of what stands around it, x and y, within 8 cm.

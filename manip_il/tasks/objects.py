@@ -62,19 +62,9 @@ def add_object(
     if mesh is None:
         body.add_geom(**seen, size=[*size, *[0.0] * (3 - len(size))], **touching)
         return
-    _add_mesh(spec, name, mesh.vertices, mesh.faces)
-    body.add_geom(**seen, meshname=name, **({"contype": 0, "conaffinity": 0} if mesh.pieces else touching))
-    for number, piece in enumerate(mesh.pieces):
-        _add_mesh(spec, f"{name}_{number}", piece)
-        body.add_geom(
-            name=f"{name}_{number}", type=SHAPES[MESH], meshname=f"{name}_{number}", mass=0, group=3, **touching
-        )
-
-
-def _add_mesh(spec: mujoco.MjSpec, name: str, vertices: F64, faces: NDArray[np.int64] | None = None) -> None:
-    mesh = spec.add_mesh(name=name, uservert=vertices.ravel(), maxhullvert=MOST_HULL)
-    if faces is not None:
-        mesh.userface, mesh.inertia = faces.ravel(), mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
+    drawn = spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), maxhullvert=MOST_HULL)
+    drawn.userface, drawn.inertia = mesh.faces.ravel(), mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
+    body.add_geom(**seen, meshname=name, **touching)
 
 
 def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:

@@ -36,7 +36,7 @@ from manip_il.mdp import Episode, State
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, Look
-from manip_il.sim.variation import drawn_in
+from manip_il.sim.variation import part
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, scene_of
@@ -230,7 +230,7 @@ def test_a_branch_is_the_experts_next_steps_and_looks_are_those_of_the_state(vis
         env.set_state(State.from_vector(one.columns[schema.SIM_STATE][0]))
         for camera, picture in env.observe().images.items():
             np.testing.assert_array_equal(picture, one.columns[schema.IMAGES + camera][0])
-        colours.add(tuple(drawn_in(env.world.variation, env.scene.nominal)["colour"]))
+        colours.add(tuple(part(env.world.variation, "colour")))
     assert len(colours) == 4
     kept = redrawn(visited, tmp_path / "kept", 5, anew=False)
     for episode, original in zip(kept, originals(visited), strict=False):

@@ -26,7 +26,7 @@ from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.parts import LeRobotConfig
+from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
 
 from ..tables import every_large_robot, every_robot

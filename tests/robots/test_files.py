@@ -27,7 +27,6 @@ def refusal(path: Path) -> str:
 
 YAMLS = {
     "a model without end": (dict(model="/dev/zero"), ["/dev/zero has more than"]),
-    "a text that grows without end": (dict(mend={"o": "o" * 9999, "oo": "o" * 9999}), ["own.xml mended has more than"]),
 }
 
 

@@ -15,8 +15,8 @@ from manip_il.errors import ManipError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots import ROBOTS
 from manip_il.robots.action_space import ServoUnits
-from manip_il.robots.parts import LeRobotConfig
-from manip_il.robots.reading import read
+from manip_il.robots.files import read
+from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv, joint_state

@@ -50,7 +50,7 @@ def test_both_fingers_are_in_view(robot: str):
     scene, data = world.scene, world.data
     data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
     data.qpos[scene.gripper.q] = scene.gripper.command(scene.gripper.least)
-    most = OPEN if scene.robot.wrist_camera else scene.gripper.most
+    most = OPEN if isinstance(scene.robot.wrist_camera, str) else scene.gripper.most
     for opening in (scene.gripper.least, (scene.gripper.least + most) / 2, most):
         data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
         mujoco.mj_step(scene.model, data, SETTLE)

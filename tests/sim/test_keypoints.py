@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
 from manip_il.evaluation.suites import read_condition
 from manip_il.robots import ROBOTS
+from manip_il.sim import render
 from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CAMERAS, CameraConfig, Look
+from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.points import point_names, points_in
-from manip_il.sim.render import Line, marked_picture, pictures, projections
+from manip_il.sim.props import Prop
+from manip_il.sim.render import pictures, projections
 from manip_il.tasks.envs import make_env
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
@@ -19,7 +22,7 @@ from ..scenes import SEED, started
 from ..tables import every_task
 
 SIZE = CameraConfig(CAMERAS, 96, 128)
-RED = (1.0, 0.0, 1.0, 1.0)
+RED, BALL = (1.0, 0.0, 1.0, 1.0), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 
 
 @every_task
@@ -47,18 +50,22 @@ def test_corners_of_a_box_are_its_own_and_the_upper_ones():
 
 @pytest.mark.gl
 @pytest.mark.parametrize("robot", list(ROBOTS))
-def test_a_spot_that_is_drawn_at_a_point_is_seen_where_the_point_is_said_to_be(robot: str):
+def test_a_spot_that_is_drawn_at_a_point_is_seen_where_the_point_is_said_to_be(robot: str, monkeypatch):
     env = started(robot)
     space = env.scene.robot.workspace
     rng = np.random.default_rng(0)
     points = np.array([*space.centre, 0.2]) + rng.uniform(-0.1, 0.1, (12, 3))
-    plain = pictures(env.scene, env.data, SIZE)
+
+    def with_spots(*spots: np.ndarray) -> dict[str, np.ndarray]:
+        balls = [Prop(BALL, np.full(3, 0.012), at, np.eye(3), RED) for at in spots]
+        monkeypatch.setattr(render, "props", lambda *_: balls)
+        return pictures(env.scene, env.data, SIZE)
+
+    plain = with_spots()
     found, seen = projections(env.scene, SIZE, points), 0
     for number, point in enumerate(points):
-        for camera in CAMERAS:
+        for camera, marked in with_spots(point).items():
             across, down, in_view = found[camera][number].tolist()
-            line = Line(point - [0, 0, 0.004], point + [0, 0, 0.004], RED, 0.008)
-            marked = marked_picture(env.scene, env.data, camera, SIZE.size, Look(), [line])
             rows, columns = np.nonzero((marked != plain[camera]).any(axis=2))
             whole = 8 < len(rows) < 200 and rows.min() and columns.min() and rows.max() < 95 and columns.max() < 127
             if whole:  # nothing hides it, and the picture's edge does not cut it

@@ -12,6 +12,7 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.props import props
+from manip_il.sim.variation import part
 from manip_il.sim.world import GOAL
 from manip_il.tasks.envs import make_env
 from manip_il.tasks.starts import UPRIGHT
@@ -28,7 +29,7 @@ def cluttered(robot: str, task: str = "pick_place", seed: int = SEED, **settings
 
 def things(env: ManipEnv) -> list:
     """What lies around, without the stand of a goal."""
-    return props(env.scene, env.data, env.looks.values["clutter"])[len(props(env.scene, env.data)) :]
+    return props(env.scene, env.data, part(env.world.variation, "clutter"))[len(props(env.scene, env.data)) :]
 
 
 @every_robot

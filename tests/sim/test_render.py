@@ -235,7 +235,8 @@ def test_without_opengl_the_error_names_debians_packages(monkeypatch):
 @pytest.mark.parametrize("chosen", ["glfw", "off", "eglo"])  # on import nobody could answer an error
 def test_the_users_choice_of_backend_stands(chosen: str, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", chosen)
-    assert choose_backend() == chosen
+    choose_backend()
+    assert os.environ["MUJOCO_GL"] == chosen
 
 
 def test_a_backend_that_mujoco_does_not_know_is_refused(monkeypatch):
@@ -244,13 +245,6 @@ def test_a_backend_that_mujoco_does_not_know_is_refused(monkeypatch):
         require_known_backend()
     monkeypatch.setenv("MUJOCO_GL", "EGL ")
     require_known_backend()
-
-
-def test_a_backend_whose_library_is_missing_is_refused(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
-    with pytest.raises(RenderError, match="MUJOCO_GL is 'osmesa', whose library is not installed; unset it"):
-        require_known_backend()
 
 
 @pytest.mark.parametrize(
@@ -276,10 +270,9 @@ def test_mujoco_may_be_imported_first():
     subprocess.run([sys.executable, "-c", f"import mujoco\n{drawn}"], env=environment, check=True)
 
 
-@pytest.mark.parametrize(
-    ("there", "chosen"), [({"EGL", "OSMesa"}, "egl"), ({"EGL"}, "egl"), ({"OSMesa"}, "osmesa"), (set(), None)]
-)
-def test_egl_is_preferred_to_osmesa(monkeypatch, there: set[str], chosen: str | None):
+@pytest.mark.parametrize("library", ["libEGL.so", None])
+def test_egl_is_chosen_where_it_is_installed(monkeypatch, library: str | None):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: f"lib{name}.so" if name in there else None)
-    assert choose_backend() == chosen
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: library)
+    choose_backend()
+    assert os.environ.get("MUJOCO_GL") == (library and "egl")

@@ -7,7 +7,6 @@ import pytest
 
 from manip_il.errors import RenderError, UsageError
 from manip_il.sim import env as module
-from manip_il.sim import window as windows
 from manip_il.sim.window import Clock
 from manip_il.tasks.envs import make_env
 
@@ -32,13 +31,13 @@ def test_the_window_shows_the_start_and_every_step_until_it_is_closed(monkeypatc
         def __init__(self, scene, control_hz):
             assert (scene.task.name, control_hz) == ("reach", 20)
 
-        def show(self, data, drawn):
+        def show(self, data, variation):
             shown.append(data.time)
 
         def close(self):
             shown.append(-1.0)
 
-    monkeypatch.setattr(windows, "require_display", lambda: None)
+    monkeypatch.setattr(module, "require_display", lambda: None)
     monkeypatch.setattr(module, "Window", Window)
     env = make_env("panda", "reach", render_mode="human")
     env.reset(seed=0)
