@@ -80,7 +80,8 @@ class FolderExistsError(UsageError):
     """An output folder that holds something already."""
 
     def __init__(self, folder: object):
-        super().__init__(f"{folder} exists already; continue with --resume=true, or replace it with --overwrite=true")
+        ways = "--resume=true goes on where a command can, --overwrite=true replaces it"
+        super().__init__(f"{folder} exists already; {ways}; or choose another folder")
 
 
 class RenderError(ManipError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 from manip_il.errors import UsageError
@@ -43,3 +43,10 @@ def check_bounds(options: Any, prefix: str = "") -> None:
     """Raise `UsageError` for a field of a dataclass's instance that is out of the bounds in its metadata."""
     for one in fields(options):
         check_bound(prefix + one.name, getattr(options, one.name), one.metadata)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seeded:
+    """Options of whatever draws at random."""
+
+    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)

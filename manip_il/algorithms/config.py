@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
-from manip_il.option import check_bounds, option
+from manip_il.option import Seeded, check_bounds, option
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.stock.table import ROBOTS as STOCK
@@ -70,7 +70,7 @@ _DEFAULTS = ("per_state", None, _LEARNER_ALONE)  # of label, query and beta
 
 
 @dataclass(frozen=True)
-class RunConfig:
+class RunConfig(Seeded):
     """Options of `manip-il dagger` by their names; round 0 is the expert's own demonstrations unless it is given.
 
     datasets: recorded demonstrations, in place of those that round 0 would record. start: a `pretrained_model` folder
@@ -124,7 +124,6 @@ class RunConfig:
         at_least=0,
     )
     conditions: tuple[Condition, ...] = ()
-    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
     datasets: tuple[Path, ...] = ()
     start: Path | None = None
 

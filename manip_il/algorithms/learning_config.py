@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
-from manip_il.option import check_bounds, option
+from manip_il.option import Seeded, check_bounds, option
 from manip_il.tasks.config import EnvConfig
 
 LONGER = 1.5  # times the longest demonstration, by default
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningConfig:
+class LearningConfig(Seeded):
     """Options of a run of reinforcement learning. method: `gail`, `airl` or `ppo`. datasets: demonstrations.
 
     start, reward: `pretrained_model` folders of a clone, and of the reward that `ppo` learns from.
@@ -48,7 +48,6 @@ class LearningConfig:
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     validation_every: int = option(20_000, "steps from one validation to the next", at_least=1)
     validation_episodes: int = option(200, "episodes of a validation, by which the best policy is chosen", at_least=1)
-    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
 
     def __post_init__(self) -> None:
         check_bounds(self)

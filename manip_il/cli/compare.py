@@ -3,40 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, replace
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from manip_il.cli import common_options as common
-from manip_il.cli.options import Given, command_line, group, to_plain
+from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, TrialGroup, Trusting, env_config
+from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.errors import UsageError
-from manip_il.evaluation.policy_folder import require_source
-from manip_il.option import option
-from manip_il.seeding import stream_seeds
+from manip_il.option import Seeded, option
+from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.evaluation.arm import Arm
     from manip_il.evaluation.comparison import Study
-    from manip_il.tasks.config import EnvConfig
 
-AT_HELP = (
-    "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; seconds "
-    "of collecting and fitting)"
-)
+EPISODES = 500  # of a test
 _YAML = (".yaml", ".yml")
 
 
-def _require_side(path: Path) -> None:
-    if path.suffix not in _YAML:
-        require_source(path)
-    elif not path.is_file():
-        raise UsageError(f"{path} does not exist; expected the YAML of a study, such as configs/studies/*.yaml")
-
-
-@dataclass
-class CompareOptions:
+@dataclass(frozen=True)
+class CompareOptions(Tested, Seeded, Trusting):
     """Compare two policies, runs, or folders of several training seeds, on the same test seeds; or run a whole study.
 
     Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with such things named seed_0, seed_1
@@ -50,42 +38,35 @@ class CompareOptions:
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
     first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
-        MISSING, "two sides, or the YAML of a study", positional=True, check=_require_side, free=True
+        MISSING,
+        "two sides, each an eval.json, a policy or a run, or the YAML of a study",
+        positional=True,
+        exists="",
+        free=True,
     )
     checkpoint: Literal["best", "last"] = option("best", "of a run: best on validation, or the last round")
-    at: Literal["end", "labels", "episodes", "steps", "seconds"] = option("end", AT_HELP)
-    eval: common.TrialGroup = field(default_factory=common.TrialGroup)
-    suite: str = common.suite_option()
-    env: Given = common.env_given(of_policy=True)
-    seed: int = option(0, "shifts the stream of test seeds, 0 to 1000", at_least=0, at_most=1000)
+    at: Literal["end", "labels", "episodes", "steps", "seconds"] = option(
+        "end",
+        "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; "
+        "seconds of collecting and fitting)",
+    )
+    eval: TrialGroup = group(TrialGroup(EPISODES))
+    env: Given = given(EnvConfig, **OF_POLICY)
     training_seeds: int | None = option(
         None, "of a study, in place of the file's; a resumed one may have more", at_least=1, free=True
     )
-    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
-    trust: bool = common.trust_option()
+    engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")
-
-    def check(self) -> None:
-        """Refuse what does not go together."""
-        self.output.check()
-        if self._is_study:
-            return
-        if len(self.sides) != 2 or any(side.suffix in _YAML for side in self.sides):
-            raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML of one study")
-        left, right = self.sides
-        if left.resolve() == right.resolve():
-            raise UsageError(f"{left} is compared with itself; give two different ones")
-
-    @property
-    def _is_study(self) -> bool:
-        return len(self.sides) == 1 and self.sides[0].suffix in _YAML
 
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
-        if self._is_study:
-            self._run_study(self.sides[0])
-        else:
-            self._compare(*self.sides)
+        match self.sides:
+            case [file] if file.suffix in _YAML:
+                self._run_study(file)
+            case [left, right]:
+                self._compare(left, right)
+            case _:
+                raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML of one study")
 
     def _run_study(self, path: Path) -> None:
         from manip_il.cli.study import expert_trials, learn, read_plan, tested
@@ -100,33 +81,35 @@ class CompareOptions:
             self._answer(study, folder, f"Study: {what}, {path.stem}", to_plain(plan.file))
 
     def _compare(self, left: Path, right: Path) -> None:
+        from manip_il.cli.inputs import check_policies
+        from manip_il.data.fingerprint import compare_fingerprints
         from manip_il.evaluation.arm import read_arm, require_pair
         from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
+        from manip_il.evaluation.runner import Trial
+        from manip_il.seeding import stream_seeds
 
         both = (read_arm(left), read_arm(right))
         require_pair(*both)
         members = [member for arm in both for member in arm.members]
         rule = Rule(self.checkpoint, self.at).limited({one.name: one.history for one in members})
         both = tuple(arm.map(lambda one: one.select(rule)) for arm in both)
-        trial = None
-        if members[0].result is None:
-            from manip_il.cli.inputs import check_policies
-            from manip_il.evaluation.runner import Trial
-
+        trial, (first, *others) = None, members
+        if first.result is None:
             policies = {one.name: one.policy for arm in both for one in arm.members if one.policy is not None}
-            seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
+            seeds = stream_seeds("test", self.eval.n_episodes or EPISODES, self.seed)
             trial = Trial.of(self._env(both, policies), seeds, self.suite, policies.values(), self.trust)
             check_policies(policies, trial)
         else:
-            _warn_of_fingerprints(Study(both, both[0].name, rule))
+            assert Study(both, both[0].name, rule).comparisons  # raises unless they can be compared
+            for other in others:
+                warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
         with self.output.open(self) as folder:
             if trial is not None:
                 with Stages(f"every finished episode, in {folder}") as stages, self.engine.open() as engine:
                     last = (trial, folder, engine, stages)
                     both = tuple(arm.map(lambda one: one.measure(*last)) for arm in both)
-            study = Study(both, both[0].name, rule)
-            test = both[0].members[0].test
+            study, test = Study(both, both[0].name, rule), both[0].members[0].test
             self._answer(study, folder, f"{left} against {right}: {test.robot} {test.task}", to_plain(self))
 
     def _env(self, arms: tuple[Arm, ...], policies: Mapping[str, Path]) -> EnvConfig:
@@ -139,7 +122,7 @@ class CompareOptions:
         if runs:
             return require_same_env({run.name: replace(run.env(given.get("task")), **given) for run in runs})
         origins = {name: Checkpoint.open(policy).origin for name, policy in policies.items()}
-        return require_same_env({name: common.env_config(given, origin) for name, origin in origins.items()})
+        return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 
     def _answer(self, study: Study, folder: Path, title: str, config: Mapping[str, Any]) -> None:
         """Write the result and the page, print the tables and the verdict."""
@@ -153,13 +136,3 @@ class CompareOptions:
         for table in (*study.result_tables(), *study.cost_tables()):
             print_table(table)
         say(study.verdict, *study.facts, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
-
-
-def _warn_of_fingerprints(study: Study) -> None:
-    """Compare what is evaluated already; warn of other versions or models."""
-    from manip_il.data.fingerprint import compare_fingerprints
-
-    assert study.comparisons
-    first, *others = (member for arm in study.arms for member in arm.members)
-    for other in others:
-        warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))

@@ -4,31 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, check_labels
-from manip_il.cli import common_options as common
-from manip_il.cli.common_options import require_dataset
+from manip_il.cli.common_options import SMALL, Demonstrations, EngineOptions, Trusting, Varied, env_config
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
 from manip_il.data.json_lines import append_line, read_lines
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
+from manip_il.sim.config import CameraConfig
+from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.algorithms.results import Result
     from manip_il.collect.workers import Engine
-    from manip_il.evaluation.figures import Curve
-    from manip_il.evaluation.report import Report
-    from manip_il.sim.config import CameraConfig
+    from manip_il.evaluation.tables import PolicyRow
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
 _OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
 
 
-@dataclass
-class DaggerOptions:
+@dataclass(frozen=True)
+class DaggerOptions(Varied, Trusting):
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
     Round 0 is behaviour cloning on the expert's own demonstrations, or on those in --dataset.root. With --policy.path
@@ -39,17 +38,12 @@ class DaggerOptions:
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
     first: ClassVar[str] = "robot.type task.type demonstrations rounds episodes_per_round policy output_dir resume"
-    env: Given = common.env_given()
+    env: Given = given(EnvConfig)
     method: Method = option(
         "dagger",
         "who drives after round 0: the learner, the expert, the expert with noise like the learner's errors",
     )
-    datasets: list[Path] = option(
-        list,
-        "recorded demonstrations to begin with, in place of recording round 0's",
-        flag="dataset.root",
-        check=require_dataset,
-    )
+    dataset: Demonstrations = group(Demonstrations([]))
     settings: Given = given(RunConfig, prefix="")
     query: str | None = option(
         None,
@@ -57,11 +51,8 @@ class DaggerOptions:
         "by default every, for takeover one, for branch probability:1/STEPS",
     )
     fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
-    cameras: list[str] = option(list, f"{common.CAMERAS_HELP}, for a policy on images; by default all for cnn")
-    image: Given = common.image_given(small=True)
-    vary: list[str] = common.vary_option()
-    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
-    trust: bool = common.trust_option()
+    image: Given = given(CameraConfig, **SMALL)
+    engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")
 
     def run(self) -> None:
@@ -72,31 +63,34 @@ class DaggerOptions:
             with Stages(kept) as stages, self.engine.open() as engine:
                 engine.warm_up(learned=True)
                 results = run_rounds(config, folder, engine, stages)
-            _report(self, config, results).write(folder / REPORT_FILE)
+            self._report(config, results, folder)
         best = folder / "best" / "pretrained_model"
         if (folder / "dataset").is_dir():
             say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
-        say(f"report: {folder / REPORT_FILE}")
-        own = common.own_names(config.env.robot, config.env.task, config.env.object)
-        say(f"best policy: {best}", f"next: manip-il eval --policy.path={best}{own} --output_dir={folder}/test")
+        say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
+        say(f"next: manip-il eval --policy.path={best} --output_dir={folder}/test")
 
     def config(self) -> RunConfig:
         """Return what `Run` takes; raises for what does not go together, or does not fit what is given."""
         from manip_il.cli.inputs import check_given, round_policy
         from manip_il.collect.query import parse_query  # which imports numpy
         from manip_il.evaluation.suites import varied
+        from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 
         policy, start = round_policy(self.fit.get("policy", {}))
-        env = common.env_config(self.env)
-        observation, cameras = self._pictures(start, env.robot)
-        of_fit: Given = {"policy": policy, "observation": observation, "trust": self.trust}
+        observation, env = self.fit.get("observation"), env_config(self.env)
+        sees = policy.get("type") == "cnn" and observation != "state"
+        cameras = self.camera_config(env) if self.cameras or sees else None
+        if start is not None:
+            observation = observation or Checkpoint.open(start).observation
+            cameras = cameras or policy_cameras(start)
         config = RunConfig(
             env=env,
             method=self.method,
             conditions=varied(self.vary, env, sees=cameras is not None),
-            fit=FitConfig(**self.fit | of_fit),
+            fit=FitConfig(**dict(self.fit, policy=policy, observation=observation, trust=self.trust)),
             cameras=cameras,
-            datasets=tuple(self.datasets),
+            datasets=tuple(self.dataset.root),
             start=start,
             query_rule=None if self.query is None else parse_query(self.query),
             **self.settings,
@@ -105,18 +99,35 @@ class DaggerOptions:
         check_given(config)
         return config
 
-    def _pictures(self, start: Path | None, robot: str) -> tuple[str | None, CameraConfig | None]:
-        """Return observation and cameras: those given, else those of the policy to begin with."""
-        observation = self.fit.get("observation")
-        sees = self.fit.get("policy", {}).get("type") == "cnn" and observation != "state"
-        given = self.cameras or sees
-        cameras = common.camera_config(self.cameras, self.image, robot=robot, small=True) if given else None
-        if start is not None:
-            from manip_il.learn.checkpoint import Checkpoint, policy_cameras
+    def _report(self, config: RunConfig, results: list[Result], folder: Path) -> None:
+        """Write the page of a run."""
+        from manip_il.algorithms.results import best_result
+        from manip_il.evaluation.results import compare_results
+        from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
 
-            observation = observation or Checkpoint.open(start).observation
-            cameras = cameras or policy_cameras(start)
-        return observation, cameras
+        best, kind = best_result(results), ALGORITHMS[config.method]
+        first = "cloning" if config.start is None else "the policy given"
+        names = [f"{first} (round 0)", *(f"{kind}, round {result.number}" for result in results[1:])]
+        rows = [
+            PolicyRow(name, result.validation, result.labels, colour=DAGGER if result.number else CLONING)
+            for name, result in zip(names, results, strict=True)
+        ]
+        success, facts = best.validation.success, tuple[str, ...]()
+        if best.number > 0:
+            comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.number]))
+            facts = (f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.",)
+        chosen = f"{names[best.number]} is chosen of {len(results)}"
+        write_page(
+            folder,
+            folder,
+            rows,
+            kind,
+            title=f"{kind} on {config.env.robot} {config.env.task}",
+            verdict=f"{chosen}: {success} success on {success.n:,} validation episodes.",
+            facts=facts,
+            command=command_line("dagger", self),
+            config=to_plain(self),
+        )
 
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Result]:
@@ -125,8 +136,7 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     from manip_il.collect.environments import env_fingerprint
     from manip_il.evaluation.results import write_json
 
-    fingerprint = env_fingerprint(config.env, config.cameras)
-    write_json(folder / FINGERPRINT_FILE, fingerprint)
+    write_json(folder / FINGERPRINT_FILE, env_fingerprint(config.env, config.cameras))
     results: list[Result] = []
     there = {record["round"] for record in read_lines(folder / METRICS_FILE)}
     for result in Run(config, folder, engine, stages.watch()).results():
@@ -140,46 +150,19 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     return results
 
 
-def _report(options: DaggerOptions, config: RunConfig, results: list[Result]) -> Report:
-    from manip_il.algorithms.results import best_result
+def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, *films: Any, **parts: Any) -> None:
+    """Write the page in `folder` on policies of the rounds in `run`: a row each, success over costs, times.
+
+    kind: name of the algorithm. films, parts: see `run_report`.
+    """
     from manip_il.evaluation.eval_report import run_report
-    from manip_il.evaluation.results import compare_results
-    from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
-
-    best, folder, kind = best_result(results), options.output.output_dir, ALGORITHMS[config.method]
-    first = "cloning" if config.start is None else "the policy given"
-    names = [f"{first} (round 0)", *(f"{kind}, round {result.number}" for result in results[1:])]
-    rows = [
-        PolicyRow(name, result.validation, result.labels, colour=DAGGER if result.number else CLONING)
-        for name, result in zip(names, results, strict=True)
-    ]
-    success, facts = best.validation.success, tuple[str, ...]()
-    if best.number > 0:
-        comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.number]))
-        facts = (f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.",)
-    return run_report(
-        rows,
-        curves=[learning_curve(folder, kind)],
-        title=f"{kind} on {config.env.robot} {config.env.task}",
-        verdict=f"{names[best.number]} is chosen of {len(results)}: {success} success on {success.n:,} validation "
-        "episodes.",
-        command=command_line("dagger", options),
-        facts=facts,
-        config=to_plain(options),
-        fingerprint=best.validation.fingerprint,
-        timings=round_timings(folder),
-    )
-
-
-def learning_curve(folder: Path, name: str = "DAgger") -> Curve:
-    """Return validation success over costs, one point a round. name: of the algorithm."""
     from manip_il.evaluation.figures import Curve
     from manip_il.evaluation.rounds import history
 
-    return Curve(name, (history(read_lines(folder / METRICS_FILE), str(folder)),))
-
-
-def round_timings(folder: Path) -> dict[str, float]:
-    """Return what each round's stages took [s], from the run's metrics."""
-    records = read_lines(folder / METRICS_FILE)
-    return {f"round {one['round']}, {stage}": took for one in records for stage, took in one["seconds"].items()}
+    records = read_lines(run / METRICS_FILE)
+    timings = {f"round {one['round']}, {stage}": took for one in records for stage, took in one["seconds"].items()}
+    curve = Curve(kind, (history(records, str(run)),))
+    fingerprint = rows[-1].result.fingerprint
+    shown, why_none = films or ((), "")
+    page = run_report(rows, shown, why_none, [curve], fingerprint=fingerprint, timings=timings, **parts)
+    page.write(folder / REPORT_FILE)

@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli.common_options import REWARD, exists, require_dataset
+from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import group
 from manip_il.cli.outputs import Output
 from manip_il.cli.progress import say
@@ -16,27 +16,20 @@ from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
-    from manip_il.preferences.frames import Frames
 
 PROGRESS = "progress"  # in place of a reward
 
 
-@dataclass
-class CheckOptions:
+@dataclass(frozen=True)
+class CheckOptions(OfDataset):
     """Check any LeRobot v3.0 dataset: files, rows, video frames, statistics, and why a policy would not learn from it.
 
     One line per finding on standard output, with what to do; exit code 1 after errors, 0 after warnings alone.
     """
 
     example: ClassVar[str] = "manip-il data check datasets/demos"
-    dataset: Path = option(
-        MISSING, "folder of a LeRobot v3.0 dataset", positional=True, check=exists("the folder of a LeRobot dataset")
-    )
 
     def run(self) -> None:
         """Examine, and say the verdict; raises `NotWhole` after errors."""
@@ -70,7 +63,7 @@ class CheckOptions:
         say(f"{self._root}: {', '.join([whole, *counts])}")
 
 
-@dataclass
+@dataclass(frozen=True)
 class RepairOptions(CheckOptions):
     """Build a dataset again from its journals; without them compute counts and statistics, and move leftovers away.
 
@@ -88,7 +81,7 @@ class RepairOptions(CheckOptions):
             say(*(f"repair   {line}" for line in done))
             findings = self._examine()
         else:
-            say("repair   nothing to repair" if not findings else "repair   nothing that can be repaired")
+            say(f"repair   nothing {'that can be repaired' if findings else 'to repair'}")
         self._say_verdict(findings)
 
 
@@ -107,13 +100,8 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
         yield Finding(OURS, str(error), "use the version of this program that recorded it, or record again")
 
 
-def _require_reward(reward: str) -> None:
-    if reward != PROGRESS:
-        exists(f"{REWARD}, or the word progress")(Path(reward))
-
-
-@dataclass
-class ScoreOptions:
+@dataclass(frozen=True)
+class ScoreOptions(OfDataset):
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
     Writes scores.json and rabc.parquet: weights of frames, for manip-il train --weights= and for
@@ -122,19 +110,27 @@ class ScoreOptions:
     """
 
     example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"
-    dataset: Path = option(MISSING, "the dataset's folder", positional=True, check=require_dataset)
-    reward: str = option(MISSING, "folder of manip-il reward fit; progress: true progress", check=_require_reward)
+    reward: str = option(MISSING, "folder of manip-il reward fit; progress: true progress")
     output: Output = group(Output(Path("runs/scores")), prefix="")
 
     def run(self) -> None:
         """Score, print the worst episodes, write the files."""
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
+        from manip_il.learn.reward import LearnedReward
         from manip_il.preferences import scores as scoring
         from manip_il.preferences.frames import read_frames
 
         data = read_frames(self.dataset)
-        scores = scoring.Scores(str(self.dataset), self.reward, data, self._scores(data))
+        if self.reward != PROGRESS:
+            reward = LearnedReward.load(find_policy(Path(self.reward)))
+            reward.check_fits(str(self.dataset), data.spec)
+            found = reward.of_inputs(data.inputs).astype("float64").clip(0.0, 1.0)
+        elif data.progress is not None:
+            found = data.progress
+        else:
+            raise ManipError(f"{self.dataset} has no column progress; give --reward=FOLDER")
+        scores = scoring.Scores(str(self.dataset), self.reward, data, found)
         with self.output.open(self) as folder:
             write_json(folder / scoring.FILE_NAME, scores.to_json())
             scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
@@ -142,17 +138,3 @@ class ScoreOptions:
         say(*scoring.fact_lines(scores))
         weights = f"--weights={folder / scoring.WEIGHTS_FILE}"
         say(f"next: manip-il train --dataset.root={self.dataset} {weights} --output_dir=runs/weighted")
-
-    def _scores(self, data: Frames) -> NDArray[np.float64]:
-        """Score of every frame, (N,)."""
-        import numpy as np
-
-        from manip_il.learn.reward import LearnedReward
-
-        if self.reward != PROGRESS:
-            reward = LearnedReward.load(find_policy(Path(self.reward)))
-            reward.check_fits(str(self.dataset), data.spec)
-            return np.clip(reward.of_inputs(data.inputs).astype(np.float64), 0.0, 1.0)
-        if data.progress is None:
-            raise ManipError(f"{self.dataset} has no column progress; give --reward=FOLDER")
-        return data.progress

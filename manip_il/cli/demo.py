@@ -9,25 +9,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.cli import common_options as common
-from manip_il.cli.dagger import DaggerOptions, learning_curve, round_timings, run_rounds
+from manip_il.cli.common_options import EngineOptions
+from manip_il.cli.dagger import DaggerOptions, run_rounds, write_page
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
+from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.report import Film
     from manip_il.evaluation.tables import PolicyRow
 
-RUN = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # in place of `manip-il dagger`'s own
-FIT = {"steps": 3_000, "batch_size": 256}
-_OF_RUN = (*RUN, "episodes_per_round", "disturbed_share", "seed")
+RUN: Given = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # in place of `manip-il dagger`'s own
+FIT: Given = {"steps": 3_000, "batch_size": 256}
 
 
-@dataclass
+@dataclass(frozen=True)
 class DemoOptions:
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
@@ -38,53 +38,41 @@ class DemoOptions:
 
     example: ClassVar[str] = "manip-il demo --output_dir=runs/demo"
     first: ClassVar[str] = "robot.type task.type rounds test_episodes output_dir resume"
-    env: Given = common.env_given()
-    settings: Given = given(RunConfig, prefix="", only=_OF_RUN, defaults=RUN)
-    fit: Given = given(FitConfig, prefix="", only=("policy", "steps", "batch_size"), defaults=FIT)
+    env: Given = given(EnvConfig)
+    settings: Given = given(RunConfig, prefix="", only=(*RUN, "episodes_per_round", "disturbed_share", "seed"), **RUN)
+    fit: Given = given(FitConfig, prefix="", only=("policy", *FIT), **FIT)
     test_episodes: int = option(200, "unseen test episodes, used for no choice", at_least=1)
     disturbed_episodes: int = option(100, "the first of them again, disturbed", at_least=1)
-    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
+    engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/demo")), prefix="")
 
     def run(self) -> None:
         """Run what is not there yet, print the table, write the report."""
-        from manip_il.evaluation.eval_report import run_report
         from manip_il.evaluation.results import compare_results
         from manip_il.evaluation.rounds import format_seconds
         from manip_il.evaluation.tables import policy_table, print_table
 
-        began, settings, fit = time.monotonic(), RUN | self.settings, FIT | self.fit
-        config = DaggerOptions(env=self.env, settings=settings, fit=fit, output=self.output).config()
+        began = time.monotonic()
+        config = DaggerOptions(env=self.env, settings=self.settings, fit=self.fit).config()
         kept = f"every finished episode, round and evaluation, in {self.output.output_dir}"
         with self.output.open(self) as folder, Stages(kept) as stages, self.engine.open() as engine:
             engine.warm_up(learned=True)
             policies, rows = self._measure(config, folder, engine, stages)
             films = _film(policies, rows, config, stages)
-        _, cloned, more, dagger = rows
-        tests = [
-            compare_results(getattr(one, test), getattr(dagger, test), (one.name, dagger.name))
+        _, *cloned, dagger = rows
+        undisturbed, disturbed = (
+            [compare_results(getattr(one, test), getattr(dagger, test), (one.name, dagger.name)) for one in cloned]
             for test in ("result", "disturbed")
-            for one in (cloned, more)
-        ]
-        verdict = demo_verdict(rows, tests[1].significant)
+        )
+        verdict = demo_verdict(rows, undisturbed[1].significant)
         facts = (
-            *(f"Undisturbed: {test.verdict}" for test in tests[:2]),
-            *(f"Disturbed: {test.verdict}" for test in tests[2:]),
+            *(f"Undisturbed: {test.verdict}" for test in undisturbed),
+            *(f"Disturbed: {test.verdict}" for test in disturbed),
             f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.",
         )
-        report = run_report(
-            rows,
-            *films,
-            [learning_curve(folder / "dagger")],
-            title=f"Demo: {config.env.robot} {config.env.task}",
-            verdict=verdict,
-            command=command_line("demo", self),
-            facts=facts,
-            config=to_plain(self),
-            fingerprint=dagger.result.fingerprint,
-            timings=round_timings(folder / "dagger"),
-        )
-        report.write(folder / REPORT_FILE)
+        about = f"Demo: {config.env.robot} {config.env.task}"
+        parts = {"title": about, "verdict": verdict, "facts": facts, "command": command_line("demo", self)}
+        write_page(folder, folder / "dagger", rows, "DAgger", *films, config=to_plain(self), **parts)
         print_table(policy_table(rows), empty="-")
         say(verdict, *facts, f"took {format_seconds(time.monotonic() - began)} in all")
         say(f"report: {folder / REPORT_FILE}")

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli import common_options as common
-from manip_il.cli.options import Given, command_line, group, to_plain
+from manip_il.cli.common_options import OF_POLICY, EngineOptions, PolicyGroup, Tested, TrialGroup, Trusting
+from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
-from manip_il.cli.progress import Stages, say
-from manip_il.errors import UsageError
-from manip_il.option import option
+from manip_il.cli.progress import Stages, say, warn
+from manip_il.data.atomic import write_file
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.option import Seeded, option
+from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.table import ROBOTS
 
 if TYPE_CHECKING:
@@ -23,27 +26,21 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EvalResult
 
 EPISODES, MOST_EPISODES = 100, 10_000
+NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing is loaded
 
 
-@dataclass
-class MeasuredPolicyGroup:
+@dataclass(frozen=True)
+class MeasuredPolicyGroup(PolicyGroup):
     """`--policy.*` of what is measured."""
 
-    path: Path | None = common.policy_option()
     type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
     device: str = option("cpu", "where the checkpoint acts: cpu or cuda")
 
 
-@dataclass
-class EvalGroup:
+@dataclass(frozen=True)
+class EvalGroup(TrialGroup):
     """`--eval.*`: the episodes to run."""
 
-    n_episodes: int | None = option(
-        None,
-        f"episodes, each with its own seed; by default {EPISODES}, with until_width at most {MOST_EPISODES:,}",
-        at_least=1,
-        grows=True,
-    )
     first: int = option(0, "index of the first seed in the stream, for one part of a larger evaluation", at_least=0)
     hold: int | None = option(
         10, "control steps after success at which an episode ends; null: at the horizon", at_least=0
@@ -55,8 +52,8 @@ class EvalGroup:
     films: int = option(2, "number of failures to film, and of successes", at_least=0, free=True)
 
 
-@dataclass
-class EvalOptions:
+@dataclass(frozen=True)
+class EvalOptions(Tested, Seeded, Trusting):
     """Measure a policy's success on unseen seeds; writes eval.json and report.html.
 
     With EVALUATION, an eval.json or its folder, nothing new is measured: --replay=SEED runs one of its episodes again,
@@ -67,50 +64,35 @@ class EvalOptions:
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     first: ClassVar[str] = "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay resume"
     evaluation: list[Path] = option(
-        list, "evaluations: one, with --replay, or several to merge", positional=True, check=common.require_eval
+        list, "evaluations: one, with --replay, or several to merge", positional=True, exists=""
     )
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
-    env: Given = common.env_given(of_policy=True)
+    env: Given = given(EnvConfig, **OF_POLICY)
     eval: EvalGroup = field(default_factory=EvalGroup)
-    suite: str = common.suite_option()
-    until_width: float | None = option(None, "stop when the interval is this narrow; 0.02 is 2 points")
-    seed: int = common.seed_option()
-    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
-    trust: bool = common.trust_option()
+    until_width: float | None = option(
+        None, "stop when the interval is this narrow; 0.02 is 2 points", at_least=0.0001, at_most=1
+    )
+    engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/eval")), prefix="")
     replay: int | None = option(None, "seed of the episode of EVALUATION to run again", at_least=0, free=True)
     video: Path | None = option(None, "an MP4 of it to write", free=True)
     health: bool = option(False, "check that this machine can evaluate and render", flag="check", free=True)
 
-    def check(self) -> None:
-        """Refuse what does not go together."""
-        if self.replay is not None and len(self.evaluation) != 1:
-            raise UsageError("--replay is for an episode of one evaluation; give its EVALUATION first")
-        if self.health or self.replay is not None:
-            return
-        if len(self.evaluation) == 1:
-            raise UsageError("expected two or more evaluations to merge, or one and --replay=SEED")
-        if not self.evaluation and (self.policy.path is None) == (self.policy.type is None):
-            raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
-        if self.until_width is not None and not 0 < self.until_width < 1:
-            raise UsageError(f"--until_width is {self.until_width}; expected between 0 and 1: 0.02 for 2 points")
-        self.output.check()
-
     def run(self) -> None:
-        """Run the episodes, write `eval.json` and `report.html`, print the table."""
-        from manip_il.cli import eval_files
-
-        if self.health:
-            say(f"healthy: {eval_files.machine()}")
-        elif self.replay is not None:
-            own = {name: self.env[name] for name in ("task", "object") if self.env.get(name) is not None}
-            eval_files.replay(self.evaluation[0], self.replay, self.policy.path, self.video, own, trust=self.trust)
-        elif self.evaluation:
-            merged = eval_files.merge(self.evaluation)
-            with self.output.open(self) as folder:
-                self._report(merged, folder)
-        else:
-            self._evaluate()
+        """Run the episodes, write `eval.json` and `report.html`, print the table; or do what is asked in its place."""
+        match self.evaluation, self.replay:
+            case _ if self.health:
+                say(f"healthy: {machine()}")
+            case [file], int(seed):
+                self._replay(file, seed)
+            case [_, _, *_], None:
+                self._merge()
+            case [], None if (self.policy.path is None) != (self.policy.type is None):
+                self._evaluate()
+            case [], None:
+                raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
+            case _:
+                raise UsageError("expected two or more evaluations to merge, or one and --replay=SEED")
 
     def _evaluate(self) -> None:
         from manip_il.evaluation.film import film_outcomes
@@ -131,9 +113,7 @@ class EvalOptions:
                 films = film_outcomes(engine, job, result, self.eval.films, folder / "films", stages)
             self._report(result, folder, *films)
         seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
-        # a robot's file is in eval.json; a task's is given each time
-        own = common.own_names("panda", job.env.task, job.env.object)
-        say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed}{own} --video=replay.mp4")
+        say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed} --video=replay.mp4")
 
     def _job(self) -> RolloutJob:
         from manip_il.cli.inputs import open_driver
@@ -163,3 +143,88 @@ class EvalOptions:
         if result.robot in ROBOTS:
             say(f"return: {mean(episode.ret for episode in result.episodes):.2f}")
         say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+
+    def _merge(self) -> None:
+        """Make one evaluation of parts; warns if they were made with different versions or models."""
+        from manip_il.data.fingerprint import compare_fingerprints
+        from manip_il.evaluation.results import EvalResult, merge_results
+
+        parts = {str(path): EvalResult.read(path) for path in self.evaluation}
+        merged, ((first, one), *others) = merge_results(parts), parts.items()
+        for name, other in others:
+            warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
+        with self.output.open(self) as folder:
+            self._report(merged, folder)
+
+    def _replay(self, file: Path, seed: int) -> None:
+        """Run one episode again with the same policy, seed and conditions; `ManipError` if its outcome differs."""
+        from manip_il.evaluation.film import Shot, run_states
+        from manip_il.evaluation.results import EvalResult
+        from manip_il.evaluation.runner import episode_result, replay_differences
+
+        result = EvalResult.read(file)
+        by_seed = {episode.seed: episode for episode in result.episodes}
+        if seed not in by_seed:
+            raise UsageError(f"--replay is {seed}; {file} has the seeds {min(by_seed)} to {max(by_seed)}")
+        before, job = by_seed[seed], self._job_of(result, file)
+        episode = run_states(job, seed)
+        ended = "success" if before.success else f"failure in phase {before.phase_at_end}"
+        say(f"seed {seed}, {before.detail.get('condition', 'nominal')}: {ended}")
+        say(*(f"  {name}: {json.dumps(value)}" for name, value in before.detail.get("drawn", {}).items()))
+        if self.video is not None:
+            write_file(self.video, Shot(job, episode).film().mp4)
+            say(f"video: {self.video}")
+        if differences := replay_differences(before, episode_result(job, episode)):
+            raise ManipError(
+                f"the episode of seed {seed} differs from {file}: {'; '.join(differences)}; across "
+                "machines and versions success rates can be compared, single episodes cannot"
+            )
+        say(f"the same as in {file}")
+
+    def _job_of(self, result: EvalResult, file: Path) -> RolloutJob:
+        """Return the rollouts of an evaluation; warn if policy or program have changed since.
+
+        `--task.*` are the files of its task and its object's mesh, if they do not ship.
+        """
+        from manip_il.cli.inputs import open_driver
+        from manip_il.collect.environments import env_fingerprint, env_spec
+        from manip_il.collect.job import RolloutJob
+        from manip_il.data.fingerprint import compare_fingerprints
+        from manip_il.evaluation.policy_folder import find_policy
+        from manip_il.learn.checkpoint import policy_sha256
+
+        settings = replace(result.settings, object=self.env["object"] or result.settings.object)
+        env = settings.env(result.robot, self.env["task"] or result.task)
+        if (given := env_spec(env).task) != result.task:
+            raise MismatchError("task", str(file), result.task, "--task.type", given)
+        is_policy = result.policy not in NO_FILES or bool(result.policy_sha256) or self.policy.path is not None
+        path = find_policy(self.policy.path or Path(result.policy)) if is_policy else None
+        _, driver, cameras = open_driver(path, result.policy, env, trust=self.trust)
+        if path is not None and result.policy_sha256 not in ("", policy_sha256(path)):
+            warn(f"{path} is not the policy of {file}: its files differ")
+        here = env_fingerprint(env, cameras)
+        warn(*compare_fingerprints(str(file), dict(result.fingerprint), "this machine", here))
+        return RolloutJob(env, driver, settings.hold, label="last", conditions=settings.conditions)
+
+
+def machine() -> str:
+    """Return renderer, PyTorch and cores in one line. Raises what an evaluation without them would raise."""
+    import multiprocessing
+    import tempfile
+    from importlib import metadata
+
+    from manip_il.collect.workers import default_workers
+    from manip_il.sim import render
+    from manip_il.sim.config import CAMERAS, CameraConfig
+    from manip_il.tasks.envs import make_env
+
+    tempfile.TemporaryFile().close()
+    multiprocessing.get_context("spawn").Lock()  # which lies in /dev/shm
+    env = make_env()
+    env.start(0)
+    render.pictures(env.scene, env.data, CameraConfig(CAMERAS))
+    from OpenGL import GL  # mujoco has chosen its platform
+
+    names = (GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER))
+    renderer = " ".join(name.decode(errors="replace") for name in names if name)
+    return f"{renderer}; torch {metadata.version('torch')}; cores {default_workers()}"

@@ -52,10 +52,8 @@ def check_given(config: RunConfig) -> None:
     for root in config.datasets:
         given = Dataset.open(root)
         if SIM_STATE not in given.features:
-            raise ManipError(
-                f"{root} has no {SIM_STATE}: it was not recorded in simulation, so rollouts cannot be added to it; fit "
-                f"a policy to it by manip-il train --dataset.root={root}, and begin with that: --policy.path=RUN"
-            )
+            advice = "fit a policy to it by manip-il train, and begin with that: --policy.path=RUN"
+            raise ManipError(f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}")
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
         warn(*dataset_differences(str(root), given.spec, given.fingerprint))
     if config.start is not None:
@@ -103,8 +101,7 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
     checkpoint.check_fits(spec)
     checkpoint.require_trust(trust)
     if origin is None:
-        lit = f", nor how its pictures were lit: {cameras.look} is assumed" if cameras else ""
-        warn(f"{path} was written by another tool and does not say which robot and task it is for{lit}")
+        warn(f"{path} was written by another tool and does not say which robot and task it is for")
     elif origin.task != spec.task:  # and with it the model and its hash
         warn(f"task differs: {path} has {origin.task}, the environment has {spec.task}")
     else:

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.cli import common_options as common
-from manip_il.cli.common_options import REWARD, exists, require_dataset
+from manip_il.cli.common_options import Demonstrations, Workers
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
@@ -25,49 +24,35 @@ if TYPE_CHECKING:
     from manip_il.learn.checkpoint import Origin
 
 METRICS_FILE = "metrics.jsonl"
-_INIT = "a cloned mlp, or its run, to begin with"
-_OF_ALL = (
-    *("steps", "episodes", "episode_steps", "action_space", "log_std", "warmup", "validation_every"),
-    *("validation_episodes", "seed"),
-)
 
 
-@dataclass
-class GivenGroup:
-    """`--dataset.*`."""
-
-    root: list[Path] = option(MISSING, "demonstrations; several are joined", check=require_dataset)
-
-
-@dataclass(kw_only=True)
+@dataclass(frozen=True)
 class Learning:
     """Run of a method, its progress and its page, as these commands share it."""
 
-    title: ClassVar[str]
     method: ClassVar[str]
     first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"
-    settings: Given = given(LearningConfig, prefix="", only=_OF_ALL)
+    init: Path | None = option(None, "a cloned mlp, or its run, to begin with; by default a new policy")
+    settings: Given = given(LearningConfig, prefix="")
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    workers: int | None = option(1, "processes that validate", at_least=1, free=True)
-    output: ResumableOutput
+    engine: Workers = group(Workers(1), prefix="")
+    output: ResumableOutput = group(ResumableOutput(Path("runs/rl")), prefix="")
 
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
         from manip_il.algorithms.results import learning_report, validations
-        from manip_il.collect.workers import Engine
 
         config = self.learning_config()
         with self.output.open(self) as folder:
             kept = f"every finished iteration, in {folder}"
-            with Stages(kept) as stages, Engine(self.workers) as engine:
+            with Stages(kept) as stages, self.engine.open() as engine:
                 self._learn(config, folder, engine, stages)
-            title, found = f"{self.title} on {config.env.robot} {config.env.task}", validations(folder)
+            title, found = f"{self.method.upper()} on {config.env.robot} {config.env.task}", validations(folder)
             records, command = read_lines(folder / METRICS_FILE), command_line(f"rl {self.method}", self)
             learning_report(title, found, records, command, to_plain(self)).write(folder / REPORT_FILE)
-        say(f"report: {folder / REPORT_FILE}")
         best = folder / "best" / "pretrained_model"
-        own = common.own_names(config.env.robot, config.env.task, config.env.object)
-        say(f"best policy: {best}", f"next: manip-il eval --policy.path={best}{own} --output_dir={folder}/test")
+        say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
+        say(f"next: manip-il eval --policy.path={best} --output_dir={folder}/test")
 
     def learning_config(self) -> LearningConfig:
         """Return what the run takes; raises for what is wrong with datasets and policy together."""
@@ -80,7 +65,8 @@ class Learning:
         if not is_known(spec.robot, spec.task, spec.object):
             raise UsageError(f"{name} is for {spec.robot} {spec.task} {spec.object}, which cannot be simulated here")
         env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
-        return LearningConfig(method=self.method, env=env, ppo=self.ppo, **more, **self.settings)
+        start = None if self.init is None else find_policy(self.init)
+        return LearningConfig(method=self.method, env=env, ppo=self.ppo, start=start, **more, **self.settings)
 
     def _learn(self, config: LearningConfig, folder: Path, engine: Engine, stages: Stages) -> None:
         from manip_il.algorithms.results import Watch
@@ -88,19 +74,18 @@ class Learning:
 
         watch, metrics = Watch(on_episode=lambda _: stages.check(), on_step=stages.check), folder / METRICS_FILE
         results = Run(config, folder, engine, watch).results()
-        stages.start(f"{self.title}, steps", config.steps)
+        stages.start(f"{self.method.upper()}, steps", config.steps)
         written = {record["iteration"] for record in read_lines(metrics)}
         for result in results:
             if result.number not in written:
                 append_line(metrics, result.to_json())
-            stages.reach(
-                result.steps, **{key: result.metrics[key] for key in ("success", "kl") if key in result.metrics}
-            )
+            shown = {key: result.metrics[key] for key in ("success", "kl") if key in result.metrics}
+            stages.reach(result.steps, **shown)
             if result.validated is not None:
                 say(f"{result.steps:,} steps: validation success {result.validated.success}")
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class GailOptions(Learning):
     """Imitate demonstrations by generative adversarial imitation learning (GAIL).
 
@@ -109,11 +94,9 @@ class GailOptions(Learning):
     train`.
     """
 
-    title: ClassVar[str] = "GAIL"
     method: ClassVar[str] = "gail"
     example: ClassVar[str] = "manip-il rl gail --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/gail"
-    dataset: GivenGroup
-    init: Path | None = option(None, f"{_INIT}; by default a new policy", check=find_policy)
+    dataset: Demonstrations
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     output: ResumableOutput = group(ResumableOutput(Path("runs/gail")), prefix="")
 
@@ -127,37 +110,33 @@ class GailOptions(Learning):
         check_same_sources(self.dataset.root, [one.spec for one in opened], pictures=False, language=False)
         for one in opened:
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
-        start = None if self.init is None else find_policy(self.init)
-        more = {"datasets": tuple(self.dataset.root), "start": start, "discriminator": self.discriminator}
+        more = {"datasets": tuple(self.dataset.root), "discriminator": self.discriminator}
         return self._config(opened[0].spec, str(opened[0].root), **more)
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class AirlOptions(GailOptions):
     """Imitate demonstrations by adversarial inverse reinforcement learning (AIRL).
 
     Like `manip-il rl gail`, with a discriminator in the form of a reward: exp f / (exp f + pi).
     """
 
-    title: ClassVar[str] = "AIRL"
     method: ClassVar[str] = "airl"
     example: ClassVar[str] = "manip-il rl airl --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/airl"
     output: ResumableOutput = group(ResumableOutput(Path("runs/airl")), prefix="")
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class PpoOptions(Learning):
-    """Improve a cloned policy by PPO on a reward that was learnt from preferences.
+    """Improve a cloned policy (--init) by PPO on a reward that was learnt from preferences.
 
     Episodes go on after success, as the reward says how good every state is. OUTPUT_DIR/best holds the policy with the
     highest validation success, which may be the one that it began with.
     """
 
-    title: ClassVar[str] = "PPO"
     method: ClassVar[str] = "ppo"
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
-    init: Path = option(MISSING, _INIT, check=find_policy)
-    reward: Path = option(MISSING, "the reward: a folder of manip-il reward fit", check=exists(REWARD))
+    reward: Path = option(MISSING, "the reward: a folder of manip-il reward fit", exists="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/ppo")), prefix="")
 
     def learning_config(self) -> LearningConfig:
@@ -165,8 +144,9 @@ class PpoOptions(Learning):
         from manip_il.collect.environments import env_spec
         from manip_il.learn.reward import LearnedReward
 
-        reward = LearnedReward.load(find_policy(self.reward))
-        paths = {"start": find_policy(self.init), "reward": find_policy(self.reward)}
-        config = self._config(reward.origin, str(self.reward), **paths)
+        if self.init is None:
+            raise UsageError("--init is missing; PPO improves a cloned policy, its path is expected")
+        reward = LearnedReward.load(found := find_policy(self.reward))
+        config = self._config(reward.origin, str(self.reward), reward=found)
         reward.check_fits("the environment", env_spec(config.env))
         return config

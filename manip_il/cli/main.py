@@ -1,7 +1,6 @@
 """`manip-il COMMAND --option=value ...`: finds the command, answers for help and for errors.
 
-Nothing heavy is imported before a command's options are sound, so that help and a mistake are answered at once:
-an options class may have `check`, which refuses what its paths and values alone show to be wrong, before `run`.
+Nothing heavy is imported before a command's options are read, so that help and a wrong name are answered at once.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any, NamedTuple, NoReturn
 from manip_il import __version__
 from manip_il.cli import progress
 from manip_il.cli.options import Option, metavar, options_of, word
-from manip_il.cli.parsing import check_values, parse
+from manip_il.cli.parsing import check_paths, parse
 from manip_il.errors import ManipError, UnknownName, UsageError, printable
 
 PROGRAM = "manip-il"
@@ -137,9 +136,7 @@ def _dispatch(words: list[str]) -> None:
 
 def _run(name: str, words: list[str]) -> None:
     options = parse(load(name), words, command=name)
-    check_values(options)
-    if hasattr(options, "check"):
-        options.check()
+    check_paths(options)
     from manip_il.errors import silence_ffmpeg_warning
     from manip_il.sim.gl import require_known_backend
 
@@ -213,7 +210,7 @@ def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
     first = () if "--help=all" in words else getattr(cls, "first", "").split()
     positional = [option for option in options if option.positional]
     places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
-    rows = dict(_row(option) for option in options if not first or option.positional or option.name in first)
+    rows = dict(_row(one) for one in options if not first or one.positional or one.name in first)
     rest = len(options) - len(rows)
     rows["--config_path=FILE.yaml"] = "read options from YAML; those on the command line win"
     if rest:

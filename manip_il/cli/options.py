@@ -15,7 +15,7 @@ import shlex
 import sys
 import types
 import typing
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Union
@@ -34,16 +34,14 @@ def group(default: Any, prefix: str | None = None) -> Any:
     return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
 
 
-def given(
-    cls: type, prefix: str | None = None, only: Collection[str] = (), defaults: Mapping[str, Any] | None = None
-) -> Any:
+def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **own: Any) -> Any:
     """Return a `Given` field: every option of `cls`, declared there.
 
-    only: fields, if not all. defaults: field -> what stands in help in place of the default of `cls`; None for one that
-    depends on what else is given.
+    only: fields, if not all. own: values in place of the defaults of `cls`, which are held, too.
     """
-    metadata = {"given": cls, "only": only, "defaults": defaults or {}}
-    return field(default_factory=dict, metadata=metadata if prefix is None else metadata | {"prefix": prefix})
+    metadata = {"given": cls, "only": only}
+    names = {} if prefix is None else {"prefix": prefix}
+    return field(default_factory=functools.partial(dict, own), metadata=metadata | names)
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,9 @@ class Option:
     """One option of a command. `default` is `MISSING` if the user must give a value.
 
     path: the attributes and keys that lead from the command's options to its value. metadata: of its field: `help`, one
-    line; `positional` for a value without a name; `command_line_only` for one that no file may set; `flag`, its whole
-    name; `at_least` and `at_most`. is_given: it is in a `Given` group, which holds it only if it was given.
+    line; `positional` for a value without a name; `command_line_only` for one that no file may set; `exists` for a path
+    to read: what it is on the Hub (`datasets/`); `flag`, its whole name; `at_least` and `at_most`. home: the class that
+    declares it.
     """
 
     name: str  # dotted: `dataset.root`
@@ -60,7 +59,7 @@ class Option:
     type: Any
     default: Any
     metadata: Mapping[str, Any]
-    is_given: bool = False
+    home: type
 
     @property
     def positional(self) -> bool:
@@ -92,41 +91,36 @@ class Option:
 
 
 def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()) -> list[Option]:
-    """Return every option of a dataclass, groups resolved, in the order of definition. base: has the defaults."""
+    """Return every option of a dataclass, groups resolved, those that classes share last. base: has the defaults."""
     found: list[Option] = []
-    for one, kind, default in fields_of(cls, base):
+    for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
         inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
-        if "given" in one.metadata:
-            source, only, defaults = (one.metadata[key] for key in ("given", "only", "defaults"))
+        (home, kind), default = declared(cls, one), default_of(one, base)
+        if source := one.metadata.get("given"):
             for theirs in dataclasses.fields(source):
-                if "help" in theirs.metadata and (not only or theirs.name in only):
-                    name, place = theirs.metadata.get("flag", inner + theirs.name), (*here, theirs.name)
-                    own, their_kind = defaults.get(theirs.name, _default(theirs)), _type_of(source, theirs)
-                    found.append(Option(name, place, their_kind, own, theirs.metadata, is_given=True))
+                if "help" in theirs.metadata and theirs.name in (one.metadata["only"] or (theirs.name,)):
+                    name = theirs.metadata.get("flag", inner + theirs.name)
+                    own, where = default.get(theirs.name, default_of(theirs)), (*here, theirs.name)
+                    home, kind = declared(source, theirs)
+                    found.append(Option(name, where, kind, own, theirs.metadata, home))
         elif dataclasses.is_dataclass(kind):
             found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
         else:
-            found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata))
+            found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata, home))
     return found
 
 
-def fields_of(cls: type, base: Any) -> Iterator[tuple[dataclasses.Field[Any], Any, Any]]:
-    """Yield every field that a dataclass's constructor takes, its type, and its value in `base`, else its default."""
-    for one in dataclasses.fields(cls):
-        if one.init:
-            yield one, _type_of(cls, one), _default(one) if base is None else getattr(base, one.name)
-
-
-def _default(one: dataclasses.Field[Any]) -> Any:
+def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
+    """Return a field's value in `base`, else its default, else `MISSING`."""
+    if base is not None:
+        return getattr(base, one.name)
     return one.default if one.default_factory is MISSING else one.default_factory()
 
 
-def _type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
-    """Return a field's type; other fields' types may be known to type checkers alone."""
-    if not isinstance(one.type, str):
-        return one.type
+def declared(cls: type, one: dataclasses.Field[Any]) -> tuple[type, Any]:
+    """Return the class that declares a field, and the field's type; others' may be known to type checkers alone."""
     home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
-    return eval(one.type, vars(sys.modules[home.__module__]))
+    return home, eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
 
 
 def to_plain(options: Any) -> dict[str, Any]:
@@ -216,9 +210,7 @@ def decode(option_type: Any, value: Any) -> Any:
     decoded: Any = draccus.decode(option_type, value)
     if decoded != decoded or (isinstance(value, bool) and some is not bool) or (some is Path and value == ""):
         raise ValueError
-    if isinstance(decoded, list):
-        return [_expand(item) for item in typing.cast(list[Any], decoded)]
-    return _expand(decoded)
+    return [_expand(item) for item in decoded] if isinstance(decoded, list) else _expand(decoded)
 
 
 def _expand(value: Any) -> Any:

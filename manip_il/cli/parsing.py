@@ -18,20 +18,23 @@ from manip_il.checks import read_yaml, shorten
 from manip_il.cli.options import (
     Option,
     choices,
+    declared,
     decode,
+    default_of,
     expected,
-    fields_of,
     from_word,
     options_of,
     to_plain,
     without_none,
 )
 from manip_il.errors import ManipError, UsageError, did_you_mean, nearest, nearest_names
+from manip_il.evaluation.policy_folder import hub_hint
 from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
-MOVED = {"task.reward": "--task.type=carry:"}  # where an option's value stands now; files may still hold it empty
+# What has taken an option's place; files may still hold it empty.
+MOVED = {"task.reward": "--task.type=carry:REWARD", "within": "read off the page's curves"}
 _FEW = 3
 type Known = Mapping[str, Option]
 
@@ -42,45 +45,57 @@ class _Said(NamedTuple):
     value: Any
     origin: str
 
-    @property
-    def is_word(self) -> bool:
-        """Whether it is from the command line."""
-        return self.origin.startswith("--")
 
-
-def parse[T](cls: type[T], words: Sequence[str], command: str = "") -> T:
+def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
     """Read options from the command line; `UsageError` for an unknown name, a bad or a missing value.
 
     command: whose options they are, for the message.
     """
-    from_words, paths = _read_words(words, _known(cls), command)
-    return _make(cls, [(path, read_yaml(Path(path), "a YAML file of options")) for path in paths], from_words)
+    known = _known(cls)
+    said, paths = _read_words(words, known, command)
+    trees = [(str(path), read_yaml(path, "a YAML file of options")) for path in map(Path, paths)]
+    return from_layers(cls, trees, said)
 
 
 def from_yaml[T](path: Path, cls: type[T]) -> T:
     """Read options from a YAML file of differences, or from one that `dump_yaml` wrote."""
-    return _make(cls, [(str(path), read_yaml(path, "a YAML file of options"))])
+    return from_layers(cls, [(str(path), read_yaml(path, "a YAML file of options"))])
 
 
-def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]]) -> T:
-    """Read options from trees of differences, as YAML gives them; a later tree wins.
+def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Said] | None = None) -> T:
+    """Read options from trees of differences, as YAML gives them; a later tree wins, and words of the command line.
 
     layers: the origin of a tree, for error messages, and the tree. `UsageError` as from a YAML file.
     """
-    return _make(cls, layers)
+    known, said = _known(cls), dict[str, _Said]()
+    for origin, tree in layers:
+        said |= _read_tree(tree, known, origin)
+    said |= words or {}
+    values: dict[tuple[str, ...], Any] = {}
+    for option in known.values():
+        if option.is_open:
+            inside = {name: one for name, one in said.items() if name.startswith(f"{option.name}.")}
+            for name, one in inside.items():
+                held = values.setdefault(option.path, dict(option.default))
+                held[name.removeprefix(f"{option.name}.")] = _decode_said(option, one)
+        elif option.name in said:
+            one = said[option.name]
+            if one.value is not None or without_none(option.type) is not option.type:  # else it was not given
+                values[option.path] = _decode_said(option, one)
+        elif option.default is MISSING:
+            raise UsageError(f"{option.label} is missing; expected {expected(option.type)}")
+    return _build(cls, values)
 
 
-def check_values(options: Any, prefix: str | None = None) -> None:
-    """Refuse values out of bounds, and what the options' own `check` refuses: paths that are not there, most of all.
-
-    prefix: of the names in messages, in place of two dashes.
-    """
+def check_paths(options: Any) -> None:
+    """Raise `UsageError` for a path that is to be read, if nothing is there."""
     for one in options_of(type(options)):
-        value = one.value(options)
-        check_bound(one.label if prefix is None else prefix + one.name, value, one.metadata)
-        for item in value if one.is_list else [value]:
-            if item is not None and "check" in one.metadata:
-                one.metadata["check"](item)
+        value = one.value(options) if "exists" in one.metadata else None
+        for path in value if isinstance(value, list) else [value]:
+            if path is not None and not path.exists():
+                raise UsageError(
+                    f"{path} does not exist; expected {one.metadata['help']}{hub_hint(path, one.metadata['exists'])}"
+                )
 
 
 def dump_yaml(options: Any) -> str:
@@ -108,7 +123,8 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
             break
         if not word.startswith("--"):
             if not places or word.startswith("-"):
-                raise UsageError(f"unexpected {shorten(word)}; options are written --name=value, {_lists(command)}")
+                wanted = f"options are written --name=value, manip-il {command} --help=all lists all"
+                raise UsageError(f"unexpected {shorten(word)}; {wanted}")
             option = places[0] if places[0].is_list else places.pop(0)
             before = said[option.name].value if option.is_list and option.name in said else []
             said[option.name] = _Said([*before, word] if option.is_list else word, option.label)
@@ -116,8 +132,6 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
         name, equals, value = word[2:].partition("=")
         if (ours := name.replace("-", "_")) in known:  # as other programs write it
             name = ours
-        if name in MOVED:
-            raise UsageError(f"--{name} has a new name: {MOVED[name]}{value or 'REWARD'}")
         kind = Path if name == CONFIG_PATH else _type_of(name, known, command)
         if not equals and kind is bool and (not rest or rest[0] not in ("true", "false")):
             value = "true"
@@ -134,18 +148,16 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
 
 def _type_of(name: str, known: Known, command: str) -> Any:
     """Return the type of an option that is given by its name, `Any` of one in an open group."""
-    if _open_group(name, known):
+    if _is_inside(name, known):
         return Any
     if name not in known or known[name].positional or known[name].is_open:
         raise _unknown_option("option", name, known, "--", command)
     return known[name].type
 
 
-def _open_group(name: str, known: Known) -> str:
-    """Return the open group that `name` is an option of, or nothing."""
-    if name in known:
-        return ""
-    return next((option.name for option in known.values() if option.is_open and name.startswith(f"{option.name}.")), "")
+def _is_inside(name: str, known: Known) -> bool:
+    """Whether `name` is an option of an open group."""
+    return name not in known and any(one.is_open and name.startswith(f"{one.name}.") for one in known.values())
 
 
 def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _Said]:
@@ -156,92 +168,61 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
     said: dict[str, _Said] = {}
     for key, value in typing.cast(dict[Any, Any], tree or {}).items():
         name = f"{prefix}{key}"
-        if name in MOVED:
-            if value:
-                raise UsageError(f"{origin}: {name} has a new name: {MOVED[name]}{value}")
-        elif (name in known and not known[name].is_open) or _open_group(name, known):
+        if (name in known and not known[name].is_open) or _is_inside(name, known):
             said[name] = _Said(value, f"{origin}: {name}")
-        elif name in known or any(option.startswith(f"{name}.") for option in known):
+            if value is not None and name in known and known[name].metadata.get("command_line_only"):
+                raise UsageError(f"{origin}: {name}: this can only be set on the command line; give --{name}=...")
+        elif any(option == name or option.startswith(f"{name}.") for option in known):
             said |= _read_tree(value, known, origin, f"{name}.")
-        else:
-            raise _unknown_option(f"key in {origin}:", name, known, "", "")
+        elif name not in MOVED or value:
+            raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
     return said
 
 
-def _make[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Said] | None = None) -> T:
-    known, said = _known(cls), dict[str, _Said]()
-    for origin, tree in layers:
-        said |= _read_tree(tree, known, origin)
-    said |= words or {}
-    values: dict[tuple[str, ...], Any] = {}
-    for option in known.values():
-        if option.is_open:
-            inside = {
-                name.removeprefix(f"{option.name}."): _decode_said(Any, one)
-                for name, one in said.items()
-                if name.startswith(f"{option.name}.")
-            }
-            if inside:
-                values[option.path] = ({} if option.default is MISSING else option.default) | inside
-        elif option.name in said:
-            one = said[option.name]
-            if option.metadata.get("command_line_only") and not one.is_word:
-                raise UsageError(f"{one.origin}: this can only be set on the command line; give --{option.name}=...")
-            if one.value is not None or not option.is_given or without_none(option.type) is not option.type:
-                values[option.path] = _decode_said(option.type, one)  # else null says that it was not given
-        elif option.default is MISSING:
-            raise UsageError(f"{option.label} is missing; expected {expected(option.type)}")
-    return _build(cls, values)
-
-
-def _build[T](cls: type[T], values: Mapping[tuple[str, ...], Any], base: Any = None, path: tuple[str, ...] = ()) -> T:
+def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, path: tuple[str, ...] = ()) -> Any:
     """Return an instance of `cls` of the values by their paths, else of `base`'s, else of the defaults."""
     arguments: dict[str, Any] = {}
-    for field, kind, default in fields_of(cls, base):
-        here = (*path, field.name)
+    for field in dataclasses.fields(cls):
+        here, (_, kind), default = (*path, field.name), declared(cls, field), default_of(field, base)
         if "given" in field.metadata:
-            arguments[field.name] = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
+            said = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
+            arguments[field.name] = default | said
         elif dataclasses.is_dataclass(kind):
-            inner_base = None if default is MISSING else default
-            arguments[field.name] = _build(typing.cast(type, kind), values, inner_base, here)
+            arguments[field.name] = _build(kind, values, None if default is MISSING else default, here)
         else:
             arguments[field.name] = values.get(here, {} if default is MISSING else default)
     return cls(**arguments)
 
 
-def _decode_said(option_type: Any, said: _Said) -> Any:
-    if option_type is Any and not said.is_word:
+def _decode_said(option: Option, said: _Said) -> Any:
+    kind, is_word = Any if option.is_open else option.type, said.origin.startswith("--")
+    if option.is_open and not is_word:
         return said.value
     try:
-        return decode(option_type, said.value)
+        value = decode(kind, said.value)
     except ManipError:  # of a class that parses itself
         raise
     except Exception:  # draccus raises bare ones, too
-        hint = nearest(said.value, choices(option_type)) if isinstance(said.value, str) else ""
-        quotes = "; YAML needs quotes around text like this" if option_type is str and not said.is_word else ""
-        text = f"{said.origin}: expected {expected(option_type)}, got {shorten(said.value)}{hint}{quotes}"
+        hint = nearest(said.value, choices(kind)) if isinstance(said.value, str) else ""
+        quotes = "; YAML needs quotes around text like this" if kind is str and not is_word else ""
+        text = f"{said.origin}: expected {expected(kind)}, got {shorten(said.value)}{hint}{quotes}"
         raise UsageError(text) from None
+    check_bound(said.origin, value, option.metadata)
+    return value
 
 
 def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
     """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
 
     `num_episodes` finds `dataset.num_episodes`. kind: `option`, or which file's key. dashes: before the names.
-    command: empty if none is known.
     """
-    inside = [one.label for one in known.values() if one.label.startswith(f"--{name}.")]
-    if inside:
+    if name in MOVED:
+        return UsageError(f"{dashes}{name} is now {MOVED[name]}")
+    if inside := [one.label for one in known.values() if one.label.startswith(f"--{name}.")]:
         return UsageError(f"{dashes}{name} is a group of options; known: {', '.join(inside)}")
-    by_leaf: dict[str, list[str]] = {}
-    for one in known.values():
-        if not one.is_open and not (dashes and one.positional):
-            by_leaf.setdefault(one.name.rpartition(".")[2], []).append(one.name)
-    leaf, named = name.rpartition(".")[2], [one for names in by_leaf.values() for one in names]
-    leaves = [leaf] if leaf in by_leaf else nearest_names(leaf, by_leaf)
-    near = [*(one for found in leaves for one in by_leaf[found]), *nearest_names(name, named)]
+    named = [one.name for one in known.values() if not one.is_open and not (dashes and one.positional)]
+    leaf, leaves = name.rpartition(".")[2], {one.rpartition(".")[2] for one in named}
+    like = [leaf] if leaf in leaves else nearest_names(leaf, sorted(leaves))
+    near = [*(one for last in like for one in named if one.rpartition(".")[2] == last), *nearest_names(name, named)]
     offered = did_you_mean([dashes + one for one in list(dict.fromkeys(near))[:_FEW]])
-    return UsageError(f"unknown {kind} {shorten(dashes + name)}{offered}; {_lists(command)}")
-
-
-def _lists(command: str) -> str:
-    return f"manip-il {command or 'COMMAND'} --help=all lists all"
+    return UsageError(f"unknown {kind} {shorten(dashes + name)}{offered}; manip-il {command} --help=all lists all")

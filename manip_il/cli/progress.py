@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from manip_il.errors import ManipError, UsageError, printable
@@ -56,9 +56,7 @@ class Stages:
     """
 
     def __init__(self, kept: str = ""):
-        self.kept = kept
-        self._stopping = False
-        self._handlers: dict[int, Any] = {}
+        self.kept, self._stopping, self._handlers = kept, False, dict[int, Any]()
         self._bar: Any = None
         self._fields: dict[str, object] = {}
         self._began = self._printed = 0.0
@@ -78,7 +76,7 @@ class Stages:
             said = f"{error}; " if error.args else ""
             error.args = (f"{said}kept: {self.kept}; continue with --resume=true",)
 
-    def _stop(self, number: int, frame: FrameType | None) -> None:
+    def _stop(self, *_: object) -> None:
         if self._stopping:
             raise KeyboardInterrupt
         self._stopping = True
@@ -120,7 +118,7 @@ class Stages:
 
     def _print(self) -> None:
         self._printed = time.monotonic()
-        if self._bar.disable and not _quiet:
+        if self._bar is not None and self._bar.disable and not _quiet:
             task, rate = self._bar.tasks[0], f"{self._done / max(self._printed - self._began, 1e-9):.3g}/s"
             count = self._done if task.total is None else f"{self._done}/{task.total:.0f}"
             details = ", ".join(filter(None, [rate, task.fields["details"]]))
@@ -160,12 +158,10 @@ class Stages:
         """Return the callbacks that a run of an algorithm reports to."""
         from manip_il.algorithms.results import Watch
 
-        return Watch(
-            on_stage=lambda stage, round_, total: self.start(f"round {round_}, {stage}", total),
-            on_episode=self.episode,
-            on_log=self.log,
-            on_step=self.step,
-        )
+        def start(stage: str, round_: int, total: int) -> None:
+            self.start(f"round {round_}, {stage}", total)
+
+        return Watch(start, self.episode, self.log, self.step)
 
 
 @contextmanager

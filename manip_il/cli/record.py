@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il import checks
-from manip_il.cli import common_options as common
+from manip_il.cli.common_options import EngineOptions, Varied, env_config
 from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import check_same_options, prepare_output, save_options
+from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, save_options
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import UsageError
-from manip_il.option import option
+from manip_il.option import Seeded, option
+from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
@@ -22,55 +22,45 @@ if TYPE_CHECKING:
 HOLD = 10  # control steps that a demonstration goes on for after success
 
 
-def require_repo_id(value: str) -> None:
-    """Raise `UsageError` unless the value is USER/NAME: a folder is named after it."""
-    if "/" not in checks.repo_id("repo_id", value):
-        raise UsageError(f"repo_id is {value!r}; expected USER/NAME")
-
-
-@dataclass
+@dataclass(frozen=True)
 class DatasetGroup:
     """`--dataset.*` of what is recorded."""
 
-    repo_id: str | None = option(
-        None, "USER/NAME on the Hub; by default local/ROBOT_TASK", check=require_repo_id, free=True
-    )
+    repo_id: str | None = option(None, "USER/NAME on the Hub; by default local/ROBOT_TASK", free=True)
     root: Path | None = option(None, "folder of the dataset; by default datasets/NAME", free=True)
     num_episodes: int = option(50, "successful episodes", at_least=1, grows=True)
     rgb_encoder: Given = given(VideoConfig)
 
 
-@dataclass
-class RecordOptions:
+@dataclass(frozen=True)
+class RecordOptions(Varied, Seeded, Resumable):
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
-    Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
+    Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded. With
+    --resume=true it goes on, also to more episodes.
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
     first: ClassVar[str] = "robot.type task.type dataset.root dataset.num_episodes cameras seed resume"
-    env: Given = common.env_given()
+    env: Given = given(EnvConfig)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
-    cameras: list[str] = option(list, f"{common.CAMERAS_HELP}; by default no pictures")
-    image: Given = common.image_given()
-    vary: list[str] = common.vary_option()
-    seed: int = common.seed_option()
-    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
-    resume: bool = option(False, "continue a recording, or add more episodes", free=True)
-    overwrite: bool = option(False, "replace an existing dataset", free=True)
+    engine: EngineOptions = group(EngineOptions(), prefix="")
 
     def run(self) -> None:
         """Record; the dataset is written as the episodes come."""
         from manip_il.collect.environments import env_spec
+        from manip_il.collect.job import RolloutJob
+        from manip_il.data.video import try_encoder
+        from manip_il.evaluation.suites import varied
 
-        job = self._job()
-        if job.cameras:
-            from manip_il.data.video import try_encoder
-
-            try_encoder(VideoConfig(**self.dataset.rgb_encoder), job.cameras.size, job.env.control_hz)
-        env_spec(job.env, job.cameras)  # refuses what no scene can be made of, before anything is written
-        repo_id = self.dataset.repo_id or f"local/{job.env.name}"
-        root = self.dataset.root or Path("datasets") / repo_id.partition("/")[2]
+        env = env_config(self.env)
+        cameras = self.camera_config(env) if self.cameras else None
+        job = RolloutJob(env, hold=HOLD, cameras=cameras, conditions=varied(self.vary, env, sees=cameras is not None))
+        if cameras:
+            try_encoder(VideoConfig(**self.dataset.rgb_encoder), cameras.size, env.control_hz)
+        env_spec(env, cameras)  # refuses what no scene can be made of, before anything is written
+        repo_id = checks.repo_id("repo_id", self.dataset.repo_id or f"local/{env.name}")
+        root = self.dataset.root or Path("datasets") / repo_id.rpartition("/")[2]
         journals = root.with_name(f"{root.name}.journals")
         with exclusive(root):
             prepare_output(root, resume=self.resume, overwrite=self.overwrite)
@@ -79,15 +69,6 @@ class RecordOptions:
                 check_same_options(journals, self)
             self._record(job, root, journals, repo_id)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
-
-    def _job(self) -> RolloutJob:
-        from manip_il.collect.job import RolloutJob
-        from manip_il.evaluation.suites import varied
-
-        env = common.env_config(self.env)
-        cameras = common.camera_config(self.cameras, self.image, robot=env.robot) if self.cameras else None
-        conditions = varied(self.vary, env, sees=cameras is not None)
-        return RolloutJob(env, hold=HOLD, cameras=cameras, conditions=conditions)
 
     def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance, record
@@ -105,12 +86,7 @@ class RecordOptions:
             stages.start(f"record {job.env.robot} {job.env.task}", max(0, count - len(list_seeds(journals))))
             episodes = collect_successes(engine, job, seeds, count, journals, stages.episode)
             info, failed = record(episodes, journals, root, job, recording, replace=self.resume)
-        say(f"recorded {info.episodes:,} successful episodes, {info.frames:,} frames; {left_out(failed)}")
+        say(
+            f"recorded {info.episodes:,} successful episodes, {info.frames:,} frames; demonstrations left out: {failed}"
+        )
         say(f"dataset: {root} (its episodes one by one, to open in Foxglove: {journals})")
-
-
-def left_out(failed: int) -> str:
-    """Return in words how many demonstrations failed."""
-    if failed == 0:
-        return "no demonstration failed"
-    return f"{failed} failed demonstration{'s' if failed > 1 else ''} left out"

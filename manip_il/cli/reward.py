@@ -4,34 +4,33 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from manip_il.cli.common_options import REWARD, exists, require_dataset
+from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile
 from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import write_file
 from manip_il.evaluation.policy_folder import find_policy
-from manip_il.option import option
-
-_PAIRS = "pairs.json of manip-il reward pairs"
+from manip_il.option import Seeded, option
 
 
-def _seed(what: str) -> Any:
-    return option(0, f"seed of {what}, 0 to 1000", at_least=0, at_most=1000)
+@dataclass(frozen=True)
+class OfPairs:
+    """Command on pairs of clips."""
+
+    pairs: Path = option(MISSING, "pairs.json of manip-il reward pairs", positional=True, exists="")
 
 
-@dataclass
-class IrlOptions:
+@dataclass(frozen=True)
+class IrlOptions(OfDataset, Seeded):
     """Learn what the demonstrations of a dataset of carry care about: the weights of a reward.
 
     Writes reward.json, which --task.type=carry:FILE takes, and report.html: the weights, and the cost over the table.
     """
 
     example: ClassVar[str] = "manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl"
-    dataset: Path = option(MISSING, "demonstrations of the task carry", positional=True, check=require_dataset)
     method: Literal["max_margin", "bayesian", "max_entropy"] = option("max_entropy", "how the weights are found")
-    seed: int = _seed("what is drawn at random")
     output: Output = group(Output(Path("runs/irl")), prefix="")
 
     def run(self) -> None:
@@ -58,8 +57,8 @@ class IrlOptions:
         say(f"next: manip-il eval --policy.type=expert --task.type=carry:{folder / inverse.FILE_NAME}")
 
 
-@dataclass
-class PairsOptions:
+@dataclass(frozen=True)
+class PairsOptions(Seeded):
     """Choose pairs of clips of one task's datasets, to be compared by people (ask) or simulated teachers (answer).
 
     A SOURCE is a dataset or a run: each round's dataset of a DAgger run is a source. Every source is in as many pairs
@@ -70,10 +69,7 @@ class PairsOptions:
     sources: list[Path] = option(MISSING, "LeRobot datasets with our columns, or runs", positional=True)
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
-    reward: Path | None = option(
-        None, "choose those about which the networks of this reward disagree most", check=exists(REWARD)
-    )
-    seed: int = _seed("the choice")
+    reward: Path | None = option(None, "choose those about which this reward's networks disagree most", exists="")
     file: OutputFile = group(OutputFile(Path("pairs.json")), prefix="")
 
     def run(self) -> None:
@@ -95,8 +91,8 @@ class PairsOptions:
         say(f"next: manip-il reward ask {self.file.output} --output=ask.html")
 
 
-@dataclass
-class AskOptions:
+@dataclass(frozen=True)
+class AskOptions(OfPairs):
     """Write one page that shows the pairs as films and asks which is better: offline, on a phone too.
 
     Keys: left and right arrow, down for equal, S to skip, U to undo. The answers stay in the browser until they are
@@ -104,7 +100,6 @@ class AskOptions:
     """
 
     example: ClassVar[str] = "manip-il reward ask pairs.json --output=ask.html"
-    pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
     file: OutputFile = group(OutputFile(Path("ask.html")), prefix="")
     robot: Path | None = option(None, "the YAML of the sources' robot, if that does not ship")
 
@@ -124,8 +119,8 @@ class AskOptions:
         say(f"next: manip-il reward fit {self.pairs} preferences.json --output_dir=runs/reward")
 
 
-@dataclass
-class AnswerOptions:
+@dataclass(frozen=True)
+class AnswerOptions(OfPairs, Seeded):
     """Answer pairs by a simulated teacher, who compares the clips' true progress (B-Pref, Lee et al. 2021).
 
     perfect; boltzmann:TEMPERATURE, who is less sure where returns are near; mistaken:EPSILON, the wrong way round in a
@@ -133,9 +128,7 @@ class AnswerOptions:
     """
 
     example: ClassVar[str] = "manip-il reward answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
-    pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
     teacher: str = option("perfect", "perfect, boltzmann[:1] or mistaken[:0.1]")
-    seed: int = _seed("the teacher's chances")
     file: OutputFile = group(OutputFile(Path("preferences.json")), prefix="")
 
     def run(self) -> None:
@@ -145,8 +138,8 @@ class AnswerOptions:
         from manip_il.preferences.pairs import Pairs, read_clips
         from manip_il.seeding import rng_for, stream_base
 
-        teacher = Teacher.parse(self.teacher)
         self.file.check()
+        teacher = Teacher.parse(self.teacher)
         clips = read_clips(Pairs.read(self.pairs))
         rng = rng_for(stream_base("training", self.seed), "teacher")
         found = answer_pairs(teacher, clips, rng)
@@ -157,8 +150,8 @@ class AnswerOptions:
         say(f"next: manip-il reward fit {self.pairs} {self.file.output} --output_dir=runs/reward")
 
 
-@dataclass
-class FitOptions:
+@dataclass(frozen=True)
+class FitOptions(OfPairs, Seeded):
     """Learn a reward of state and action from answers about pairs (Bradley-Terry): an ensemble of small networks.
 
     Every pair is held out by one network; agreement on those is in fit.json. ANSWERS are files of ask or answer, of one
@@ -166,18 +159,9 @@ class FitOptions:
     """
 
     example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
-    pairs: Path = option(MISSING, _PAIRS, positional=True, check=exists(_PAIRS))
-    answers: list[Path] = option(
-        MISSING,
-        "preferences.json of ask or answer",
-        positional=True,
-        check=exists("preferences.json of manip-il reward ask or answer"),
-    )
-    more_pairs: list[Path] = option(
-        list, "further files of pairs of the same task and length of clip", check=exists(_PAIRS)
-    )
+    answers: list[Path] = option(MISSING, "preferences.json of ask or answer", positional=True, exists="")
+    more_pairs: list[Path] = option(list, "further files of pairs of the same task and length of clip", exists="")
     members: int = option(8, "networks of the ensemble, and folds of the pairs", at_least=3, at_most=64)
-    seed: int = _seed("weights, folds and batches")
     output: Output = group(Output(Path("runs/reward")), prefix="")
 
     def run(self) -> None:

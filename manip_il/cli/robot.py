@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import os
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
 from manip_il import checks
-from manip_il.cli import common_options as common
-from manip_il.cli.common_options import exists
-from manip_il.cli.options import Given, command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile
+from manip_il.cli.common_options import OF_POLICY, EngineOptions, PolicyGroup, Trusting
+from manip_il.cli.options import Given, command_line, given, group, to_plain
+from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile, Replacing
 from manip_il.cli.progress import progress, say
 from manip_il.errors import ManipError, RenderError
-from manip_il.option import option
+from manip_il.option import Seeded, option
 from manip_il.tasks import NAMES
+from manip_il.tasks.config import EnvConfig
 
 PAGE = "check.html"
 
 
-@dataclass
-class RobotNewOptions:
+@dataclass(frozen=True)
+class RobotNewOptions(Replacing):
     """Write a first YAML for an arm's MJCF: hand, fingers and workspace as they look on the model.
 
     Every line says what it means. What is found beyond that (joints, home, gains, the hand's frame) stands below as
@@ -30,10 +30,9 @@ class RobotNewOptions:
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"
-    model: Path = option(MISSING, "the arm's MJCF", positional=True, check=exists("an MJCF"))
-    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", check=exists("an MJCF"))
+    model: Path = option(MISSING, "the arm's MJCF", positional=True, exists="")
+    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", exists="")
     output: Path | None = option(None, "the YAML; by default beside the model, with its name")
-    overwrite: bool = option(False, "replace an existing file")
 
     def run(self) -> None:
         """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
@@ -44,7 +43,7 @@ class RobotNewOptions:
 
         target = self.output or self.model.with_suffix(".yaml")
         checks.name(f"the name of {target}, which will be the robot's,", target.stem)
-        OutputFile(target, self.overwrite).check()
+        OutputFile(target, overwrite=self.overwrite).check()
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
         found = suggest(self.model, self.gripper)
         write_file(target, yaml_of(found, *paths).encode())
@@ -60,7 +59,7 @@ class RobotNewOptions:
         say(f"look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
 
 
-@dataclass
+@dataclass(frozen=True)
 class RobotCheckOptions:
     """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
 
@@ -109,8 +108,8 @@ class RobotCheckOptions:
             raise ManipError(f"{self.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
 
 
-@dataclass
-class CertifyOptions:
+@dataclass(frozen=True)
+class CertifyOptions(Seeded, Trusting):
     """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json and a report.
 
     With --policy.path it also takes over from that policy.
@@ -118,12 +117,10 @@ class CertifyOptions:
 
     example: ClassVar[str] = "manip-il robot certify --policy.path=runs/dagger --output_dir=runs/certificate"
     first: ClassVar[str] = "policy.path robot.type task.type cases output_dir"
-    policy: Path | None = common.policy_option(flag="policy.path")
-    env: Given = common.env_given(of_policy=True)
+    policy: PolicyGroup = field(default_factory=PolicyGroup)
+    env: Given = given(EnvConfig, **OF_POLICY)
     cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)
-    seed: int = common.seed_option()
-    engine: common.EngineOptions = group(common.EngineOptions(), prefix="")
-    trust: bool = common.trust_option()
+    engine: EngineOptions = group(EngineOptions(), prefix="")
     output: Output = group(Output(Path("runs/certificate")), prefix="")
 
     def run(self) -> None:
@@ -134,13 +131,13 @@ class CertifyOptions:
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
 
-        env, *_ = open_driver(self.policy, "expert", self.env, trust=self.trust)
-        policy = find_policy(self.policy) if self.policy else None
+        env, *_ = open_driver(self.policy.path, "expert", self.env, trust=self.trust)
+        policy = find_policy(self.policy.path) if self.policy.path else None
         count = count_episodes(env, self.cases, policy)
         with self.output.open(self) as folder:
             with progress(count, f"certify {env.robot} {env.task}") as bar, self.engine.open() as engine:
-                arguments = (engine, env, self.cases, self.seed, policy, lambda _: bar.step())
-                certificate = certify(*arguments, trust=self.trust)
+                last = (self.seed, policy, lambda _: bar.step())
+                certificate = certify(engine, env, self.cases, *last, trust=self.trust)
             write_json(folder / FILE_NAME, certificate.to_json(), indent=None)
             certificate.report(command_line("robot certify", self), to_plain(self)).write(folder / REPORT_FILE)
         print_table(certificate.table(), empty="-")

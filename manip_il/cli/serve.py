@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
-from manip_il.cli import common_options as common
+from manip_il.cli.common_options import Varied, env_config
 from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say, warn
 from manip_il.option import option
 from manip_il.serve.config import ServoConfig, SessionConfig
+from manip_il.tasks.config import EnvConfig
 
 SERVO = "servo"  # among the ways in which worlds differ
 
 
-@dataclass
-class ServeOptions:
+@dataclass(frozen=True)
+class ServeOptions(Varied):
     """Run a simulated SO-101 behind serial ports that LeRobot's own programs open as a real one's.
 
     It prints both ports, the cameras, and a line to copy. With `-- COMMAND ...` it runs that program against them and
     presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded again.
+    --vary takes servo, too.
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
     first: ClassVar[str] = "task.type cameras servo log output_dir"
     command: list[str] = option(list, "a program of LeRobot's and its options, after `--`", positional=True)
-    env: Given = common.env_given(robot="so101")
-    cameras: list[str] = option(list, f"{common.CAMERAS_HELP}; by default no pictures")
-    image: Given = common.image_given()
-    vary: list[str] = option(list, "how worlds differ from episode to episode: servo, and what record takes")
+    env: Given = given(EnvConfig, robot="so101")
     session: Given = given(SessionConfig, prefix="")
-    servos: Given = given(ServoConfig)
+    servos: ServoConfig = field(default_factory=ServoConfig)
 
     def run(self) -> None:
         """Serve until the program ends, or Ctrl-C."""
@@ -38,9 +37,9 @@ class ServeOptions:
         from manip_il.evaluation.suites import varied
         from manip_il.serve.session import serve
 
-        env = common.env_config({"robot": "so101", **self.env})
-        cameras = common.camera_config(self.cameras, self.image) if self.cameras else None
+        env = env_config(self.env)
+        cameras = self.camera_config(env) if self.cameras else None
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)
-        session = SessionConfig(**self.session, servos=ServoConfig(**self.servos), varies=SERVO in self.vary)
+        session = SessionConfig(**self.session, servos=self.servos, varies=SERVO in self.vary)
         with exclusive(session.output_dir):
             serve(env, session, self.command, cameras, conditions, say, warn)

@@ -12,35 +12,34 @@ from pathlib import Path
 from typing import Any, Literal
 
 from manip_il import checks
-from manip_il.cli.common_options import EngineOptions, TrialGroup
+from manip_il.cli.common_options import Demonstrations, EngineOptions, TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.inputs import check_policies
-from manip_il.cli.learning import AirlOptions, GailOptions, GivenGroup, PpoOptions
-from manip_il.cli.options import Open
+from manip_il.cli.learning import AirlOptions, GailOptions, PpoOptions
+from manip_il.cli.options import Open, group
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
-from manip_il.cli.parsing import check_values, from_layers, from_yaml
+from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.cli.progress import Stages, say
 from manip_il.data.json_lines import read_lines
 from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
 from manip_il.evaluation.arm import Arm, Member, read_member, require_same_env
 from manip_il.evaluation.comparison import TARGET, Study
-from manip_il.evaluation.rounds import COSTS, METRICS_FILE, At, Cost, Rule, history
+from manip_il.evaluation.rounds import METRICS_FILE, At, Rule, history
 from manip_il.evaluation.runner import FOLDER, Trial
 from manip_il.evaluation.suites import varied
 from manip_il.option import option
-from manip_il.robots.table import get_robot
 from manip_il.seeding import MAX_SEED, stream_seeds
 from manip_il.tasks.config import EnvConfig
 
 ROUND_0 = "round_000"
 ALGORITHM = "algorithm"  # the key of an arm that names one of these
-LearningOptions = GailOptions | PpoOptions  # an AirlOptions is a GailOptions
-ArmOptions = DaggerOptions | LearningOptions
-ALGORITHMS: Mapping[str, type[LearningOptions]] = {"gail": GailOptions, "airl": AirlOptions, "ppo": PpoOptions}
+ALGORITHMS = {"gail": GailOptions, "airl": AirlOptions, "ppo": PpoOptions}
+ArmOptions = DaggerOptions | GailOptions | PpoOptions  # an AirlOptions is a GailOptions
 OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study itself sets
+EPISODES = 500  # of a test
 
 
-@dataclass
+@dataclass(frozen=True)
 class ExpertTest:
     """One test of the expert in every arm's task, by default on the arm's robot.
 
@@ -50,10 +49,10 @@ class ExpertTest:
     robot: str | None = None
     suite: str = "nominal"
     vary: list[str] = field(default_factory=list[str])
-    n_episodes: int = option(500, "test episodes", at_least=1)
+    n_episodes: int = option(EPISODES, "test episodes", at_least=1)
 
 
-@dataclass
+@dataclass(frozen=True)
 class StudyFile:
     """Content of a study's YAML file.
 
@@ -66,12 +65,11 @@ class StudyFile:
     arms: Open = field(default_factory=dict[str, Any])
     expert: Open = field(default_factory=dict[str, Any])
     training_seeds: int = option(3, "runs of every arm", at_least=1, at_most=MAX_SEED, grows=True)
-    eval: TrialGroup = field(default_factory=TrialGroup)
+    eval: TrialGroup = group(TrialGroup(EPISODES))
     checkpoint: Literal["best", "last"] = "best"
     at: At = "end"
     baseline: str | None = option(None, "the arm that others are compared with; by default the first")
     target: float = option(TARGET, "validation success whose cost is reported", at_least=0.0, at_most=1.0)
-    within: list[str] = option(list, "costs up to which the best validation success is reported: steps:20000")
 
 
 @dataclass(frozen=True)
@@ -79,13 +77,12 @@ class Plan:
     """A checked file: the options of every arm are valid.
 
     starts: arm -> the arm whose round 0 it begins with, itself for its own. envs: arm -> its environment, the same for
-    all where there is a baseline. experts: name -> test.
+    all where there is a baseline.
     """
 
     file: StudyFile
     arms: Mapping[str, ArmOptions]
     starts: Mapping[str, str]
-    within: tuple[tuple[Cost, float], ...]
     baseline: str | None
     envs: Mapping[str, EnvConfig]
     experts: Mapping[str, ExpertTest]
@@ -99,7 +96,6 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
     file = from_yaml(path, StudyFile)
     if training_seeds is not None:
         file = replace(file, training_seeds=training_seeds)
-    check_values(file, "")
     if not file.arms:
         raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
     arms, starts, envs = dict[str, ArmOptions](), dict[str, str](), dict[str, EnvConfig]()
@@ -109,16 +105,15 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
             options = read_arm(file.common, file.arms[name])
             if isinstance(options, DaggerOptions):
                 options = replace(options, trust=trust)
-                envs[name] = options.config().env
-                starts[name] = name
+                starts[name], envs[name] = name, options.config().env
             else:
-                starts[name] = _first_arm(options, arms)
+                starts[name] = _first_arm(options, [one for one in arms if starts[one] == one])
                 envs[name] = envs[starts[name]]
         except ManipError as error:
             raise UsageError(f"{path}: arm {name!r}: {error}") from error
         arms[name] = options
     experts = {name: from_layers(ExpertTest, [(f"{path}: expert.{name}", file.expert[name])]) for name in file.expert}
-    return Plan(file, arms, starts, tuple(map(_cost, file.within)), _baseline(file, envs), envs, experts)
+    return Plan(file, arms, starts, _baseline(file, envs), envs, experts)
 
 
 def read_arm(common: Mapping[str, Any], own: Any) -> ArmOptions:
@@ -137,14 +132,13 @@ def read_arm(common: Mapping[str, Any], own: Any) -> ArmOptions:
     return from_layers(ALGORITHMS[name], [("its options", {key: own[key] for key in own if key != ALGORITHM})])
 
 
-def _first_arm(options: LearningOptions, arms: Mapping[str, ArmOptions]) -> str:
+def _first_arm(options: GailOptions | PpoOptions, known: list[str]) -> str:
     """Return the arm that a learning one begins with, which `dataset.root` and `init` name in place of a path.
 
-    arms: those before it. Raises `UsageError` for another.
+    known: arms of `manip-il dagger` before it. Raises `UsageError` for another.
     """
     roots = options.dataset.root if isinstance(options, GailOptions) else []
     named = {str(path) for path in (*roots, options.init) if path is not None}
-    known = [name for name, other in arms.items() if isinstance(other, DaggerOptions)]
     if len(named) != 1 or not named <= {*known}:
         raise UsageError(
             f"dataset.root and init are {', '.join(sorted(named)) or 'not given'}; expected the name of one arm of "
@@ -163,14 +157,6 @@ def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
     return file.baseline or next(iter(envs))
 
 
-def _cost(text: str) -> tuple[Cost, float]:
-    cost, _, amount = text.partition(":")
-    try:
-        return next(one for one in COSTS if one == cost), float(amount)
-    except (StopIteration, ValueError):
-        raise UsageError(f"within has {text!r}; expected a cost with an amount, such as steps:20000") from None
-
-
 def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
     """Return the expert's tests in every arm's task, arm -> name of the test -> trial.
 
@@ -180,7 +166,6 @@ def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
     for name, arms_env in plan.envs.items():
         for test, one in plan.experts.items():
             env, seeds = replace(arms_env, robot=one.robot or arms_env.robot), stream_seeds("test", one.n_episodes, 0)
-            get_robot(env.robot)
             with contextlib.suppress(NoEffect):
                 if one.vary:
                     found[name][test] = Trial(env, seeds, "+".join(one.vary), varied(one.vary, env, sees=False))
@@ -198,25 +183,22 @@ def learn(plan: Plan, root: Path, engine: EngineOptions) -> None:
             say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
             options = with_start_policy(plan.arms[name], _folder(root, plan.starts[name], seed) / ROUND_0)
             settings, output = options.settings | {"seed": seed}, ResumableOutput(folder, resume=True)
-            if isinstance(options, DaggerOptions):
-                replace(options, settings=settings, output=output, engine=engine).run()
-            else:
-                replace(options, settings=settings, output=output, workers=engine.workers).run()
+            replace(options, settings=settings, output=output, engine=engine).run()
 
 
 def tested(
     plan: Plan, experts: Mapping[str, Mapping[str, Trial]], root: Path, engine_options: EngineOptions, trust: bool
 ) -> Study:
     """Return all runs, with the tests of their policies and of the expert."""
-    seeds = range(plan.file.training_seeds)
+    file, seeds = plan.file, range(plan.file.training_seeds)
     arms = [Arm(name, tuple(_member(plan, root, name, seed) for seed in seeds)) for name in plan.arms]
-    rule = Rule(plan.file.checkpoint, plan.file.at)
+    rule = Rule(file.checkpoint, file.at)
     rule = rule.limited({member.name: member.history for arm in arms for member in arm.members})
     arms = [arm.map(lambda one: one.select(rule)) for arm in arms]
     trials: dict[str, Trial] = {}
     for arm in arms:
         policies = {one.name: one.policy for one in arm.members if one.policy is not None}
-        test_seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
+        test_seeds = stream_seeds("test", file.eval.n_episodes or EPISODES, 0)
         trials[arm.name] = Trial.of(plan.envs[arm.name], test_seeds, "nominal", policies.values(), trust)
         check_policies(policies, trials[arm.name])
     with Stages(f"every finished run and episode, in {root}") as stages, engine_options.open() as engine:
@@ -231,18 +213,17 @@ def tested(
             }
             for name, tests in experts.items()
         }
-    return Study(tuple(arms), plan.baseline, rule, plan.file.target, solved, plan.within)
+    return Study(tuple(arms), plan.baseline, rule, file.target, solved)
 
 
 def with_start_policy(options: ArmOptions, start: Path) -> ArmOptions:
     """Return a learning arm's options with the demonstrations and policy of round 0, `start`, for its arm's name."""
     if isinstance(options, DaggerOptions):
         return options
-    if options.init is not None:
-        options = replace(options, init=start / "policy")
-    if isinstance(options, GailOptions):
-        options = replace(options, dataset=GivenGroup([start / "dataset"]))
-    return options
+    options = replace(options, init=options.init and start / "policy")
+    return (
+        replace(options, dataset=Demonstrations([start / "dataset"])) if isinstance(options, GailOptions) else options
+    )
 
 
 def with_start_cost(options: ArmOptions, own: Member, run: Path) -> Member:

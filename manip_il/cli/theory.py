@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli import common_options as common
-from manip_il.cli.common_options import exists
+from manip_il.cli.common_options import Workers
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output
 from manip_il.cli.progress import progress, say
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from manip_il.theory.shift import Shift
 
 
-@dataclass
+@dataclass(frozen=True)
 class TheoryOptions:
     """Compare the proven bounds of cloning and DAgger with processes solved exactly, linear systems and the arm.
 
@@ -26,15 +25,10 @@ class TheoryOptions:
     """
 
     example: ClassVar[str] = "manip-il theory runs/dagger --output_dir=runs/theory"
-    source: Path | None = option(
-        None,
-        "a run of manip-il dagger, to look at its rounds",
-        positional=True,
-        check=exists("a run of manip-il dagger"),
-    )
+    source: Path | None = option(None, "a run of manip-il dagger, to look at its rounds", positional=True, exists="")
     episodes: int = option(50, "of the expert and of every round's policy", at_least=2)
     cases: int = option(30, "wrong actions of each kind, to find what one costs the expert", at_least=1)
-    workers: int | None = common.processes_option()
+    engine: Workers = group(Workers(), prefix="")
     output: Output = group(Output(Path("runs/theory")), prefix="")
 
     def run(self) -> None:
@@ -55,7 +49,6 @@ class TheoryOptions:
         say(f"report: {folder / REPORT_FILE}")
 
     def _shift(self, run: Path) -> Shift:
-        from manip_il.collect.workers import Engine
         from manip_il.evaluation.arm import read_arm
         from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.theory.shift import find_rounds, measure_shift
@@ -63,6 +56,6 @@ class TheoryOptions:
         rounds = find_rounds(run)
         env = read_arm(run).members[0].env()
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
-        with progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
+        with progress(count, f"theory {run}") as bar, self.engine.open() as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.step())
             return measure_shift(engine, env, rounds, certificate.mu or 0, self.episodes, lambda _: bar.step())

@@ -6,21 +6,27 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from manip_il.cli.common_options import exists, require_dataset
+from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import group
-from manip_il.cli.outputs import OutputFile, check_output, prepare_output, save_options
+from manip_il.cli.outputs import OutputFile, Replacing, prepare_output, require_replaceable, save_options
 from manip_il.cli.progress import has_bars, progress, say, warn
 from manip_il.data.atomic import new_folder, write_file
-from manip_il.errors import FolderExistsError, ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
-REMOTES = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
 EXPORTABLE = ("mlp", "cnn")
 
 
-@dataclass
-class PushOptions:
+@dataclass(frozen=True, kw_only=True)
+class Transfer:
+    """Command that moves files."""
+
+    dry_run: bool = option(False, "only list what would be done")
+
+
+@dataclass(frozen=True)
+class PushOptions(Transfer):
     """Push a dataset, or a policy with its run, to the Hugging Face Hub, an object store, another machine or a folder.
 
     A dataset is checked first, as by manip-il data check, and refused if it has errors. Only changes are uploaded.
@@ -29,11 +35,12 @@ class PushOptions:
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
-    source: Path = option(
-        MISSING, "folder of a dataset, a run or a policy", positional=True, check=exists("a dataset, a run or a policy")
+    source: Path = option(MISSING, "a dataset, a run or a policy", positional=True, exists="")
+    remote: str = option(
+        MISSING,
+        "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER",
+        positional=True,
     )
-    remote: str = option(MISSING, REMOTES, positional=True)
-    dry_run: bool = option(False, "only list what would be uploaded and removed")
     journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
     private: bool = option(False, "make a new repository on the Hub private")
 
@@ -55,8 +62,8 @@ class PushOptions:
         say("nothing was done" if self.dry_run else f"next: manip-il pull {remote.name} FOLDER")
 
 
-@dataclass
-class PullOptions:
+@dataclass(frozen=True)
+class PullOptions(Transfer, Replacing):
     """Pull a dataset or a policy from the Hugging Face Hub, an object store, another machine or a folder.
 
     Every file is verified by its hash, and every file of a dataset opened once, before the folder appears. Paths that
@@ -67,8 +74,6 @@ class PullOptions:
     remote: str = option(MISSING, "what manip-il push was given, or any repo of the Hub", positional=True)
     target: Path = option(MISSING, "new folder for it", positional=True)
     revision: str | None = option(None, "branch, tag or commit of a repo on the Hub")
-    dry_run: bool = option(False, "only list what would be pulled")
-    overwrite: bool = option(False, "replace an existing dataset or run")
 
     def run(self) -> None:
         """Fetch, verify, rename; print what was pulled."""
@@ -76,14 +81,10 @@ class PullOptions:
 
         from manip_il.store.transfer import open_remote, pull
 
-        if self.overwrite:
-            check_output(self.target, overwrite=True)
+        if self.overwrite and self.target.exists():
+            require_replaceable(self.target, self.overwrite)
         remote = open_remote(self.remote, revision=self.revision, quiet=not has_bars())
-        try:
-            manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
-        except FolderExistsError:
-            remedy = "replace them with --overwrite=true, or name a new folder"
-            raise UsageError(f"{self.target} or its journals exist already; {remedy}") from None
+        manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
         if self.dry_run:
             say(*(f"pull     {path} ({filesize.decimal(file.size)})" for path, file in manifest.files.items()))
         size = filesize.decimal(sum(file.size for file in manifest.files.values()))
@@ -93,7 +94,7 @@ class PullOptions:
             say(f"next: manip-il data check {self.target}")
 
 
-@dataclass
+@dataclass(frozen=True)
 class ExportOptions:
     """Write an mlp or cnn policy as one file that runs without this package.
 
@@ -102,7 +103,7 @@ class ExportOptions:
     """
 
     example: ClassVar[str] = "manip-il export runs/dagger --output=policy.onnx"
-    policy: Path = option(MISSING, "a run, a checkpoint or its pretrained_model", positional=True, check=find_policy)
+    policy: Path = option(MISSING, "a run, a checkpoint or its pretrained_model", positional=True, exists="")
     format: Literal["onnx"] = option("onnx", "for onnxruntime and others")
     file: OutputFile = group(OutputFile(Path("policy.onnx")), prefix="")
 
@@ -131,26 +132,23 @@ class ExportOptions:
         say(f"exported: {self.file.output} ({len(exported.data):,} bytes)")
 
 
-@dataclass
-class McapExportOptions:
+@dataclass(frozen=True)
+class McapExportOptions(OfDataset, Replacing):
     """Write a LeRobot v3.0 dataset as MCAP, which Foxglove opens: one file per episode, one topic per column.
 
     With it, mapping.yaml, from which `manip-il data from-mcap` makes the same dataset again.
     """
 
     example: ClassVar[str] = "manip-il data to-mcap datasets/demos demos_mcap"
-    dataset: Path = option(MISSING, "the dataset's folder", positional=True, check=require_dataset)
     out: Path = option(MISSING, "folder for the files", positional=True)
-    overwrite: bool = option(False, "replace an existing export")
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
         from manip_il.data.dataset import Dataset
         from manip_il.mcap.export import MAPPING, export_dataset, left_out
 
-        check_output(self.out, self.dataset, overwrite=self.overwrite)
         dataset = Dataset.open(self.dataset)
-        prepare_output(self.out, overwrite=self.overwrite)
+        prepare_output(self.out, overwrite=self.overwrite, sources=[self.dataset])
         with new_folder(self.out) as folder, progress(dataset.info.episodes, "export") as bar:
             for _ in export_dataset(dataset, folder):
                 bar.step()
@@ -161,7 +159,7 @@ class McapExportOptions:
         say(f"back to a dataset: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
 
 
-@dataclass
+@dataclass(frozen=True)
 class McapImportOptions:
     """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in the order of their names.
 
@@ -170,13 +168,9 @@ class McapImportOptions:
     """
 
     example: ClassVar[str] = "manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
-    source: Path = option(
-        MISSING, "an MCAP file, or a folder of them", positional=True, check=exists("an MCAP file, or a folder of them")
-    )
-    dataset: Path = option(MISSING, "folder for the dataset", positional=True)
-    mapping: Path = option(
-        MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)", check=exists("a mapping file")
-    )
+    source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True, exists="")
+    dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
+    mapping: Path = option(MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)", exists="")
 
     def run(self) -> None:
         """Import every file; the dataset appears when it is whole."""
@@ -184,11 +178,7 @@ class McapImportOptions:
         from manip_il.mcap.mapping import load_mapping
         from manip_il.mcap.read import read_topics
 
-        if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
-            raise UsageError(f"{self.dataset} exists already; choose another folder, or delete it first")
-        mapping = load_mapping(self.mapping)
-        paths = list_files(self.source)
-        frames = 0
+        mapping, paths, frames = load_mapping(self.mapping), list_files(self.source), 0
         with progress(len(paths), "import") as bar:
             for count in import_files(paths, self.dataset, mapping):
                 bar.step()

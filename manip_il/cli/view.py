@@ -8,34 +8,33 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli import common_options as common
-from manip_il.cli.options import Given
+from manip_il.cli.common_options import OF_POLICY, PolicyGroup, Tested, Trusting, default_cameras
+from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say
 from manip_il.errors import UsageError
-from manip_il.option import option
+from manip_il.option import Seeded, option
+from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.collect.rollout import Environment
     from manip_il.evaluation.watch import RerunLog, WindowScreen
-    from manip_il.tasks.config import EnvConfig
 
 HOLD = 10  # control steps that an episode goes on for after success
 IN_A_FILE = 3  # episodes, if nobody says how many
 SIZE = {"height": 240, "width": 320}  # of pictures that no policy looks at [pixels]
 
 
-@dataclass
-class WatchedPolicyGroup:
+@dataclass(frozen=True)
+class WatchedPolicyGroup(PolicyGroup):
     """`--policy.*` of what drives."""
 
-    path: Path | None = common.policy_option()
     type: Literal["expert", "random", "sliders"] | None = option(
         None, "instead of a checkpoint; sliders: those of the window; by default expert"
     )
 
 
-@dataclass
-class ViewOptions:
+@dataclass(frozen=True)
+class ViewOptions(Tested, Seeded, Trusting):
     """Watch a robot at its task: in MuJoCo's viewer, without a display in a browser (Rerun), or from a file.
 
     Shows episodes in real time until the window is closed, Ctrl-C, or so many. Without a display it serves the pictures
@@ -46,11 +45,8 @@ class ViewOptions:
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
     first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
-    env: Given = common.env_given(of_policy=True)
-    suite: str = common.suite_option()
+    env: Given = given(EnvConfig, **OF_POLICY)
     n_episodes: int | None = option(None, f"episodes; by default without end, {IN_A_FILE} in a file", at_least=1)
-    seed: int = common.seed_option()
-    trust: bool = common.trust_option()
     output: Path | None = option(None, "write a file of Rerun's, FILE.rrd, in place of showing anything")
 
     def run(self) -> None:
@@ -62,7 +58,7 @@ class ViewOptions:
         from manip_il.evaluation.watch import outcome
         from manip_il.mdp import LONGEST_EPISODE
         from manip_il.seeding import BLOCK, stream_seeds
-        from manip_il.sim.config import FILM, Look
+        from manip_il.sim.config import FILM, CameraConfig, Look
         from manip_il.sim.window import has_display
         from manip_il.tasks.stock.table import ROBOTS as STOCK
 
@@ -72,7 +68,7 @@ class ViewOptions:
         env, driver, cameras = open_driver(self.policy.path, self.policy.type or "expert", self.env, trust=self.trust)
         in_window = in_window and env.robot not in STOCK
         if cameras is None and not in_window:  # pictures for people, with shadows if nobody waits
-            cameras = common.camera_config((), SIZE, FILM if self.output else Look(), robot=env.robot)
+            cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if self.output else Look())
         if sliders and not self.env.get("horizon"):
             env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
         conditions = suite_conditions(self.suite, env, sees=cameras is not None)

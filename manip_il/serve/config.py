@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from manip_il.option import check_bounds, option
+from manip_il.option import Seeded, check_bounds, option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +59,7 @@ class ServoConfig:
 
 
 @dataclass(frozen=True)
-class SessionConfig:
+class SessionConfig(Seeded):
     """A session: how the follower's servos move, when a new world is drawn, and what is kept."""
 
     output_dir: Path = option(Path("runs/serve"), "folder of the links follower and leader, and of their calibrations")
@@ -72,6 +72,5 @@ class SessionConfig:
         0.15, "with LeRobot's DAgger: correct a policy whose targets differ by more from the expert's [rad]", at_least=0
     )
     log: Path | None = option(None, "folder for journals of what the client cannot see: states and labels")
-    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
     servos: ServoConfig = field(default_factory=ServoConfig)
     varies: bool = False  # whether each world's servos are drawn anew

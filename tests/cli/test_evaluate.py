@@ -65,7 +65,7 @@ def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tm
         assert fingerprint["cameras_sha256"][:12] in line
     (seeing / META_FILE).unlink()
     assert evaluate(seeing, tmp_path / "e", "--robot.type=panda", "--task.type=reach", "--overwrite=true") == 0
-    assert "how its pictures were lit" in capsys.readouterr().err
+    assert "does not say which robot and task it is for" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("no_opengl")

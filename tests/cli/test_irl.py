@@ -22,7 +22,7 @@ def test_the_methods_of_the_command_are_those_there_are():
 @pytest.mark.parametrize(
     ("line", "says", "code"),
     [
-        ("reward irl nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        ("reward irl nowhere", "nowhere does not exist; expected a LeRobot v3.0 dataset", 2),
         (f"reward irl {SAMPLE} --method=max_entrpy", "did you mean 'max_entropy'?", 2),
         (f"reward irl {SAMPLE} --seed=-1", "seed is -1", 2),
         (f"reward irl {SAMPLE}", "expected a dataset of manip-il record --task.type=carry", 1),

@@ -57,12 +57,3 @@ def test_an_export_is_replaced_only_when_told_to_and_never_its_own_dataset(datas
     for out in (dataset, dataset / ".." / dataset.name, dataset.parent):
         assert main(["data", "to-mcap", str(dataset), str(out), "--overwrite=true"]) == 2
         assert "overlaps" in error()
-
-
-def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path, error):
-    mapping = tmp_path / "m.yaml"
-    mapping.write_text("fps: 10\ntask: t\nfeatures: {a: {topic: /a, video: true, resample: previous, tolerance: 1}}\n")
-    (tmp_path / "a.mcap").touch()
-    words = ["data", "from-mcap", str(tmp_path / "a.mcap"), str(dataset), f"--mapping={mapping}"]
-    assert main(words) == 2
-    assert error().endswith("exists already; choose another folder, or delete it first")

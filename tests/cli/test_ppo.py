@@ -38,8 +38,8 @@ def cloned(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("", "--init is missing; expected a path"),
-        ("--init=nowhere --reward=nowhere", "no policy in nowhere"),
+        ("", "--reward is missing; expected a path"),
+        ("--reward=nowhere", "nowhere does not exist; expected the reward"),
     ],
 )
 def test_bad_input_is_one_line(words, says, here, error):
@@ -52,7 +52,7 @@ def test_a_reward_that_is_not_the_policys_is_refused(here, cloned, error):
     assert main(["rl", "ppo", f"--init={cloned}", "--quiet"]) == 2
     assert "--reward is missing; expected a path" in error()
     assert main(["rl", "ppo", f"--init={cloned}", "--reward=nowhere", "--quiet"]) == 2
-    assert "nowhere does not exist; expected a reward of manip-il reward fit" in error()
+    assert "nowhere does not exist; expected the reward: a folder of manip-il reward fit" in error()
     assert main(["rl", "ppo", f"--init={cloned}", f"--reward={cloned}", "--quiet"]) == 1
     assert "is of type 'mlp'; expected a reward" in error()
     reward(here / "lift", replace(ENV, task="lift", horizon=0))

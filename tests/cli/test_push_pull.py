@@ -61,7 +61,7 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
     target = tmp_path / "got"
     target.mkdir()
     (target / "thesis.txt").write_text("mine")
-    for asked, says in (("false", "replace them with --overwrite=true"), ("true", "manip-il did not make")):
+    for asked, says in (("false", "--overwrite=true replaces it"), ("true", "manip-il did not make")):
         assert main(["pull", url, str(target), f"--overwrite={asked}"]) == 2
         assert says in capsys.readouterr().err
     assert (target / "thesis.txt").read_text() == "mine"

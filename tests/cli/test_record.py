@@ -70,7 +70,7 @@ def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, error):
     assert main(words) == 0
     before = files(tmp_path / "x")
     assert main(words) == 2
-    assert "replace it with --overwrite=true" in error()
+    assert "--overwrite=true replaces it" in error()
     assert main([*words, "--overwrite=true", "--repo_id=you/demos"]) == 0
     assert {name for name, data in files(tmp_path / "x").items() if data != before[name]} == {"meta/manip_il.json"}
     mine = tmp_path / "mine" / "thesis.tex"
@@ -118,7 +118,7 @@ def test_the_command_makes_a_dataset_with_the_asked_pictures(demos, capsys):
     assert main(["data", "render", "demos", "seen", "--workers=1", "--image.height=48", "--image.width=64"]) == 0
     said = capsys.readouterr()
     assert "rendered 3 episodes, 18 frames\ndataset: seen\n" in said.out
-    assert "render demos: 3/3" in said.err
+    assert "seen: 3/3" in said.err
     assert Dataset.open(Path("seen")).spec == env_spec(ENV, CameraConfig(("front", "side", "wrist"), 48, 64))
     np.testing.assert_array_equal(
         Dataset.open(Path("seen")).columns()["sim_state"], Dataset.open(demos).columns()["sim_state"]

@@ -140,7 +140,7 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
             "metod: cloning",
             "x.yaml: arm 'cloning': unknown key in its options: 'metod'",
         ),
-        ("rounds: 2", "rounds: -1", "x.yaml: arm 'cloning': rounds is -1"),
+        ("rounds: 2", "rounds: -1", "x.yaml: arm 'cloning': common: rounds is -1"),
         ("rounds: 2", "seed: 2", "x.yaml: arm 'cloning': seed is set by the study itself"),
         ("dagger:\n", "dagger: 3\n", "arm 'dagger': its options: expected a mapping"),
         ("  dagger:", "  ../dagger:", "its name, which becomes a folder, is '../dagger'"),

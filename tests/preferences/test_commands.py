@@ -69,8 +69,8 @@ def test_true_progress_scores_without_a_reward(here, capsys):
         ("reward answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
         ("reward fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
         ("reward fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),
-        ("data score good --reward=nowhere", "nowhere does not exist; expected a reward", 2),
-        ("data score nowhere --reward=progress", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        ("data score good --reward=nowhere", "no policy in nowhere", 2),
+        ("data score nowhere --reward=progress", "nowhere does not exist; expected a LeRobot v3.0 dataset", 2),
         (
             "train --dataset.root=good --weights=nowhere.parquet",
             "nowhere.parquet does not exist; expected rabc.parquet",

@@ -86,9 +86,9 @@ def test_a_task_of_which_there_is_one_takes_nothing_behind_a_colon():
 
 def test_the_old_option_names_the_new_one_and_old_files_may_hold_it_empty(tmp_path: Path):
     (tmp_path / "old.yaml").write_text("task: {type: lift, reward: ''}")
-    assert from_yaml(tmp_path / "old.yaml", EvalOptions).env == {"task": "lift"}
+    assert from_yaml(tmp_path / "old.yaml", EvalOptions).env["task"] == "lift"
     (tmp_path / "old.yaml").write_text("task: {type: carry, reward: low}")
-    with pytest.raises(UsageError, match=r"reward has a new name: --task.type=carry:low"):
+    with pytest.raises(UsageError, match=r"reward is now --task.type=carry:REWARD"):
         from_yaml(tmp_path / "old.yaml", EvalOptions)
-    with pytest.raises(UsageError, match=r"--task.reward has a new name: --task.type=carry:low"):
+    with pytest.raises(UsageError, match=r"--task.reward is now --task.type=carry:REWARD"):
         parse(EvalOptions, ["--task.reward=low"])
