@@ -30,8 +30,7 @@ from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
 from manip_il.tasks.own import source_hash
-from manip_il.tasks.stock.environment import check_cameras, described_stock, make_stock, stock_actions
-from manip_il.tasks.stock.expert import stock_expert
+from manip_il.tasks.stock.envs import check_cameras, described_stock, make_stock, make_stock_expert
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 from manip_il.tasks.stock.table import get_stock
 from manip_il.tasks.table import TASKS, get_task, is_task
@@ -49,14 +48,14 @@ def make_env(
 ) -> Environment:
     """Make an environment. Raises `UsageError` for cameras or conditions that it does not have."""
     if config.robot in STOCK:
-        return make_stock(config, cameras, conditions)
+        return make_stock(config.robot, config.task, cameras, conditions)
     return env_of(config, cameras, conditions)
 
 
 @lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
     """Make the expert of an environment, or return the one that was made."""
-    return stock_expert(config.robot, config.task) if config.robot in STOCK else Expert(config_scene(config))
+    return make_stock_expert(config.robot, config.task) if config.robot in STOCK else Expert(config_scene(config))
 
 
 @cache
@@ -71,7 +70,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
             fps=config.control_hz,
             joint_names=robot.joint_names,
             environment_state_names=stock.observed,
-            sim_state_size=described_stock(config.robot, config.task).state_size,
+            sim_state_size=len(described_stock(config.robot, config.task).get_state().to_vector()),
             instruction=stock.instruction,
             action_meaning=robot.action_meaning,
             phases=stock.phases,
@@ -100,7 +99,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
 
 def env_actions(config: EnvConfig) -> ActionSpace:
     """Return names, bounds and scale of an environment's actions, (n,)."""
-    return stock_actions(config.robot) if config.robot in STOCK else config_scene(config).actions
+    return (described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)).actions
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:

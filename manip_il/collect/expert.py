@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from manip_il.errors import ManipError
 from manip_il.mdp import Label, State
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.rotations import angle_between, rotation_matrix
+from manip_il.robots.rotations import turned_towards
 from manip_il.sim.task import Refusing, Target, objects_in
 from manip_il.sim.world import Scene, World
 
@@ -75,7 +75,7 @@ class Expert:
     def _towards(self, q: F64, opening: float, target: Target, phase: int) -> Label:
         ee, ee_rotation = self._ik.ee_pose(q)
         position = ee + _clip_norm(target.position - ee, target.max_step)
-        rotation = _turn_towards(ee_rotation, target.rotation, target.max_turn)
+        rotation = turned_towards(ee_rotation, target.rotation, target.max_turn)
         step = self._step(q, position, rotation, target)
         if step is None:
             return self._hold(q, opening, "inverse kinematics has no solution")
@@ -106,17 +106,3 @@ class Expert:
 def _clip_norm(vector: F64, longest: float) -> F64:
     norm = math.hypot(*vector.tolist())
     return vector if norm <= longest else vector * (longest / norm)
-
-
-def _turn_towards(rotation: F64, target: F64, largest: float) -> F64:
-    """The rotation at most `largest` [rad] from `rotation` on the shortest way to `target`."""
-    if angle_between(rotation, target) <= largest:
-        return target
-    (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation.T.dot(target).tolist()
-    axis = zy - yz, xz - zx, yx - xy
-    length = math.hypot(*axis)
-    if length < 1e-6:  # half a turn: every axis is as near
-        axis, length = (0.0, 0.0, 1.0), 1.0
-    x, y, z = axis
-    turn = largest / length
-    return rotation.dot(rotation_matrix(np.array([turn * x, turn * y, turn * z])))

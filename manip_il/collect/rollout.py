@@ -18,8 +18,7 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State, Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import World
-from manip_il.tasks.stock.base import StockEnvironment
-from manip_il.tasks.stock.expert import StockLabeller
+from manip_il.tasks.stock.envs import StockEnvironment, StockLabeller
 
 F64 = NDArray[np.float64]
 Environment = ManipEnv | StockEnvironment

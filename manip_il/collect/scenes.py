@@ -25,6 +25,7 @@ from manip_il.sim.task import TakesArgument
 from manip_il.sim.variation import completed, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.stock.aloha.environment import AlohaEnv
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time
@@ -115,8 +116,9 @@ class SceneDrawer:
 
     def redrawn(self, visited: State, rng: np.random.Generator) -> State | None:
         """Return a scene with other goals and other places of what is untouched; None for one that cannot be."""
-        if not isinstance(self._env, ManipEnv):
+        if isinstance(self._env, AlohaEnv):
             return self._env.redrawn(visited, rng)
+        assert isinstance(self._env, ManipEnv)  # no other has cameras
         world, task = self._env.world, self._env.scene.task
         world.restore(visited.physics, visited.variation)
         free, markers = self._untouched(world), _markers(world.model)

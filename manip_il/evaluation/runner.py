@@ -30,7 +30,7 @@ from manip_il.sim.task import objects_in
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene
-from manip_il.tasks.stock.environment import described_stock
+from manip_il.tasks.stock.envs import described_stock
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 _LOG = logging.getLogger(__name__)

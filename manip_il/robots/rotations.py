@@ -72,3 +72,17 @@ def angle_from_down(rotation: F64, yaw: float) -> float:
 def angle_between(a: F64, b: F64) -> float:
     """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
     return math.acos(min(1.0, max(-1.0, (float(a.ravel().dot(b.ravel())) - 1) / 2)))
+
+
+def turned_towards(rotation: F64, target: F64, largest: float) -> F64:
+    """Return the rotation (3, 3) at most `largest` [rad] from `rotation` on the shortest way to `target`."""
+    if angle_between(rotation, target) <= largest:
+        return target
+    (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation.T.dot(target).tolist()
+    axis = zy - yz, xz - zx, yx - xy
+    length = math.hypot(*axis)
+    if length < 1e-6:  # half a turn: every axis is as near
+        axis, length = (0.0, 0.0, 1.0), 1.0
+    x, y, z = axis
+    turn = largest / length
+    return rotation.dot(rotation_matrix(np.array([turn * x, turn * y, turn * z])))

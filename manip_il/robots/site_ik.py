@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import daqp
 import mink
@@ -19,29 +17,24 @@ _DAMPING = 1e-5
 _UNBOUNDED = 1e30  # DAQP's infinity
 
 
-@dataclass(frozen=True)
-class Costs:
-    """Costs of a hand's pose and of the way to a home posture: position [1/m], orientation and posture [1/rad].
-
-    extra: of the posture where the arm is at `q` (n,) beside `posture`, (n,); for postures in which it is singular.
-    """
-
-    position: float
-    orientation: float
-    posture: float
-    extra: Callable[[F64], F64]
-
-
 class SiteIK:
-    """Stateless: every step starts from the measured `q` (n,) and a fixed home posture.
+    """Stateless: every step starts from the measured `q` (n,) and a fixed home posture (n,).
 
-    model: of the arm alone, with one degree of freedom a joint.
+    model: of the arm alone, with one degree of freedom a joint. costs: of the hand's position [1/m] and rotation
+    [1/rad]. posture: cost of every joint off the home posture where the arm is at `q`, (n,) [1/rad].
     """
 
-    def __init__(self, model: mujoco.MjModel, site: str, home: F64, costs: Costs):
-        self._model, self._home, self._costs = model, home, costs
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        site: str,
+        home: F64,
+        costs: tuple[float, float],
+        posture: Callable[[F64], F64],
+    ):
+        self._model, self._home, self._posture = model, home, posture
         self._configuration = mink.Configuration(model)
-        self._frame = mink.FrameTask(site, "site", costs.position, costs.orientation, lm_damping=_LM_DAMPING)
+        self._frame = mink.FrameTask(site, "site", *costs, lm_damping=_LM_DAMPING)
         self._frame.set_target(mink.SE3.identity())
         limit = mink.ConfigurationLimit(model)
         bounded = limit.indices.astype(int)
@@ -65,19 +58,10 @@ class SiteIK:
         target.wxyz_xyz[4:] = position
         # mink's quadratic program of a pose and a posture; DAQP itself, as through qpsolvers it takes thrice as long.
         jacobian, error, damping = self._frame.compute_qp_residual(self._configuration)
-        posture = self._costs.posture**2 + self._costs.extra(q) ** 2
+        posture = self._posture(q) ** 2
         hessian = jacobian.T.dot(jacobian)
         hessian.flat[:: self._model.nv + 1] += _DAMPING + damping + posture
         gradient = -error.dot(jacobian) - posture * (self._home - q)
         upper = (self._ends + self._sign * q[self._bounded]) * self._gain
         x, _, exit_flag, _ = daqp.solve(hessian, gradient, self._rows, upper, self._lower, self._sense)
         return x if exit_flag > 0 else None
-
-
-def turned_towards(start: F64, end: F64, most: float) -> F64:
-    """Return the rotation (3, 3) on the way from one to another, at most so far along it [rad]."""
-    angle = math.acos(min(1.0, max(-1.0, (float((start * end).sum()) - 1) / 2)))
-    if angle <= most:
-        return end
-    way = mink.SO3.from_matrix(start.T @ end).log()
-    return start @ mink.SO3.exp(way * (most / angle)).as_matrix()

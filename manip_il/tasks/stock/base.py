@@ -2,78 +2,36 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Any, ClassVar, NoReturn
+from typing import ClassVar, NoReturn
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import ManipError
-from manip_il.mdp import Observation, State
+from manip_il.mdp import State
 
 F64 = NDArray[np.float64]
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class StockEnvironment(ABC):
-    """An environment of another package whose state is saved and restored bit for bit."""
+class StockBase:
+    """An environment of another package, whose reset and step are its own."""
 
     world: ClassVar[None] = None  # its expert restores states
-    task_description: str
     model: mujoco.MjModel
     data: mujoco.MjData
-    reward: float
 
     def __reduce__(self) -> NoReturn:
         raise ManipError("a stock environment cannot be copied or pickled; use get_state()")
 
-    @abstractmethod
-    def start(self, seed: int) -> None:
-        """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
-
-    def begin_step(self) -> None:  # noqa: B027
+    def begin_step(self) -> None:
         """Leave the world as it is: nothing disturbs it."""
-
-    @abstractmethod
-    def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (n,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
-
-    @abstractmethod
-    def observe(self) -> Observation:
-        """Return what a learner sees."""
-
-    @abstractmethod
-    def get_state(self) -> State:
-        """Return everything that the future depends on; `set_state` restores it bit for bit."""
-
-    @abstractmethod
-    def set_state(self, state: State) -> None:
-        """Restore a state of the same task. Raises `MismatchError` for another one's."""
-
-    def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
-        """Return a state with other places of what nothing has touched yet; None for one that cannot be."""
-        return state
-
-    @property
-    @abstractmethod
-    def progress(self) -> float:
-        """Share of the task that is done, 0 to 1."""
-
-    @property
-    @abstractmethod
-    def positions(self) -> dict[str, F64]:
-        """Positions (3,) [m] of `hand`, objects and `goal`."""
 
     @property
     def solved(self) -> bool:
         """State of the task after the last step."""
         return self._streak > 0
-
-    @property
-    def state_size(self) -> int:
-        """Length of `State.to_vector`."""
-        return len(self.get_state().to_vector())
 
     @property
     def model_bytes(self) -> bytes:

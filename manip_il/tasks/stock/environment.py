@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
-from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -15,14 +13,11 @@ from numpy.typing import NDArray
 
 # First: it chooses the OpenGL that mujoco takes on import.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import MismatchError
 from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
-from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CAMERAS, CameraConfig, require_cameras
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.base import WHOLE, StockEnvironment
-from manip_il.tasks.stock.table import ALOHA, ROBOTS, STATE_NAMES, TOLERANCE, StockTask, get_stock
+from manip_il.tasks.stock.base import WHOLE, StockBase
+from manip_il.tasks.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
 
 F64 = NDArray[np.float64]
 
@@ -39,8 +34,10 @@ _ONES = np.ones(len(STATE_NAMES))
 ACTIONS = StockActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False]))
 
 
-class StockEnv(StockEnvironment):
+class StockEnv(StockBase):
     """An environment of gymnasium-robotics. task: its name."""
+
+    actions = ACTIONS
 
     def __init__(self, task: str):
         found = get_stock(task)
@@ -144,46 +141,6 @@ class StockEnv(StockEnvironment):
         mujoco.mj_step(self.model, self.data, nstep=self._env.n_substeps - 1)
         self._remember()
         mujoco.mj_step(self.model, self.data, nstep=1)
-
-
-def make_stock(
-    config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
-) -> StockEnvironment:
-    """Make an environment. Raises `UsageError` for cameras that it has not, or conditions that change it."""
-    check_cameras(config.robot, cameras)
-    if changed := [one.name for one in conditions if one.ranges]:
-        raise UsageError(
-            f"{config.robot} is unmodified and takes no {', '.join(changed)}; use --suite=nominal, for manip-il dagger "
-            "--disturbed_share=0"
-        )
-    if config.robot == ALOHA:
-        from manip_il.tasks.stock.aloha.environment import AlohaEnv  # here, as its package need not be installed
-
-        return AlohaEnv(config.task, cameras)
-    return StockEnv(config.task)
-
-
-def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
-    """Raise `UsageError` for cameras that a robot, stock or not, has not."""
-    known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
-    if cameras is not None and not known:
-        raise UsageError(f"{robot} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
-    require_cameras(cameras, known)
-
-
-@cache
-def described_stock(robot: str, task: str) -> StockEnvironment:
-    """Return an environment for descriptions, which no episode runs in."""
-    return make_stock(EnvConfig(robot=robot, task=task))
-
-
-def stock_actions(robot: str) -> ActionSpace:
-    """Return names, bounds and scale of a stock robot's actions, (n,)."""
-    if robot == ALOHA:
-        from manip_il.tasks.stock.aloha.environment import aloha_actions
-
-        return aloha_actions()
-    return ACTIONS
 
 
 def _make(task: StockTask) -> Any:

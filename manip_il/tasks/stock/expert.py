@@ -9,14 +9,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.mdp import Label, State
 from manip_il.tasks.stock.environment import StockEnv
-from manip_il.tasks.stock.table import ALOHA, PHASES
+from manip_il.tasks.stock.table import PHASES
 
 F64 = NDArray[np.float64]
 
@@ -243,14 +243,6 @@ LADDERS: dict[str, tuple[Rung, ...]] = {
 }
 
 
-class StockLabeller(Protocol):
-    """Labels any state of one stock task. The same state gives bit-equal labels in any order and process."""
-
-    def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's action in `state`, (n,). Raises `MismatchError` for another task's."""
-        ...
-
-
 class StockExpert:
     """Labels any state of one stock task. The same state gives bit-equal labels in any order and process."""
 
@@ -265,12 +257,3 @@ class StockExpert:
         rung = next(rung for rung in self._ladder if rung.holds(scene))
         way, fingers = rung.command(scene)
         return Label(np.append(np.clip(way / REACH, -1, 1), fingers), PHASES.index(rung.name), True, 0.0)
-
-
-def stock_expert(robot: str, task: str) -> StockLabeller:
-    """Return the expert of a stock task."""
-    if robot == ALOHA:
-        from manip_il.tasks.stock.aloha.expert import AlohaExpert  # here, as its package need not be installed
-
-        return AlohaExpert(task)
-    return StockExpert(task)

@@ -19,14 +19,14 @@ from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.gl import remedy
 from manip_il.tasks.stock.aloha.scene import Parts, Scene
-from manip_il.tasks.stock.base import WHOLE, StockEnvironment
-from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, ALOHA_TASKS, AlohaTask, get_stock
+from manip_il.tasks.stock.base import WHOLE, StockBase
+from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
 
 F64 = NDArray[np.float64]
 INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
 MOST_REWARD = 4
 GRIPPERS = np.array([6, 13])
-DRAWN = 0.1  # what `random_near` turns a joint by, at most [rad]
+LONGEST = 0.04  # step of a joint, as the expert makes them [rad]
 _DEEP = 1e-3  # what is redrawn may overlap with something by so much [m]
 _BLANK = np.zeros((1, 1, 3), np.uint8)
 
@@ -36,12 +36,12 @@ class AlohaActions(ActionSpace):
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
         """Draw joint targets near the measured joints in `state` (14,), the grippers anywhere."""
-        action = np.asarray(state, np.float64) + rng.uniform(-DRAWN, DRAWN, len(self))
+        action = np.asarray(state, np.float64) + rng.uniform(-LONGEST, LONGEST, len(self))
         action[GRIPPERS] = rng.uniform(0.0, 1.0, len(GRIPPERS))
         return action
 
 
-class AlohaEnv(StockEnvironment):
+class AlohaEnv(StockBase):
     """An environment of `gym_aloha`. task: its name. cameras: what is pictured in every step.
 
     Raises `ManipError` where the package is not installed.
@@ -155,12 +155,6 @@ def _gym_aloha() -> Any:
         raise ManipError(f"{ALOHA} needs {error.name}, which is not installed: {INSTALL}") from error
 
 
-@cache
-def aloha_actions() -> ActionSpace:
-    """Return names, bounds and scale of the actions, (14,)."""
-    return AlohaEnv(next(iter(ALOHA_TASKS))).actions
-
-
 def _actions(model: mujoco.MjModel) -> ActionSpace:
     """The actuators' own bounds: MuJoCo keeps to them, and the environment's -1 to 1 is not meant."""
     chosen = [*range(7), *range(8, 15)]  # the right finger of a hand does as the left one
@@ -168,4 +162,4 @@ def _actions(model: mujoco.MjModel) -> ActionSpace:
     low[GRIPPERS], high[GRIPPERS] = 0.0, 1.0
     is_joint = np.ones(len(chosen), bool)
     is_joint[GRIPPERS] = False
-    return AlohaActions(ALOHA_NAMES, low, high, np.where(is_joint, DRAWN, 1.0), is_joint)
+    return AlohaActions(ALOHA_NAMES, low, high, np.where(is_joint, LONGEST, 1.0), is_joint)

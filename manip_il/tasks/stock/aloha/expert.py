@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.mdp import Label, State
-from manip_il.robots.site_ik import Costs, SiteIK, turned_towards
+from manip_il.robots.rotations import turned_towards
+from manip_il.robots.site_ik import SiteIK
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
 from manip_il.tasks.stock.aloha.ladder import Target
 from manip_il.tasks.stock.aloha.scene import Hand, Scene
@@ -81,8 +82,8 @@ class _Arm:
         self._joints = joints = np.arange(8 * number, 8 * number + 6)
         self.foot = model.body(f"vx300s_{side}").pos[:2].tolist()
         constants = import_module("gym_aloha.constants")
-        costs = Costs(POSITION, ORIENTATION, POSTURE, _pull_on_roll)
-        self._ik = SiteIK(_alone(side), f"cali_{side}_site1", np.array(constants.START_ARM_POSE[:6]), costs)
+        home = np.array(constants.START_ARM_POSE[:6])
+        self._ik = SiteIK(_alone(side), f"cali_{side}_site1", home, (POSITION, ORIENTATION), _posture_costs)
         self._gain = model.actuator_gainprm[joints, 0]
         self._breakaway = model.dof_frictionloss[joints] / self._gain  # lead at which a joint overcomes friction [rad]
         # Below it MuJoCo's friction, an impedance of 0.9 within 0.02 s, lets through what makes a joint creep.
@@ -108,10 +109,11 @@ class _Arm:
         return np.sign(step) * np.where(size <= crept, size / self._creep, most + (size - crept) / BREAKAWAY)
 
 
-def _pull_on_roll(q: F64) -> F64:
-    """Costs that keep the forearm from winding around where the wrist is straight, (6,) [1/rad]."""
-    costs = np.zeros(len(q))
-    costs[FOREARM_ROLL] = ROLL * math.exp(-((q[WRIST] / STRAIGHT[int(q[WRIST] <= 0)]) ** 2))
+def _posture_costs(q: F64) -> F64:
+    """Costs of the posture, (6,) [1/rad]: they keep the forearm from winding around where the wrist is straight."""
+    costs = np.full(len(q), POSTURE)
+    straight = math.exp(-((q[WRIST] / STRAIGHT[int(q[WRIST] <= 0)]) ** 2))
+    costs[FOREARM_ROLL] = math.hypot(POSTURE, ROLL * straight)
     return costs
 
 

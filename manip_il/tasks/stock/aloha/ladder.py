@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.robots.rotations import angle_between
-from manip_il.robots.site_ik import turned_towards
+from manip_il.robots.rotations import angle_between, turned_towards
 from manip_il.tasks.stock.aloha.scene import GRASP_AHEAD, Scene
 
 F64 = NDArray[np.float64]

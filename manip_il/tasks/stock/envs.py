@@ -1,0 +1,50 @@
+"""Stock environments and their experts by the names of robot and task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+from manip_il.errors import UsageError
+from manip_il.sim.conditions import Condition
+from manip_il.sim.config import CAMERAS, CameraConfig, require_cameras
+from manip_il.tasks.stock.aloha.environment import AlohaEnv
+from manip_il.tasks.stock.aloha.expert import AlohaExpert
+from manip_il.tasks.stock.environment import StockEnv
+from manip_il.tasks.stock.expert import StockExpert
+from manip_il.tasks.stock.table import ALOHA, ROBOTS
+
+StockEnvironment = StockEnv | AlohaEnv
+StockLabeller = StockExpert | AlohaExpert
+
+
+def make_stock(
+    robot: str, task: str, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
+) -> StockEnvironment:
+    """Make an environment. Raises `UsageError` for cameras that it has not, or conditions that change it."""
+    check_cameras(robot, cameras)
+    if changed := [one.name for one in conditions if one.ranges]:
+        raise UsageError(
+            f"{robot} is unmodified and takes no {', '.join(changed)}; use --suite=nominal, for manip-il dagger "
+            "--disturbed_share=0"
+        )
+    return AlohaEnv(task, cameras) if robot == ALOHA else StockEnv(task)
+
+
+def make_stock_expert(robot: str, task: str) -> StockLabeller:
+    """Make the expert of a stock task."""
+    return AlohaExpert(task) if robot == ALOHA else StockExpert(task)
+
+
+def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
+    """Raise `UsageError` for cameras that a robot, stock or not, has not."""
+    known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
+    if cameras is not None and not known:
+        raise UsageError(f"{robot} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
+    require_cameras(cameras, known)
+
+
+@cache
+def described_stock(robot: str, task: str) -> StockEnvironment:
+    """Return an environment for descriptions, which no episode runs in."""
+    return make_stock(robot, task)
