@@ -17,7 +17,20 @@ choose_backend()
 register_envs()
 
 __version__ = "0.1.0"
-_HOMES = {"Expert": "collect.expert", "make_env": "tasks.envs", "record": "collect.record"}
+_HOMES = {  # of the public names
+    "CameraConfig": "sim.config",
+    "Checkpoint": "learn.checkpoint",
+    "Dataset": "data.dataset",
+    "Expert": "collect.expert",
+    "FitConfig": "learn.fit_config",
+    "LearnedPolicy": "learn.policy",
+    "dagger": "api",
+    "evaluate": "api",
+    "make_config": "tasks.config",
+    "make_env": "tasks.envs",
+    "record": "api",
+    "train": "api",
+}
 
 
 def __getattr__(name: str) -> Any:

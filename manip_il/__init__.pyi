@@ -1,6 +1,25 @@
+from manip_il.api import dagger, evaluate, record, train
 from manip_il.collect.expert import Expert
-from manip_il.collect.record import record
+from manip_il.data.dataset import Dataset
+from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.sim.config import CameraConfig
+from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env
 
-__all__ = ["Expert", "make_env", "record"]
+__all__ = [
+    "CameraConfig",
+    "Checkpoint",
+    "Dataset",
+    "Expert",
+    "FitConfig",
+    "LearnedPolicy",
+    "dagger",
+    "evaluate",
+    "make_config",
+    "make_env",
+    "record",
+    "train",
+]
 __version__: str

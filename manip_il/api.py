@@ -1,0 +1,146 @@
+"""The commands as functions, for notebooks and scripts: record, train, dagger, evaluate.
+
+Their options are the fields of the classes that the commands use too, by name; those that are left out have the same
+defaults. Episodes run in `workers` processes: 1 is this one alone, None is one a core.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from manip_il.algorithms.config import BetaSchedule, RunConfig, check_labels
+from manip_il.algorithms.results import Result
+from manip_il.algorithms.run import Run
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.query import parse_query
+from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
+from manip_il.collect.record import record as write_episodes
+from manip_il.collect.workers import Engine
+from manip_il.data.build import Recording
+from manip_il.data.dataset import Dataset
+from manip_il.errors import UsageError
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.runner import HOLD, episode_hold
+from manip_il.evaluation.runner import evaluate as run_episodes
+from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.sources import Sources
+from manip_il.seeding import stream_base, stream_seeds
+from manip_il.tasks.config import EnvConfig, make_config
+
+Policy = Checkpoint | Path
+
+
+def record(
+    root: Path,
+    env: EnvConfig,
+    episodes: int = 50,
+    *,
+    policy: Policy | None = None,
+    beta: float = 0.0,
+    query: str = "every",
+    seed: int = 0,
+    workers: int | None = 1,
+    **options: Any,
+) -> Dataset:
+    """Record a dataset: successful demonstrations of the expert, or all rollouts of a policy, labelled by the expert.
+
+    beta: the expert's share of a policy's steps. query: when the expert is asked, as the command `dagger` takes it.
+    options: the other fields of `RolloutJob`, such as `label` and `cameras`; a policy's `round` is 1 unless given.
+    Each frame holds the executed action and the expert's label. Raises `UsageError` for a folder that is there.
+    """
+    driver = PolicyDriver((_folder(policy),), beta) if policy is not None else RolloutJob.driver
+    chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)} | options
+    job, journals, name = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals"), "local/recorded"
+    for folder in (root, journals):
+        if folder.exists():
+            raise UsageError(f"{folder} exists already; give a folder that is not there yet")
+    with Engine(workers) as engine:
+        if policy is None:
+            seeds = stream_seeds("demonstrations", MAX_TRIES * episodes, seed)
+            made = collect_successes(engine, job, seeds, episodes, journals)
+            recording = Recording(name, True, episodes, provenance(job))
+        else:
+            made = collect(engine, job, stream_seeds(f"round/{job.round}", episodes, seed), journals)
+            recording = Recording(name, provenance=provenance(job), only_labelled=not job.labels_all)
+        write_episodes(made, journals, root, job, recording)
+    return Dataset.open(root)
+
+
+def train(
+    datasets: Dataset | Sequence[Dataset],
+    output_dir: Path,
+    *,
+    seed: int = 0,
+    on_log: Callable[[dict[str, Any]], None] | None = None,
+    **options: Any,
+) -> Checkpoint:
+    """Fit a policy to the labels of datasets; return its checkpoint.
+
+    options: fields of `FitConfig`, such as `policy={"type": "mlp", "width": 128}`, `steps` and `batch_size`. on_log:
+    called after every step with its metrics, {} at a step without. Raises what `Trainer` raises.
+    """
+    from manip_il.learn.train import Trainer  # LeRobot's trainer takes seconds to import
+
+    opened = (datasets,) if isinstance(datasets, Dataset) else tuple(datasets)
+    config = FitConfig(seed=stream_base("training", seed), **options)
+    return Checkpoint.open(Trainer(Sources(opened), config, output_dir).fit(on_log))
+
+
+def dagger(
+    output_dir: Path,
+    env: EnvConfig,
+    *,
+    beta: str | None = None,
+    query: str | None = None,
+    fit: FitConfig | None = None,
+    workers: int | None = 1,
+    **options: Any,
+) -> list[Result]:
+    """Run DAgger, or another `method`, in a folder; return every round's result, round 0 (cloning) first.
+
+    beta, query: as the command takes them, `"linear:5"` and `"probability:0.1"`. options: the other fields of
+    `RunConfig`. A folder with finished rounds is continued. Raises `UsageError` for options that do not fit together.
+    """
+    options |= {} if beta is None else {"beta": BetaSchedule.parse(beta)}
+    options |= {} if query is None else {"query_rule": parse_query(query)}
+    config = RunConfig(env=env, fit=fit or FitConfig(), **options)
+    check_labels(config)
+    with Engine(workers) as engine:
+        return list(Run(config, output_dir, engine).results())
+
+
+def evaluate(
+    policy: Policy | None = None,
+    env: EnvConfig | None = None,
+    episodes: int = 100,
+    *,
+    stream: Literal["test", "validation"] = "test",
+    seed: int = 0,
+    workers: int | None = 1,
+    **options: Any,
+) -> EvalResult:
+    """Measure a policy, or the expert, on unseen seeds; return every episode's outcome.
+
+    env: by default the one that the policy was trained for. options: fields of `RolloutJob`, such as `conditions`.
+    Raises `UsageError` if there is neither a policy nor an environment, `MismatchError` if they do not fit.
+    """
+    path = None if policy is None else _folder(policy)
+    if env is None:
+        origin = None if path is None else Checkpoint.open(path).origin
+        if origin is None:
+            raise UsageError("env is missing, and there is no policy of this program to take it from")
+        env = make_config(origin.robot, origin.task, origin.fps, object=origin.object)
+    driver = RolloutJob.driver if path is None else PolicyDriver((path,))
+    chosen: dict[str, Any] = {"hold": episode_hold(env), "label": "last"} | options
+    job = RolloutJob(env, driver, **chosen)
+    with Engine(workers) as engine:
+        return run_episodes(engine, job, stream_seeds(stream, episodes, seed), str(path or "expert"))
+
+
+def _folder(policy: Policy) -> Path:
+    return policy.path if isinstance(policy, Checkpoint) else find_policy(policy)

@@ -1,0 +1,49 @@
+"""The package's public names: what notebooks and scripts use in place of the commands."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import manip_il
+from manip_il.errors import UsageError
+
+STUB = Path(manip_il.__file__).with_suffix(".pyi")
+
+
+def test_every_public_name_is_there_and_typed():
+    names = next(node.value for node in ast.parse(STUB.read_text()).body if isinstance(node, ast.Assign))
+    assert ast.literal_eval(names) == sorted(set(dir(manip_il)) - {"__version__"})
+    assert [name for name in ast.literal_eval(names) if not getattr(manip_il, name).__doc__] == []
+
+
+def test_an_option_that_is_not_known_is_an_error(tmp_path: Path):
+    with pytest.raises(TypeError, match="epochs"):
+        manip_il.dagger(tmp_path / "run", manip_il.make_config("panda", "reach"), epochs=3)
+
+
+def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
+    with pytest.raises(UsageError, match="exists already"):
+        manip_il.record(tmp_path, manip_il.make_config("panda", "reach"), 1)
+
+
+def test_without_a_policy_the_environment_must_be_given():
+    with pytest.raises(UsageError, match="env is missing"):
+        manip_il.evaluate(episodes=1)
+
+
+@pytest.mark.slow
+def test_a_policys_rollouts_hold_the_experts_labels_and_its_evaluation_knows_its_task(tmp_path: Path):
+    env = manip_il.make_config("panda", "reach")
+    demos = manip_il.record(tmp_path / "demos", env, 2)
+    policy = manip_il.train(demos, tmp_path / "clone", policy={"width": 16}, steps=2, batch_size=8)
+    made = manip_il.record(tmp_path / "made", env, 2, policy=policy, beta=0.5)
+    table = made.columns(["action", "executed_action", "actor", "label_valid"])
+    assert set(table["actor"].ravel()) == {0, 1}
+    assert table["label_valid"].all()
+    assert (table["action"] != table["executed_action"]).any()
+    assert (made.provenance["beta"], made.provenance["round"]) == (0.5, 1)
+    found = manip_il.evaluate(policy, episodes=2)
+    assert (found.robot, found.task, found.success.n) == ("panda", "reach", 2)
