@@ -30,7 +30,7 @@ from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.tasks.carry.grid import Grid
 from manip_il.tasks.carry.reward import TASTES
-from manip_il.tasks.carry.things import layout_of, space_of
+from manip_il.tasks.carry.things import layout_of
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
 from manip_il.tasks.pick_place import OBJECT
@@ -70,7 +70,7 @@ def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int
     env = env_of(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
-        grid = Grid(layout_of(env.world, OBJECT), space_of(env.world.scene.robot))
+        grid = Grid(layout_of(env.world, OBJECT), env.world.scene.robot)
         at = env.world.pose(OBJECT).position
         near = grid.near(at)
         yield grid.problem, int(near[np.argmin(np.linalg.norm(grid.points[near] - at, axis=1))])

@@ -29,8 +29,9 @@ from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
+from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.results import EvalResult, compare_results
+from manip_il.evaluation.results import EvalResult
 from manip_il.learn.reward import LearnedReward
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
@@ -75,7 +76,7 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
     weights = f"--weights={folder / 'scores' / 'rabc.parquet'}"
     sources = {"weighted": f"{half} {weights}", "as it is": half, "demonstrations alone": folder / "good"}
     results = {name: clone(folder, name, source, steps, seeds) for name, source in sources.items()}
-    compared = compare_results(results["as it is"], results["weighted"])
+    compared = Comparison("as it is", "weighted", ((results["as it is"], results["weighted"]),))
     agreement = float(np.mean([one.rate for one in agreements]))
     print(f"agreement with true progress on pairs that nobody answered: mean {agreement:.1%}")
     print("\n".join(f"  draw {draw}: {one} of {one.n:,}" for draw, one in enumerate(agreements)))

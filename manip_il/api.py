@@ -17,7 +17,6 @@ from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query
 from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
-from manip_il.collect.record import record as write_episodes
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
@@ -67,7 +66,8 @@ def record(
         else:
             made = collect(engine, job, stream_seeds(f"round/{job.round}", episodes, seed), journals)
             recording = Recording(name, provenance=provenance(job), only_labelled=not job.labels_all)
-        write_episodes(made, journals, root, job, recording)
+        recording.write(journals)
+        recording.make(made, root)
     return Dataset.open(root)
 
 

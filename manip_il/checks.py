@@ -24,7 +24,6 @@ from manip_il.errors import ManipError, UsageError, shorten
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
 LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; an eval.json of half a million episodes
-LARGEST_SEED = 2**63 - 1  # datasets store seeds as int64
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 

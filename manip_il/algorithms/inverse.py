@@ -28,7 +28,7 @@ from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid
 from manip_il.tasks.carry.layout import THINGS
 from manip_il.tasks.carry.reward import FEATURES
-from manip_il.tasks.carry.things import EDGE, observed_layout, space_of
+from manip_il.tasks.carry.things import EDGE, observed_layout
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
@@ -74,7 +74,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
             continue
         layout = observed_layout(scene, OBJECT, {name: float(rows[0, column]) for name, column in places.items()})
         positions = carried_stretch(rows[:, [places[f"{OBJECT}.{axis}"] for axis in "xyz"]], np.array(layout.goal))
-        grid = Grid(layout, space_of(scene.robot))
+        grid = Grid(layout, scene.robot)
         path = grid.snap(positions)
         if len(path) < 2 or path[-1] != grid.goal:
             raise ManipError(f"episode {episode}: the object's path does not lead through free space to the goal")

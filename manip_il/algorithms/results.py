@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from manip_il.errors import ManipError
+from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report
 from manip_il.evaluation.figures import CLONING, DAGGER, Curve
 from manip_il.evaluation.report import Report
-from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, compare_results
+from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.rounds import history
 from manip_il.evaluation.tables import PolicyRow
 from manip_il.mdp import Episode
@@ -122,7 +123,7 @@ def learning_report(
     best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "policy given"}
     facts = ["The best policy was chosen on these episodes, so they flatter it; measure it by manip-il eval."]
     if 0 in found and best:
-        facts.insert(0, compare_results(found[0], found[best], (names[0], names[best])).verdict)
+        facts.insert(0, Comparison(names[0], names[best], ((found[0], found[best]),)).verdict)
     return run_report(
         [
             PolicyRow(names[number], found[number], colour=DAGGER if number else CLONING)

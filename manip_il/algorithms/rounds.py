@@ -19,7 +19,7 @@ from typing import Any
 from manip_il.algorithms.config import RunConfig
 from manip_il.collect.drivers import ExpertDriver, PolicyDriver
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.record import journal_of, record
+from manip_il.collect.record import journal_of
 from manip_il.collect.scenes import Scenes
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, dataset_sha256, merge_datasets
@@ -96,7 +96,8 @@ def record_round(
     for line in journal_of(folder / JOURNALS, job).prepare():
         _LOG.warning("%s", line)
     try:
-        record(episodes, folder / JOURNALS, folder / DATASET, job, recording)
+        recording.write(folder / JOURNALS)
+        recording.make(episodes, folder / DATASET)
     except NothingToLearnError:
         _LOG.warning("round %d: no labels, as the expert was queried in none of its rollouts", job.round)
 

@@ -43,7 +43,7 @@ from manip_il.collect.drivers import Driver, PolicyDriver
 from manip_il.collect.edits import Source, Target, redraw_dataset
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Query
-from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance, record
+from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
 from manip_il.collect.scenes import CHUNK
 from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.atomic import new_folder
@@ -126,7 +126,9 @@ class Run:
             if not root.is_dir():
                 job = replace(expert_job(self.config, 0), cameras=None)
                 episodes = collect(self._engine, job, stream_seeds("held_out", count, self.config.seed), journals)
-                record(episodes, journals, root, job, Recording("local/held_out", provenance=provenance(job)))
+                recording = Recording("local/held_out", provenance=provenance(job))
+                recording.write(journals)
+                recording.make(episodes, root)
             self._held_out_steps = sum(len(read_journal(path)[1]) for path in list_episodes(journals))
         return root
 

@@ -126,8 +126,8 @@ class CompareOptions(Tested, Seeded, Trusting):
 
     def _answer(self, study: Study, folder: Path, title: str, config: Mapping[str, Any]) -> None:
         """Write the result and the page, print the tables and the verdict."""
-        from manip_il.evaluation.compare_report import compare_report
         from manip_il.evaluation.comparison import FILE_NAME
+        from manip_il.evaluation.eval_report import compare_report
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
 

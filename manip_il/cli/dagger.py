@@ -102,7 +102,7 @@ class DaggerOptions(Varied, Trusting):
     def _report(self, config: RunConfig, results: list[Result], folder: Path) -> None:
         """Write the page of a run."""
         from manip_il.algorithms.results import best_result
-        from manip_il.evaluation.results import compare_results
+        from manip_il.evaluation.comparison import Comparison
         from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
 
         best, kind = best_result(results), ALGORITHMS[config.method]
@@ -114,7 +114,7 @@ class DaggerOptions(Varied, Trusting):
         ]
         success, facts = best.validation.success, tuple[str, ...]()
         if best.number > 0:
-            comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.number]))
+            comparison = Comparison(names[0], names[best.number], ((results[0].validation, best.validation),))
             facts = (f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.",)
         chosen = f"{names[best.number]} is chosen of {len(results)}"
         write_page(

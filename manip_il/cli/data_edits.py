@@ -13,7 +13,6 @@ from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import Replacing, prepare_output, require_replaceable
 from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import exclusive
-from manip_il.errors import ManipError
 from manip_il.option import Seeded, option
 from manip_il.sim.config import CameraConfig, Look
 
@@ -27,8 +26,7 @@ _RUN = "dataset"  # the folder of a DAgger run that has the states of all its ro
 class BuildOptions(Replacing):
     """Build the LeRobot dataset of a folder of journals.
 
-    The same journals give the same bytes, those that record wrote. Unreadable journals are reported and left out; the
-    exit code is then 1.
+    The same journals give the same bytes, those that record wrote.
     """
 
     example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
@@ -37,19 +35,15 @@ class BuildOptions(Replacing):
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded")
 
     def run(self) -> None:
-        """Build the dataset; `ManipError` if a journal could not be read."""
+        """Build the dataset."""
         from manip_il.data.build import build
 
         if self.overwrite and self.dataset.exists():
             require_replaceable(self.dataset, self.overwrite)
         with exclusive(self.dataset):
-            result = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
-        say(f"built {result.info.episodes:,} episodes, {result.info.frames:,} frames; left out: {result.failed}")
+            info, failed = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
+        say(f"built {info.episodes:,} episodes, {info.frames:,} frames; left out: {failed}")
         say(f"dataset: {self.dataset}")
-        warn(*result.damaged)
-        if result.damaged:
-            lacks = "the dataset lacks them; record them again by `manip-il record ... --resume=true`"
-            raise ManipError(f"journals that could not be read: {len(result.damaged)}; {lacks}")
 
 
 @dataclass(frozen=True)

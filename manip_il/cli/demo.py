@@ -48,7 +48,7 @@ class DemoOptions:
 
     def run(self) -> None:
         """Run what is not there yet, print the table, write the report."""
-        from manip_il.evaluation.results import compare_results
+        from manip_il.evaluation.comparison import Comparison
         from manip_il.evaluation.rounds import format_seconds
         from manip_il.evaluation.tables import policy_table, print_table
 
@@ -61,7 +61,7 @@ class DemoOptions:
             films = _film(policies, rows, config, stages)
         _, *cloned, dagger = rows
         undisturbed, disturbed = (
-            [compare_results(getattr(one, test), getattr(dagger, test), (one.name, dagger.name)) for one in cloned]
+            [Comparison(one.name, dagger.name, ((getattr(one, test), getattr(dagger, test)),)) for one in cloned]
             for test in ("result", "disturbed")
         )
         verdict = demo_verdict(rows, undisturbed[1].significant)

@@ -71,7 +71,7 @@ class RecordOptions(Varied, Seeded, Resumable):
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 
     def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
-        from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance, record
+        from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
         from manip_il.seeding import stream_seeds
@@ -85,7 +85,8 @@ class RecordOptions(Varied, Seeded, Resumable):
         with Stages(f"every finished episode, in {journals}") as stages, self.engine.open() as engine:
             stages.start(f"record {job.env.robot} {job.env.task}", max(0, count - len(list_seeds(journals))))
             episodes = collect_successes(engine, job, seeds, count, journals, stages.episode)
-            info, failed = record(episodes, journals, root, job, recording, replace=self.resume)
+            recording.write(journals)
+            info, failed = recording.make(episodes, root, replace=self.resume)
         say(
             f"recorded {info.episodes:,} successful episodes, {info.frames:,} frames; demonstrations left out: {failed}"
         )

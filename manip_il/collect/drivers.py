@@ -145,17 +145,10 @@ def policy_actions(policy: LearnedPolicy, turns: Sequence[Turn]) -> F64:
     if started := [turn.seed for turn in turns if turn.step == 0]:
         policy.reset(started)
         policy.instruct({turn.seed: turn.observation.instruction for turn in turns if turn.step == 0})
-    return policy.act(*observations(turns, policy.cameras), [turn.seed for turn in turns])
-
-
-def observations(turns: Sequence[Turn], cameras: Sequence[str]) -> tuple[F32, F32, dict[str, NDArray[np.uint8]]]:
-    """Return the turns' observations as a policy takes them: (B, n), (B, k), camera -> (B, H, W, 3)."""
     seen = [turn.observation for turn in turns]
-    return (
-        np.stack([one.state for one in seen]),
-        np.stack([one.environment_state for one in seen]),
-        {camera: np.stack([one.images[camera] for one in seen]) for camera in cameras},
-    )
+    pictures = {camera: np.stack([one.images[camera] for one in seen]) for camera in policy.cameras}
+    states = (np.stack([one.state for one in seen]), np.stack([one.environment_state for one in seen]))
+    return policy.act(*states, pictures, [turn.seed for turn in turns])
 
 
 def generators(stream: str) -> Callable[[int], np.random.Generator]:

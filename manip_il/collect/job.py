@@ -55,9 +55,6 @@ class RolloutJob:
     def __post_init__(self) -> None:
         if self.label == "takeover" and self.driver.name != "policy":
             raise UsageError(f"the expert takes over from a policy; this rollout is driven by {self.driver.name!r}")
-        for name in ("batch", "branch_steps"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"{name} is {getattr(self, name)}; expected at least 1")
 
     @property
     def policy(self) -> Path | None:

@@ -2,7 +2,7 @@
 
 A rule is written `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`. `rollout` applies it in every
 step to the learner's actions, and nowhere else is the expert queried for a label. Differences between actions are
-measured in longest steps (see `action_gap`), so that a bound means the same for every robot.
+measured in longest steps (of an action's largest dimension), so that a bound means the same for every robot.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def _safety(bound: float, setting: Setting) -> Gate:
     def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
         labels = [turn.label or turn.peek() for turn in turns]
         pairs = zip(labels, actions, strict=True)
-        return [bool(action_gap(one.action, action, setting.actions.scale) > bound) for one, action in pairs]
+        return [bool(np.abs((one.action - action) / setting.actions.scale).max() > bound) for one, action in pairs]
 
     return gate
 
@@ -159,11 +159,6 @@ def cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
 def branch(env: Environment, expert: Labeller, first: State, seed: int, steps: int) -> Iterator[Transition]:
     """Yield the expert's next steps from a state; the last one is `done`."""
     yield from rollout([env], [seed], expert_actions, Rules(steps), expert, first=first)
-
-
-def action_gap(left: F64, right: F64, scale: F64) -> F64:
-    """Return the largest difference over the dimensions of two actions (..., n), in units of `scale` (n,)."""
-    return np.abs((left - right) / scale).max(axis=-1)
 
 
 def drawn_step(seed: int, steps: int) -> int:

@@ -136,37 +136,18 @@ def local_id(folder: str) -> str:
     return f"local/{name[: checks.LONGEST_NAME] or 'dataset'}"
 
 
-@dataclass(frozen=True)
-class BuildResult:
-    """A built dataset. failed: episodes left out as they failed. damaged: what is wrong with each unreadable file."""
-
-    info: Info
-    failed: int
-    damaged: tuple[str, ...]
-
-
-def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> BuildResult:
+def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> tuple[Info, int]:
     """Build the LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
 
-    Files that cannot be read are left out and named in the result. Raises `ManipError` if no episode is left,
+    Returns what `Recording.make` returns. Raises what reading raises, `ManipError` if there is no journal,
     `FolderExistsError` if `root` holds something, unless `replace` is to swap it for the new one at the end.
     """
-    recording, damaged = Recording.read(journals), list[str]()
+    recording = Recording.read(journals)
     if repo_id is not None:
         recording = dataclasses.replace(recording, repo_id=repo_id)
-
-    def readable() -> Iterator[tuple[Journal, Episode]]:
-        for path in list_episodes(journals):
-            try:
-                yield read_journal(path)
-            except ManipError as error:
-                damaged.append(str(error))
-
-    rollouts = readable()
-    if (first := next(rollouts, None)) is None:
-        raise ManipError(f"{journals} holds no readable episode{f': {damaged[0]}' if damaged else ''}")
-    info, failed = recording.make(itertools.chain([first], rollouts), root, replace=replace)
-    return BuildResult(info, failed, tuple(damaged))
+    if not (paths := list_episodes(journals)):
+        raise ManipError(f"{journals} holds no episode")
+    return recording.make(map(read_journal, paths), root, replace=replace)
 
 
 def merge_datasets(

@@ -256,22 +256,16 @@ class Dataset:
 def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
 
-    One data file is held at a time, beside the columns. Raises what `Dataset.columns` raises.
+    Raises what `Dataset.columns` raises.
     """
-    datasets = [Dataset.open(root) for root in roots]
-    total = sum(map(len, datasets))
-    joined: dict[str, NDArray[Any]] = {}
-    row = episode = 0
-    for dataset in datasets:
-        before = {layout.EPISODE_INDEX: episode, layout.INDEX: row}
+    pieces: list[dict[str, NDArray[Any]]] = []
+    before = {layout.EPISODE_INDEX: 0, layout.INDEX: 0}
+    for dataset in map(Dataset.open, roots):
         for piece in dataset.pieces(names):
-            for name, values in piece.items():
-                if name not in joined:
-                    joined[name] = np.empty((total, *values.shape[1:]), values.dtype)
-                part = joined[name][row : row + len(values)]
-                part[:] = values.reshape(part.shape)
-                if before.get(name):
-                    part += before[name]
-            row += len(next(iter(piece.values()), ()))
-        episode += dataset.info.episodes
-    return joined
+            pieces.append({name: values + before[name] if name in before else values for name, values in piece.items()})
+        before = {
+            layout.EPISODE_INDEX: before[layout.EPISODE_INDEX] + dataset.info.episodes,
+            layout.INDEX: before[layout.INDEX] + len(dataset),
+        }
+    shapes = {name: values.shape[1:] for name, values in pieces[0].items()}
+    return {name: np.concatenate([one[name].reshape(-1, *shape) for one in pieces]) for name, shape in shapes.items()}

@@ -8,12 +8,9 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
-from enum import Enum
 from importlib import metadata
-from pathlib import PurePath
 from typing import Any
 
-import numpy as np
 from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 from threadpoolctl import threadpool_info
 
@@ -75,21 +72,9 @@ def compare_fingerprints(
 def canonical_json(value: Any) -> str:
     """Return JSON with sorted keys and no spaces: equal configs give equal text, whatever their order.
 
-    Takes dataclasses, enums, paths and numpy numbers and arrays as well. Raises `TypeError` for anything else.
+    Takes dataclasses as well. Raises `TypeError` for anything else.
     """
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=_plain)
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Enum):
-        return value.value
-    if isinstance(value, PurePath):
-        return value.as_posix()
-    raise TypeError(f"{value!r} of type {type(value).__name__}")
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=dataclasses.asdict)
 
 
 def _version(package: str) -> str:

@@ -7,7 +7,6 @@ bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove s
 from __future__ import annotations
 
 import json
-import logging
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,11 +28,9 @@ from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mdp import Episode
 
-_LOG = logging.getLogger(__name__)
 _FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
 _NPY = ".npy"
-_DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
 _FINAL = "final/"  # what journals of before had of the observation after the last frame
 
@@ -75,40 +72,17 @@ class Journal:
         """Encode and store one episode; return its path."""
         return self.store(episode.seed, self.encode(episode))
 
-    def read(self, seed: int) -> tuple[Journal, Episode] | None:
-        """Return what `read_journal` gives for a seed.
-
-        None for a damaged file, which is renamed to `<name>.damaged` with a warning, so that its seed is free. Raises
-        `OlderSchemaError` for one of an older version, with which nothing is wrong.
-        """
-        path = episode_path(self.folder, seed)
-        try:
-            return read_journal(path)
-        except OlderSchemaError:
-            raise
-        except ManipError as error:
-            aside = path.rename(path.with_name(path.name + _DAMAGED))
-            _LOG.warning("%s (set aside as %s)", error, aside.name)
-            return None
-
     def prepare(self) -> list[str]:
         """Check that episodes may be added to the folder; return warnings to show.
 
-        Unfinished files of killed writers are removed, so no other writer may be at work. The first journal that can be
-        read speaks for all. Raises `MismatchError` if it is of another robot, task or cameras.
+        Unfinished files of killed writers are removed, so no other writer may be at work. The first journal speaks for
+        all. Raises `MismatchError` if it is of another robot, task or cameras, and what `read_journal` raises.
         """
         for leftover in self.folder.glob(f".episode-*{PARTIAL}"):
             leftover.unlink(missing_ok=True)
-        for path in list_episodes(self.folder):
-            try:
-                there, _ = read_journal(path)
-                break
-            except OlderSchemaError:
-                raise
-            except ManipError:  # set aside when its turn comes
-                continue
-        else:
+        if not (paths := list_episodes(self.folder)):
             return []
+        there, _ = read_journal(paths[0])
         here, also = f"{self.spec.robot} {self.spec.task}", ("task", "cameras", "image_size")
         check_same_spec(str(self.folder), there.spec, here, self.spec, also)
         return compare_fingerprints(str(self.folder), there.fingerprint, "this machine", self.fingerprint)
@@ -143,7 +117,8 @@ def read_journal(path: Path) -> tuple[Journal, Episode]:
         raise
     except Exception as error:  # what has right checksums and is none of ours can make a parser raise anything
         why = checks.one_line(error) or type(error).__name__
-        raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error
+        again = "delete it, and --resume=true records it again"
+        raise ManipError(f"{path} is not a complete episode: {why}; {again}") from error
 
 
 def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:

@@ -23,7 +23,7 @@ from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import PICTURES, Info, read_info
 from manip_il.data.parquet_files import ParquetFiles, to_table
-from manip_il.data.schema import RobotTaskSpec, features, fitted_columns
+from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
 from manip_il.data.statistics import PooledStatistics, column_statistics, picture_statistics, to_lists
 from manip_il.data.video import CameraFiles, try_encoder
 from manip_il.data.video_config import VideoConfig
@@ -54,7 +54,7 @@ def write_dataset(
     videos included. One that comes with films has them copied. provenance: where they came from; it is read after the
     last one. video: LeRobot's settings by default. replace: as in `new_folder`. Raises `FolderExistsError` if `root`
     holds something, `UsageError` for pictures or settings that the encoder refuses, both before an episode is taken;
-    what `fitted_columns` raises for one that does not fit; `ManipError` if there is none, or no space.
+    what `ordered_columns` raises for one that does not fit; `ManipError` if there is none, or no space.
     """
     video = video or VideoConfig()
     if spec.cameras and spec.video:
@@ -63,7 +63,7 @@ def write_dataset(
     with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about, drawn=True)) as writer:
         for item in episodes:
             episode, films = (item, None) if isinstance(item, Episode) else item
-            columns = fitted_columns(episode, spec, writer.films if films else ())
+            columns = ordered_columns(episode, spec, writer.films if films else ())
             text = checks.text("instruction", episode.instruction or spec.instruction)
             writer.add_columns(columns, [text] * len(episode), json.dumps(dict(episode.drawn)), films)
         writer.close_files()

@@ -6,11 +6,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import ManipError, MismatchError, OlderSchemaError, UnknownName
+from manip_il.errors import ManipError, MismatchError, OlderSchemaError
 from manip_il.mdp import KEYPOINTS, Episode
 from manip_il.tasks.stock.table import TWO_ARMS
 
@@ -169,26 +168,14 @@ def check_same_spec(
             raise MismatchError(what, left_name, ours or none, right_name, theirs or none)
 
 
-def fitted_columns(episode: Episode, spec: RobotTaskSpec, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:
+def ordered_columns(episode: Episode, spec: RobotTaskSpec, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:
     """Return the episode's columns in the order of `features(spec)`, but for those that it is `without`.
 
-    (T,) for scalars, (T, d) for vectors, uint8 (T, height, width, 3) for pictures. Raises `UnknownName` for a column
-    too many, `MismatchError` for one missing or of another dtype or shape.
+    (T,) for scalars, (T, d) for vectors, uint8 (T, height, width, 3) for pictures. Raises `MismatchError` if the
+    episode has other columns.
     """
-    who = f"episode with seed {episode.seed}"
     table = {key: feature for key, feature in features(spec).items() if key not in without}
-    for key in episode.columns:
-        if key not in table:
-            raise UnknownName(f"column of {who}", key, table)
-    fitted: dict[str, NDArray[Any]] = {}
-    for key, feature in table.items():
-        is_scalar = feature["shape"] == (1,)
-        shape = (len(episode), *feature["shape"])
-        dtype = np.dtype("uint8" if feature["dtype"] in ("video", "image") else feature["dtype"])
-        values = episode.columns.get(key)
-        fits = values is not None and (values.shape == shape or (is_scalar and values.ndim == 1))
-        if values is None or values.dtype != dtype or not fits:
-            found = "no such column" if values is None else f"{values.dtype} of shape {values.shape}"
-            raise MismatchError(f"column {key!r}", who, found, "the schema", f"{dtype} of shape {shape}")
-        fitted[key] = values.reshape(-1) if is_scalar else values
-    return fitted
+    if table.keys() != episode.columns.keys():
+        raise MismatchError("columns", f"seed {episode.seed}", [*episode.columns], "the dataset", [*table])
+    columns = {key: episode.columns[key] for key in table}
+    return {key: one.reshape(-1) if table[key]["shape"] == (1,) else one for key, one in columns.items()}

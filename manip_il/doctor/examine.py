@@ -105,15 +105,15 @@ def _rebuild(root: Path, kept: Path) -> str:
     with suppress(ManipError):
         held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
     try:
-        result = build(journals, fresh, replace=True)
+        info, _ = build(journals, fresh, replace=True)
     except ManipError as problem:
         return f"not rebuilt: {problem}"
-    if result.info.episodes < held:
+    if info.episodes < held:
         shutil.rmtree(fresh)
-        return f"not rebuilt: {journals.name} makes {result.info.episodes} episodes, and {held} are still readable"
+        return f"not rebuilt: {journals.name} makes {info.episodes} episodes, and {held} are still readable"
     root.rename(kept)
     fresh.rename(root)
-    return "; left out: ".join([f"rebuilt from {journals.name}: {result.info.episodes} episodes", *result.damaged])
+    return f"rebuilt from {journals.name}: {info.episodes} episodes"
 
 
 def _recount(root: Path) -> dict[str, Any]:

@@ -153,13 +153,6 @@ class Certificate:
         colours = tuple(_COLOURS[row.group] for row in self._with_pooled)
         return Table((*head, "largest cost", "cases", "left out"), tuple(rows), colours)
 
-    @property
-    def verdict(self) -> str:
-        """The first sentence: how many changed states the expert recovers from."""
-        states = self.pooled("state")
-        changed = f"{states.success} of {len(states.cases):,} changed states" if states.success else "no changed state"
-        return f"The expert on {self.robot} {self.task} recovers from {changed}."
-
     def facts(self) -> list[str]:
         """Return sentences on the largest cost, and on the learner's states."""
         lines: list[str] = []
@@ -177,6 +170,8 @@ class Certificate:
 
     def report(self, command: str, config: Mapping[str, Any]) -> Report:
         """Return the page."""
+        states = self.pooled("state")
+        changed = f"{states.success} of {len(states.cases):,} changed states" if states.success else "no changed state"
         bars = [Bar(row.words, (row.success,), _COLOURS[row.group]) for row in self.rows if row.success]
         note = (
             "An episode is perturbed once, at a step drawn from those of the undisturbed one; the expert then has "
@@ -185,7 +180,7 @@ class Certificate:
         )
         return Report(
             title=f"Certificate of the expert: {self.robot} {self.task}",
-            verdict=self.verdict,
+            verdict=f"The expert on {self.robot} {self.task} recovers from {changed}.",
             facts=tuple(self.facts()),
             command=command,
             sections=(Section("Results", figures=(rates_figure(bars),), tables=(self.table(),), notes=(note,)),),

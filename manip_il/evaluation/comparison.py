@@ -13,17 +13,16 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.arm import Arm
 from manip_il.evaluation.intervals import (
     CONFIDENCE,
-    PairedComparison,
+    Pairs,
     Proportion,
-    difference_verdict,
     format_p,
     format_percent,
     format_points,
     mean_interval,
     sign_flip_exact,
 )
-from manip_il.evaluation.results import EvalResult, compare_results
-from manip_il.evaluation.rounds import COSTS, Cost, Round, Rule, format_amount, has_unlabelled_steps, largest_dip, up_to
+from manip_il.evaluation.results import EvalResult, require_equal
+from manip_il.evaluation.rounds import COSTS, Cost, Round, Rule, format_amount, has_unlabelled_steps
 from manip_il.evaluation.tables import NO_CONDITION, Table
 
 FILE_NAME = "compare.json"
@@ -34,24 +33,48 @@ TARGET = 0.95
 class Comparison:
     """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
 
-    Raises `MismatchError` if robot, task or settings differ, and `ManipError` if the test episodes are not the same.
+    results: of both, for each training seed; episodes that only one of them ran do not count. Raises `MismatchError`
+    if robot, task or settings differ, `ManipError` if two share no episode.
     """
 
-    left: Arm
-    right: Arm
+    left: str
+    right: str
+    results: tuple[tuple[EvalResult, EvalResult], ...]
 
     def __post_init__(self) -> None:
-        # Also policies of different training seeds must have run the same episodes.
-        first, *others = (*self.left.members, *self.right.members)
-        for other in others:
-            _require_same_episodes(first.name, first.test, other.name, other.test)
-        _ = self.pairs
+        for left, right in self.results:
+            require_equal(self.left, left, self.right, right)
+        if not all(self._outcomes):
+            raise ManipError(f"{self.left} and {self.right} share no seed; evaluate both with the same --seed=")
+
+    @classmethod
+    def of(cls, left: Arm, right: Arm) -> Comparison:
+        """Compare two arms. Raises `ManipError`, too, unless all their policies have run the same episodes."""
+        members = [*left.members, *right.members]
+        ours, *others = ({episode.seed for episode in one.test.episodes} for one in members)
+        for other, theirs in zip(members[1:], others, strict=True):
+            if ours != theirs:
+                raise ManipError(
+                    f"test episodes differ: {members[0].name} has {len(ours)}, {other.name} {len(theirs)}, of which "
+                    f"{len(ours & theirs)} are the same; evaluate both with the same --seed and --eval.n_episodes"
+                )
+        pairs = zip(left.members, right.members, strict=True)
+        return cls(left.name, right.name, tuple((one.test, other.test) for one, other in pairs))
 
     @cached_property
-    def pairs(self) -> tuple[PairedComparison, ...]:
-        """The paired comparison of each training seed."""
-        members = zip(self.left.members, self.right.members, strict=True)
-        return tuple(compare_results(a.test, b.test, (self.left.name, self.right.name)) for a, b in members)
+    def _outcomes(self) -> list[dict[int, tuple[bool, bool]]]:
+        """Outcomes (left, right) by test episode, of each training seed."""
+        found: list[dict[int, tuple[bool, bool]]] = []
+        for left, right in self.results:
+            theirs = {episode.seed: episode.success for episode in right.episodes}
+            ours = (one for one in left.episodes if one.seed in theirs)
+            found.append({one.seed: (one.success, theirs[one.seed]) for one in ours})
+        return found
+
+    @cached_property
+    def pairs(self) -> tuple[Pairs, ...]:
+        """The paired outcomes of each training seed."""
+        return tuple(Pairs.of(outcomes.values()) for outcomes in self._outcomes)
 
     @property
     def difference(self) -> float:
@@ -72,33 +95,37 @@ class Comparison:
         It holds for these trained policies; `interval` is about other training seeds, too.
         """
         margins: Counter[int] = Counter()
-        for arm, sign in ((self.left, -1), (self.right, 1)):
-            for episode in (one for member in arm.members for one in member.test.episodes):
-                margins[episode.seed] += sign * episode.success
+        for seed, (left, right) in (one for outcomes in self._outcomes for one in outcomes.items()):
+            margins[seed] += right - left
         return sign_flip_exact(list(margins.values()))
 
     @property
     def significant(self) -> bool:
-        """Whether one arm is better by the exact test, and with several seeds by the t interval, too."""
+        """Whether one is better by the exact test, and with several training seeds by the t interval, too."""
         low, high = self.interval
         return self.p_value < 1 - CONFIDENCE and (len(self.pairs) == 1 or low > 0 or high < 0)
 
     @property
     def verdict(self) -> str:
-        """One sentence with the difference, its interval and p."""
+        """A sentence: which one is better, or that nothing shows it, with the difference, its interval and p."""
         n, sign = len(self.pairs), -1 if self.difference < 0 else 1
         leads = sum(sign * pair.difference > 0 for pair in self.pairs)
         tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
         tested += f" on each of {n} training seeds, ahead in {leads}" if n > 1 else ""
-        names = self.left.name, self.right.name
-        return difference_verdict(names, self.difference, self.interval, tested, significant=self.significant)
+        if not self.significant:
+            points = format_points(self.difference, self.interval)
+            return f"No difference shown between {self.right} and {self.left}: {points}, {tested}."
+        better, worse = (self.left, self.right) if sign < 0 else (self.right, self.left)
+        low, high = sorted(100 * sign * end for end in self.interval)
+        points = f"{100 * abs(self.difference):.1f} points [{low:.1f}, {high:.1f}]"
+        return f"{better} is better than {worse} by {points}, {tested}."
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; differences are right minus left."""
         counts = ("both", "only_left", "only_right", "neither")
         return {
-            "left": self.left.name,
-            "right": self.right.name,
+            "left": self.left,
+            "right": self.right,
             "difference": self.difference,
             "interval": list(self.interval),
             "confidence": CONFIDENCE,
@@ -116,7 +143,7 @@ class Study:
 
     baseline: the arm that the others are compared with; arms of different tasks have none (None). rule: chose each
     run's round. target: validation success whose cost is told. experts: tests of the expert in an arm's task, arm ->
-    name of the test -> result. within: costs up to which validation is told.
+    name of the test -> result.
     """
 
     arms: tuple[Arm, ...]
@@ -124,7 +151,6 @@ class Study:
     rule: Rule = field(default_factory=Rule)
     target: float = TARGET
     experts: Mapping[str, Mapping[str, EvalResult]] = field(default_factory=dict)
-    within: tuple[tuple[Cost, float], ...] = ()
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
@@ -132,7 +158,7 @@ class Study:
         if self.baseline is None:
             return {}
         [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
-        return {arm.name: Comparison(baseline, arm) for arm in self.arms if arm is not baseline}
+        return {arm.name: Comparison.of(baseline, arm) for arm in self.arms if arm is not baseline}
 
     @property
     def verdict(self) -> str:
@@ -170,13 +196,11 @@ class Study:
         return (self.results_table(), *([self.condition_table()] if several else []))
 
     def cost_tables(self) -> tuple[Table, ...]:
-        """Return costs to the target, and success within costs; nothing unless all arms are runs."""
-        if not all(arm.has_histories for arm in self.arms):
-            return ()
-        return (self.target_table(), *([self.within_table()] if self.within else []))
+        """Return costs to the target; nothing unless all arms are runs."""
+        return (self.target_table(),) if all(arm.has_histories for arm in self.arms) else ()
 
     def results_table(self) -> Table:
-        """Return an arm a row: the expert's success, mean costs, validation, test success, difference, largest dip.
+        """Return an arm a row: the expert's success, mean costs, validation, test success, difference.
 
         In brackets each training seed, of one alone the interval.
         """
@@ -190,10 +214,9 @@ class Study:
             cells.append(_rates([one.validation for one in chosen]) if chosen else "")
             cells.append(_rates([one.test.success for one in arm.members]))
             points = against and f"{format_points(against.difference, against.interval)}, {format_p(against.p_value)}"
-            dip = f"{100 * max(largest_dip(member.history) for member in arm.members):.1f}" if chosen else ""
-            rows.append((arm.name, *cells, points or "", dip))
+            rows.append((arm.name, *cells, points or ""))
         head = ("arm", *tests, *map(_head, costs), "validation", "test", f"test, against {self.baseline}")
-        return Table((*head, "largest dip [points]"), tuple(rows))
+        return Table(head, tuple(rows))
 
     def condition_table(self) -> Table:
         """Return a condition a row: success of every arm, the mean over training seeds."""
@@ -218,16 +241,6 @@ class Study:
             rows.append((arm.name, *(missed if None in first else _mean_cost(cost, first) for cost in self._costs)))
         head = (f"{_head(cost)} to {100 * self.target:g} %" for cost in self._costs)
         return Table(("arm, validation", *head), tuple(rows))
-
-    def within_table(self) -> Table:
-        """Return an arm a row: the best validation success up to each of the costs `within`, empty before the first."""
-        columns = tuple(f"within {format_amount(*one)}" for one in self.within)
-        rows: list[tuple[str, ...]] = []
-        for arm in self.arms:
-            known = [[up_to(member.history, *one) for member in arm.members] for one in self.within]
-            best = ([max((r.validation for r in own), key=lambda v: v.rate) for own in runs if own] for runs in known)
-            rows.append((arm.name, *(_rates(one) if len(one) == len(arm.members) else "" for one in best)))
-        return Table(("arm, validation", *columns), tuple(rows))
 
     @property
     def _costs(self) -> list[Cost]:
@@ -269,16 +282,6 @@ class Study:
                 for member, first in zip(arm.members, self._reached(arm), strict=True)
             ],
         }
-
-
-def _require_same_episodes(left_name: str, left: EvalResult, right_name: str, right: EvalResult) -> None:
-    """Raise `ManipError` with both numbers unless both ran exactly the same seeds."""
-    ours, theirs = ({episode.seed for episode in one.episodes} for one in (left, right))
-    if ours != theirs:
-        raise ManipError(
-            f"test episodes differ: {left_name} has {len(ours)}, {right_name} {len(theirs)}, of which "
-            f"{len(ours & theirs)} are the same; evaluate both with the same --seed and --eval.n_episodes"
-        )
 
 
 def _head(cost: Cost) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,15 +102,19 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class PairedComparison:
-    """Two policies on the same `n` episodes, counted by who succeeded."""
+class Pairs:
+    """Two policies, left and right, on the same `n` episodes, counted by who succeeded."""
 
-    left: str
-    right: str
     both: int
     only_left: int
     only_right: int
     neither: int
+
+    @classmethod
+    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> Pairs:
+        """Count the outcomes (left, right) of every episode, at least one."""
+        pairs = Counter(outcomes)
+        return cls(pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])
 
     @property
     def n(self) -> int:
@@ -144,35 +148,6 @@ class PairedComparison:
         low, high = add_squares(p1 - l1, u2 - p2), add_squares(u1 - p1, p2 - l2)
         return max(-1.0, self.difference - low), min(1.0, self.difference + high)
 
-    @property
-    def p_value(self) -> float:
-        """Two-sided p that both have one success rate.
-
-        McNemar (1947), Psychometrika 12, 153-157, with the exact binomial in place of chi-square.
-        """
-        discordant = self.only_left + self.only_right
-        return float(stats.binomtest(self.only_left, discordant).pvalue) if discordant else 1.0
-
-    @property
-    def significant(self) -> bool:
-        """Whether the exact test rejects "equally good"."""
-        return self.p_value < 1 - CONFIDENCE
-
-    @property
-    def verdict(self) -> str:
-        """One sentence with the difference, its interval and p."""
-        tested = f"{format_p(self.p_value)}, {self.n:,} paired episodes"
-        names = self.left, self.right
-        return difference_verdict(names, self.difference, self.interval, tested, significant=self.significant)
-
-
-def compare_paired(
-    left: Sequence[bool], right: Sequence[bool], names: tuple[str, str] = ("A", "B")
-) -> PairedComparison:
-    """Compare outcomes that are paired by position, at least one."""
-    pairs = Counter(zip(left, right, strict=True))
-    return PairedComparison(*names, pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])
-
 
 def sign_flip_exact(differences: Sequence[int]) -> float:
     """Return two-sided p that every difference, one a test episode, was as likely to have the other sign.
@@ -189,22 +164,6 @@ def sign_flip_exact(differences: Sequence[int]) -> float:
     total, observed = len(ways) - 1, abs(sum(differences))
     # Whole numbers divided once: exact at any count.
     return sum(count for place, count in enumerate(ways) if abs(2 * place - total) >= observed) / sum(ways)
-
-
-def difference_verdict(
-    names: tuple[str, str], difference: float, interval: tuple[float, float], tested: str, *, significant: bool
-) -> str:
-    """Return in a sentence which of two, left and right, is better, or that nothing shows it.
-
-    difference: right minus left. tested: p, and what it rests on.
-    """
-    left, right = names
-    if not significant:
-        points = format_points(difference, interval)
-        return f"No difference shown between {right} and {left}: {points}, {tested}."
-    better, worse, sign = (left, right, -1) if difference < 0 else (right, left, 1)
-    low, high = sorted(100 * sign * end for end in interval)
-    return f"{better} is better than {worse} by {100 * abs(difference):.1f} points [{low:.1f}, {high:.1f}], {tested}."
 
 
 def format_p(p: float) -> str:

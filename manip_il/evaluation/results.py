@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from manip_il import checks
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, MismatchError
-from manip_il.evaluation.intervals import CONFIDENCE, PairedComparison, Proportion, compare_paired
+from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.shape import stored
 from manip_il.tasks.config import make_config
@@ -177,8 +178,8 @@ class EvalResult:
     @property
     def failures(self) -> dict[str, int]:
         """Failed episodes by the phase they ended in, most frequent first."""
-        phases = [episode.phase_at_end for episode in self.episodes if not episode.success]
-        return dict(sorted(((p, phases.count(p)) for p in set(phases)), key=lambda item: (-item[1], item[0])))
+        phases = Counter(sorted(episode.phase_at_end for episode in self.episodes if not episode.success))
+        return dict(phases.most_common())  # of equals the first by name
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `eval.json`."""
@@ -238,21 +239,6 @@ class EvalResult:
             raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
 
 
-def compare_results(left: EvalResult, right: EvalResult, names: tuple[str, str] | None = None) -> PairedComparison:
-    """Compare two evaluations on the seeds that both ran.
-
-    Raises `MismatchError` where robot, task or settings differ, and `ManipError` where no seed is shared.
-    """
-    names = names or (left.policy, right.policy)
-    _require_equal(names[0], left, names[1], right)
-    ours = {episode.seed: episode.success for episode in left.episodes}
-    theirs = {episode.seed: episode.success for episode in right.episodes}
-    shared = sorted(ours.keys() & theirs.keys())
-    if not shared:
-        raise ManipError(f"{names[0]} and {names[1]} share no seed; evaluate both with the same --seed=")
-    return compare_paired([ours[seed] for seed in shared], [theirs[seed] for seed in shared], names)
-
-
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     """Return all episodes of the parts (name -> part), in the order of their seeds.
 
@@ -262,7 +248,7 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     (first, one), *others = parts.items()
     for name, other in others:
         known = one.policy_sha256 or other.policy_sha256  # else the names alone say whether the policy is the same
-        _require_equal(first, one, name, other, "policy_sha256" if known else "policy")
+        require_equal(first, one, name, other, "policy_sha256" if known else "policy")
     if stopped := next((name for name, part in parts.items() if part.until_width is not None), None):
         raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes merge")
     episodes = [episode for part in parts.values() for episode in part.episodes]
@@ -275,7 +261,7 @@ def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -
     write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
-def _require_equal(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
+def require_equal(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
     """Raise `MismatchError` naming the first field in which two differ: robot, task, a setting, or one of `more`."""
     sides = [(name, getattr(one, name), getattr(other, name)) for name in (*more, "robot", "task")]
     own = [field.name for field in fields(EvalSettings)]

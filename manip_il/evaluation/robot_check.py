@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,8 +29,6 @@ from manip_il.sim.config import FILM
 from manip_il.sim.posture import Pair, meeting_at
 from manip_il.sim.render import Overview, framed_picture
 from manip_il.sim.scene import PREFIX
-from manip_il.sim.task import TakesShape, Task
-from manip_il.sim.variation import widest_grasp
 from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
@@ -49,13 +47,11 @@ _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 class TaskCheck:
     """One task with a robot.
 
-    width: of the widest object that is grasped [m]; 0 if there is none. starts: how many found a place; refused: why
-    there is no scene, or why the next start found none. clean, noisy: evaluations of the expert, as it is and with a
-    tenth of its actions random; None if none ran.
+    starts: how many found a place; refused: why there is no scene, or why the next start found none. clean, noisy:
+    evaluations of the expert, as it is and with a tenth of its actions random; None if none ran.
     """
 
     name: str
-    width: float
     starts: int = 0
     refused: str = ""
     clean: EvalResult | None = None
@@ -68,7 +64,7 @@ class TaskCheck:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        facts = {"done": self.done, "width": self.width, "starts": self.starts, "refused": self.refused}
+        facts = {"done": self.done, "starts": self.starts, "refused": self.refused}
         tests = {"clean": self.clean, "noisy": self.noisy}
         return {"task": self.name} | facts | {key: one and one.success.to_json() for key, one in tests.items()}
 
@@ -136,7 +132,6 @@ def check_robot(
 def check_starts(name: str, task: str) -> TaskCheck:
     """Draw a task's starts with a robot as episodes do, until one finds no place."""
     the_task, starts = get_task(task), 0
-    width = max(widths(the_task).values(), default=0.0)
     try:
         world = World(scene_of(name, task))
         world.update()
@@ -144,19 +139,8 @@ def check_starts(name: str, task: str) -> TaskCheck:
             the_task.draw(rng_for(seed, "reset"), world)
             starts += 1
     except UsageError as error:
-        return TaskCheck(task, width, starts, str(error))
-    return TaskCheck(task, width, starts)
-
-
-def widths(task: Task) -> dict[str, float]:
-    """Return how wide the objects that a task grasps are between fingers from above, by name [m]."""
-    spec = mujoco.MjSpec()
-    task.build(spec)
-    model, found = spec.compile(), dict[str, float]()
-    for name in task.grasped:
-        geom = int(model.body(name).geomadr[0])
-        found[name] = widest_grasp(int(model.geom_type[geom]), model.geom_size[geom])
-    return found
+        return TaskCheck(task, starts, str(error))
+    return TaskCheck(task, starts)
 
 
 def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
@@ -207,14 +191,12 @@ def verdict(check: RobotCheck) -> str:
 
 
 def task_table(check: RobotCheck) -> Table:
-    """Return the tasks: object against opening, starts, and the expert's success, clean and with random actions."""
-    columns = ("task", "object [mm]", "starts", "expert [95 % interval]", "with random actions")
+    """Return the tasks: starts, and the expert's success, clean and with random actions."""
+    columns = ("task", "starts", "expert [95 % interval]", "with random actions")
     rows: list[tuple[str, ...]] = []
     for task in check.tasks:
-        fits = "fits" if task.width < check.opening else "too wide"
-        wide = f"{1000 * task.width:.0f}, {fits}" if task.width else "none grasped"
         tests = (str(one.success) if one else "" for one in (task.clean, task.noisy))
-        rows.append((task.name, wide, f"{task.starts} of {STARTS}", *tests))
+        rows.append((task.name, f"{task.starts} of {STARTS}", *tests))
     return Table(columns, tuple(rows), tuple(EXPERT if task.done else CLONING for task in check.tasks))
 
 
@@ -245,31 +227,21 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML, the arm's first, then for each task that cannot be done."""
     lines, space = list[str](), check.robot.workspace
     if check.table < ENOUGH:
-        change = (
-            f"take a smaller half_width than {space.half_width:g}, or move workspace.centre, ({space.centre[0]:g}, "
-            f"{space.centre[1]:g}), to where the map is green"
+        x, y = space.centre
+        lines.append(
+            f"The hand gets to {100 * check.table:.0f} % of the workspace on the table: take a smaller half_width than "
+            f"{space.half_width:g}, or move workspace.centre, ({x:g}, {y:g}), to where the map is green; if it is "
+            "nowhere, turn the gripper on the hand by gripper.quaternion."
         )
-        if not check.table and check.robot.gripper.files is not None:
-            change += "; or turn the gripper on the hand by gripper.quaternion"
-        lines.append(f"The hand gets to {100 * check.table:.0f} % of the workspace on the table: {change}.")
-    return (*lines, *(line for task in check.failed for line in _task_advice(check, task)))
-
-
-def _task_advice(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
-    if task.width >= check.opening:
-        change = "widen gripper.open, or leave the task out"
-        if isinstance(get_task(task.name), TakesShape):
-            narrow = max(0.005, math.floor(0.6 * check.opening / 0.005) * 0.005)
-            change = f"choose a narrower one, --task.object=box:{narrow:.3g}, or widen gripper.open"
-        sizes = f"{1000 * task.width:.0f} mm wide, the gripper opens {1000 * check.opening:.0f} mm"
-        yield f"{task.name}: its object is {sizes}: {change}."
-    elif task.refused and check.table:  # else it is said of the whole workspace
-        yield f"{task.name}: {task.refused}."
-    elif task.clean is not None:
-        success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
-        failed = f"the expert fails in {success.n - success.successes} of {success.n} episodes"
-        watch = f"manip-il view --robot.type={check.name} --task.type={task.name}"
-        yield f"{task.name}: {failed}, {count} in phase {phase}; watch it: {watch}"
+    for task in check.failed:
+        if task.refused and check.table:  # else it is said of the whole workspace
+            lines.append(f"{task.name}: {task.refused}.")
+        elif task.clean is not None:
+            success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
+            failed = f"the expert fails in {success.n - success.successes} of {success.n} episodes"
+            watch = f"manip-il view --robot.type={check.name} --task.type={task.name}"
+            lines.append(f"{task.name}: {failed}, {count} in phase {phase}; watch it: {watch}")
+    return tuple(lines)
 
 
 def looks(name: str) -> tuple[Still, ...]:

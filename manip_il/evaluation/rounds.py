@@ -30,11 +30,6 @@ class Round:
     validation: Proportion
     unit: Literal["round", "iteration"] = "round"
 
-    @property
-    def name(self) -> str:
-        """Return `round 3` or `iteration 120`."""
-        return f"{self.unit} {self.round}"
-
     def amount(self, cost: Cost) -> float:
         """Return the labels, episodes, steps or seconds that the run had used."""
         return getattr(self, cost)
@@ -83,11 +78,6 @@ def has_unlabelled_steps(rounds: History) -> bool:
     return any(one.steps != one.labels for one in rounds)
 
 
-def up_to(rounds: History, cost: Cost, most: float) -> History:
-    """Return the rounds that ended within an amount of a cost."""
-    return tuple(one for one in rounds if one.amount(cost) <= most)
-
-
 @dataclass(frozen=True)
 class Rule:
     """The rule that chooses the round of each run, fixed before any test episode.
@@ -111,7 +101,8 @@ class Rule:
     def select(self, rounds: History, name: str) -> Round:
         """Return the round of one run that the rule chooses; `UsageError` if none ended within the limit."""
         if self.at != "end" and self.limit is not None:
-            first, rounds = rounds[0].amount(self.at), up_to(rounds, self.at, self.limit)
+            first = rounds[0].amount(self.at)
+            rounds = tuple(one for one in rounds if one.amount(self.at) <= self.limit)
             if not rounds:
                 reached, most = format_amount(self.at, first), format_amount(self.at, self.limit)
                 raise UsageError(f"--at={self.at}: the first round of {name} took {reached}, another run had {most}")
@@ -127,14 +118,6 @@ class Rule:
         if self.at == "end" or self.limit is None:
             return f"{words}."
         return f"{words}, within {format_amount(self.at, self.limit)}, the most that every run reached."
-
-
-def largest_dip(rounds: History) -> float:
-    """Return how far validation success fell at most below the best before it, 0 to 1."""
-    best, dip = 0.0, 0.0
-    for one in rounds:
-        dip, best = max(dip, best - one.validation.rate), max(best, one.validation.rate)
-    return dip
 
 
 def format_seconds(seconds: float) -> str:

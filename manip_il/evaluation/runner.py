@@ -143,24 +143,18 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
     The first object that the episode is about is called `object`; `goal` is where it, or the hand, is to go.
     """
     state = State.from_vector(sim_state)
-    found = _stock_positions(env, state) if env.robot in STOCK else _positions(env, state)
+    if env.robot in STOCK:
+        stock = described_stock(env.robot, env.task)
+        stock.set_state(state)
+        found = stock.positions
+    else:
+        world = _world(config_scene(env))
+        task = world.scene.task
+        world.restore(state.physics, state.variation)
+        found = {"hand": world.ee.position, "goal": task.destination(world)}
+        for name in world.scene.objects:
+            found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
-
-
-def _stock_positions(config: EnvConfig, state: State) -> dict[str, F64]:
-    env = described_stock(config.robot, config.task)
-    env.set_state(state)
-    return env.positions
-
-
-def _positions(env: EnvConfig, state: State) -> dict[str, F64]:
-    world = _world(config_scene(env))
-    task = world.scene.task
-    world.restore(state.physics, state.variation)
-    found = {"hand": world.ee.position, "goal": task.destination(world)}
-    for name in world.scene.objects:
-        found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
-    return found
 
 
 def measure(

@@ -50,7 +50,9 @@ class Prop(NamedTuple):
 
 
 def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
-    """Return what is only seen of a scene's world. clutter: how many things, and the seed of what they are and where.
+    """Return what is only seen of a scene's world.
+
+    clutter: (2,) how many things, and the seed of what they are and where.
 
     Poses of mocap bodies and joints in `data` must be up to date.
     """

@@ -16,8 +16,8 @@ from types import ModuleType
 from typing import Any
 
 from manip_il import checks
-from manip_il.errors import ManipError, UsageError, shorten
-from manip_il.sim.task import Limits, Rung, Task
+from manip_il.errors import ManipError, UsageError
+from manip_il.sim.task import Task
 
 SUFFIX = ".py"
 GROUP = "manip_il.tasks"  # of entry points: a name, and a class that is a task
@@ -93,15 +93,6 @@ def _made(what: str, cls: Any) -> Task:
     try:
         task: Any = cls() if inspect.isclass(cls) else cls
         checks.name(f"{what}: its name", task.name)
-        checks.text(f"{what}: its instruction", task.instruction)
     except (ManipError, TypeError) as error:
         raise UsageError(str(error) if what in str(error) else f"{what}: {checks.one_line(error)}") from error
-    if not isinstance(task.limits, Limits):
-        raise UsageError(f"{what}: limits is a {type(task.limits).__name__}; expected Limits(...)")
-    for name, kind in (("objects", str), ("grasped", str), ("rungs", Rung)):
-        value = getattr(task, name)
-        if not isinstance(value, tuple) or not all(isinstance(one, kind) for one in value):
-            raise UsageError(f"{what}: {name} is {shorten(str(value))}; expected a tuple of {kind.__name__}")
-    if not task.rungs:
-        raise UsageError(f"{what}: it has no rungs; expected at least one, and the last to hold everywhere")
     return task

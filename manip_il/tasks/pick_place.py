@@ -1,4 +1,4 @@
-"""Pick and place: a cube from the table to a goal on it or in the air."""
+"""Pick and place: a cube from the table to a goal on it or in the air; lift: to a goal above where it lies."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from manip_il.tasks.grasp import Lie, is_cube, lie_of
 from manip_il.tasks.ladder import held, pick_progress, pick_rungs
 from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_lying
+from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
 
 F64 = NDArray[np.float64]
 
 OBJECT = "object"
+UNDER = np.array([0.0, 0.0, -1.0])  # no hand gets there [m]
 ANY_SHAPE = Limits(horizon=200)  # what is small or rolls away takes more attempts than a cube
 
 
@@ -87,6 +88,29 @@ class PickPlace:
     def progress(self, world: World) -> float:
         """Return progress by the way that is left along the ladder's path."""
         return pick_progress(world, OBJECT)
+
+
+@dataclass(frozen=True)
+class Lift(PickPlace):
+    """Pick and place whose goal is above the cube."""
+
+    name: str = "lift"
+    instruction: str = "Lift the cube to the green goal above it."
+    limits: Limits = Limits(horizon=150)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""
+        low, high = np.array(LIFT) * min(1.0, world.scene.robot.workspace.height / LIFT_HEIGHT)
+
+        def draw_both() -> F64:
+            at, turn = draw_lying(rng, world, OBJECT)
+            goals = (at + [0.0, 0.0, rng.uniform(low, high)] for _ in range(FEW_DRAWS))
+            goal = next((goal for goal in goals if world.reach.has(goal)), UNDER)
+            return np.concatenate([goal, at, turn])
+
+        both = draw_until(draw_both, lambda one: world.reach.has(one[:3]), world, "the goal")
+        goal, at, turn = np.split(both, [3, 6])
+        return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
 
 def observe_cube(world: World, name: str) -> Observed:

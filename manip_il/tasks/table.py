@@ -12,9 +12,8 @@ from manip_il.tasks.carry.task import Carry
 from manip_il.tasks.clear_table import ClearTable
 from manip_il.tasks.drawer import Drawer
 from manip_il.tasks.insert import Insert
-from manip_il.tasks.lift import Lift
 from manip_il.tasks.own import GROUP, SUFFIX, packaged, packaged_task, read_task
-from manip_il.tasks.pick_place import PickPlace
+from manip_il.tasks.pick_place import Lift, PickPlace
 from manip_il.tasks.press import Press
 from manip_il.tasks.push import Push
 from manip_il.tasks.reach import ReachGoal

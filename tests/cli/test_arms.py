@@ -87,10 +87,10 @@ def lines(*validated: float | None) -> list[dict[str, Any]]:
 
 def test_iterations_that_were_validated_are_rounds_and_cost_what_all_before_them_took():
     found = history(lines(0.2, None, 0.5, None, 0.4), "x")
-    assert [(one.name, one.steps, one.labels, one.seconds) for one in found] == [
-        ("iteration 0", 0, 0, 3.0),
-        ("iteration 2", 200, 0, 9.0),
-        ("iteration 4", 400, 0, 15.0),
+    assert [(one.unit, one.round, one.steps, one.labels, one.seconds) for one in found] == [
+        ("iteration", 0, 0, 0, 3.0),
+        ("iteration", 2, 200, 0, 9.0),
+        ("iteration", 4, 400, 0, 15.0),
     ]
 
 

@@ -45,7 +45,7 @@ def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: N
     page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
     assert "No pictures: no off-screen OpenGL" in page
     assert "data:image/jpeg" not in page
-    facts = {"task": "reach", "done": True, "width": 0.0, "starts": 50, "refused": ""}
+    facts = {"task": "reach", "done": True, "starts": 50, "refused": ""}
     assert found["tasks"] == [facts | {"clean": None, "noisy": None}]
 
 
@@ -57,7 +57,7 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     assert main(words) == 1
     said = capsys.readouterr()
     assert "narrow has starts for 1 of 2 tasks; the expert was not asked; it cannot do lift." in said.out
-    assert "--task.object=box:0.025" in said.out
+    assert "change: lift: task lift: 'object' is 0.050 m wide" in said.out
     assert "cannot do 1 of 2 tasks: lift" in said.err
     assert (out / "check.html").is_file()
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.record import collect, collect_successes, journal_of, record
+from manip_il.collect.record import collect, collect_successes, journal_of
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, build
 from manip_il.data.dataset import Dataset
@@ -89,29 +89,16 @@ def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
     assert len(journal_of(tmp_path, replace(JOB, env=make_config("fetch", "reach", tolerance=0.05))).prepare()) == 1
 
 
-def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog):
-    list(collect(Recorded(), JOB, SEEDS[:3], tmp_path))
-    whole = contents(tmp_path)
-    damaged = list_episodes(tmp_path)[1]
-    damaged.write_bytes(whole[1][:5000])
-    assert journal_of(tmp_path, JOB).prepare() == []
-    engine = Recorded()
-    assert [episode.seed for _, episode in collect(engine, JOB, SEEDS[:4], tmp_path)] == list(SEEDS[:4])
-    assert contents(tmp_path)[:3] == whole
-    assert engine.asked == [SEEDS[3], SEEDS[1]]
-    assert f"{damaged} is not a complete episode" in caplog.text
-    assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
-
-
 def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):
     failing = [SEEDS[1]]
     folder = tmp_path / "journals"
     rule = Recording("local/x", only_successes=True, episodes=3, provenance={"driver": "expert"})
     episodes = collect_successes(Recorded(failing), JOB, SEEDS, 3, folder)
-    info, failed = record(episodes, folder, tmp_path / "dataset", JOB, rule)
+    rule.write(folder)
+    info, failed = rule.make(episodes, tmp_path / "dataset")
     assert (info.episodes, failed) == (3, 1)
     seeds = Dataset.open(tmp_path / "dataset").columns(["seed"])["seed"]
     assert sorted(set(seeds.tolist())) == [SEEDS[0], SEEDS[2], SEEDS[3]]
-    result = build(folder, tmp_path / "again")
-    assert (result.info.episodes, result.failed, result.damaged) == (3, 1, ())
+    again, failed = build(folder, tmp_path / "again")
+    assert (again.episodes, failed) == (3, 1)
     assert digests(tmp_path / "again") == digests(tmp_path / "dataset")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +11,11 @@ import pytest
 from manip_il.data import schema as s
 from manip_il.data.fingerprint import canonical_json, compare_fingerprints, environment_fingerprint
 from manip_il.errors import ManipError, MismatchError
-from manip_il.mdp import Actor
 
 
 @dataclass(frozen=True)
 class Config:
     rate: float = 0.5
-    where: Path = Path("a/b")
 
 
 def test_a_spec_survives_json(spec):
@@ -66,9 +63,7 @@ def test_a_fingerprint_names_versions_and_hashes_what_it_is_given():
     assert "policy has " in warning
 
 
-def test_configs_of_many_kinds_have_one_canonical_text():
-    config = {"config": Config(), "actor": Actor.LEARNER, "gains": np.array([1.0, 2.0]), "n": np.int64(3)}
-    expected = '{"actor":1,"config":{"rate":0.5,"where":"a/b"},"gains":[1.0,2.0],"n":3}'
-    assert canonical_json(config) == expected
-    with pytest.raises(TypeError, match="object"):
+def test_configs_have_one_canonical_text():
+    assert canonical_json({"gains": (1.0, 2.0), "config": Config()}) == '{"config":{"rate":0.5},"gains":[1.0,2.0]}'
+    with pytest.raises(TypeError, match="dataclass"):
         canonical_json({"x": object()})

@@ -10,8 +10,7 @@ from typing import Literal
 import pytest
 from playwright.sync_api import Browser
 
-from manip_il.evaluation.compare_report import compare_report
-from manip_il.evaluation.eval_report import eval_report, run_report
+from manip_il.evaluation.eval_report import compare_report, eval_report, run_report
 from manip_il.evaluation.figures import Curve
 from manip_il.evaluation.report import Report
 from manip_il.evaluation.tables import CLONING, PolicyRow

@@ -10,7 +10,7 @@ import pytest
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.arm import Arm, Member, require_pair
 from manip_il.evaluation.comparison import Comparison, Study
-from manip_il.evaluation.intervals import compare_paired
+from manip_il.evaluation.intervals import Pairs
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.rounds import Rule, history
 
@@ -36,29 +36,28 @@ def one(name: str, outcomes: list[bool]) -> Arm:
 
 
 def test_one_policy_against_another_is_the_paired_comparison():
-    comparison, paired = Comparison(one("A", HARD), one("B", EASY)), compare_paired(HARD, EASY)
+    comparison, paired = Comparison.of(one("A", HARD), one("B", EASY)), Pairs.of(zip(HARD, EASY, strict=True))
     assert comparison.difference == pytest.approx(0.3)
     assert comparison.interval == paired.interval
-    assert comparison.p_value == pytest.approx(paired.p_value, rel=1e-12)
     assert comparison.verdict.startswith("B is better than A by 30.0 points [20.")
     assert comparison.verdict.endswith("p < 0.001, 100 paired episodes.")
 
 
 def test_the_verdict_names_the_better_one_on_either_side_and_no_small_difference():
-    assert Comparison(one("A", EASY), one("B", HARD)).verdict.startswith("A is better than B by 30.0 points [20.")
-    verdict = Comparison(one("A", HARD), one("B", HARD[:-1] + [True])).verdict
+    assert Comparison.of(one("A", EASY), one("B", HARD)).verdict.startswith("A is better than B by 30.0 points [20.")
+    verdict = Comparison.of(one("A", HARD), one("B", HARD[:-1] + [True])).verdict
     assert verdict.startswith("No difference shown between B and A: +1.0 points [")
 
 
 def test_over_training_seeds_the_mean_difference_has_students_interval():
-    better = Comparison(arm("A", HARD, HARD, HARD), arm("B", EASY, EASY[1:] + [True], EASY[:-1] + [False]))
+    better = Comparison.of(arm("A", HARD, HARD, HARD), arm("B", EASY, EASY[1:] + [True], EASY[:-1] + [False]))
     assert [pair.difference for pair in better.pairs] == pytest.approx([0.3, 0.31 - 0.01, 0.3])
     assert better.significant
     assert "100 paired episodes on each of 3 training seeds, ahead in 3" in better.verdict
 
 
 def test_these_policies_may_differ_where_training_seeds_do_not_show_it():
-    comparison = Comparison(arm("A", HARD, HARD), arm("B", EASY, HARD[:-2] + [True, True]))
+    comparison = Comparison.of(arm("A", HARD, HARD), arm("B", EASY, HARD[:-2] + [True, True]))
     low, high = comparison.interval
     assert comparison.p_value < 0.001
     assert low < 0 < high
@@ -68,14 +67,14 @@ def test_these_policies_may_differ_where_training_seeds_do_not_show_it():
 
 def test_two_equal_differences_alone_are_no_proof():
     """Student's interval has no width then; the episodes still have to show it."""
-    comparison = Comparison(arm("A", HARD, HARD), arm("B", HARD[:-1] + [True], HARD[:-1] + [True]))
+    comparison = Comparison.of(arm("A", HARD, HARD), arm("B", HARD[:-1] + [True], HARD[:-1] + [True]))
     assert comparison.interval == (0.01, 0.01)
     assert comparison.p_value == 1
     assert not comparison.significant
 
 
 def test_equal_arms_are_not_called_different():
-    comparison = Comparison(arm("A", HARD, EASY), arm("B", HARD, EASY))
+    comparison = Comparison.of(arm("A", HARD, EASY), arm("B", HARD, EASY))
     assert (comparison.difference, comparison.p_value) == (0, 1)
     assert "No difference shown between B and A: +0.0 points" in comparison.verdict
 
@@ -87,7 +86,7 @@ def test_random_arms_of_one_quality_are_seldom_called_different():
     wrong = 0
     for _ in range(400):
         drawn = rng.random((2, 3, 40)) < difficulty
-        wrong += Comparison(*(arm(name, *side.tolist()) for name, side in zip("AB", drawn, strict=True))).significant
+        wrong += Comparison.of(*(arm(name, *side.tolist()) for name, side in zip("AB", drawn, strict=True))).significant
     assert wrong <= 32  # 3 standard deviations above 5 %
 
 
@@ -95,11 +94,11 @@ def test_what_is_not_paired_is_refused():
     with pytest.raises(UsageError, match=r"training seeds differ: A has \[0, 1\], B \[0, 1, 2\]"):
         require_pair(arm("A", HARD, HARD), arm("B", HARD, HARD, HARD))
     with pytest.raises(ManipError, match=r"test episodes differ: A has 100, B 50, of which 50 are the same"):
-        Comparison(one("A", HARD), one("B", HARD[:50]))
+        Comparison.of(one("A", HARD), one("B", HARD[:50]))
     with pytest.raises(MismatchError, match=r"robot differs: A has panda, B has fetch"):
-        Comparison(one("A", HARD), Arm("B", (made_member(HARD, robot="fetch"),)))
+        Comparison.of(one("A", HARD), Arm("B", (made_member(HARD, robot="fetch"),)))
     with pytest.raises(MismatchError, match=r"tolerance differs: A has 0\.02, B has 0\.05"):
-        Comparison(one("A", HARD), Arm("B", (made_member(HARD, settings=EvalSettings(100, 0.05)),)))
+        Comparison.of(one("A", HARD), Arm("B", (made_member(HARD, settings=EvalSettings(100, 0.05)),)))
 
 
 def member(name: str, seed: int, outcomes: list[bool], successes: tuple[float, ...], labels: int = 100) -> Member:
@@ -144,21 +143,13 @@ def test_a_row_holds_what_the_arm_had_cost_and_how_it_did():
         "validation": "100.0 % (100.0, 100.0)",
         "test": "80.0 % (80.0, 80.0)",
         "test, against cloning": "+30.0 points [+30.0, +30.0], p < 0.001",
-        "largest dip [points]": "0.0",
     }
     assert row(STUDY, "cloning")["test, against cloning"] == ""
-    assert row(STUDY, "cloning")["largest dip [points]"] == "10.0"
 
 
-def test_the_target_is_told_in_every_cost_and_costs_within_amounts():
+def test_the_target_is_told_in_every_cost():
     assert list(row(STUDY, "dagger", "target_table").values()) == ["dagger", "200", "6", "20.0 s"]
     assert row(replace(STUDY, target=1.0), "cloning", "target_table")["labels to 100 %"] == "not in 2 of 2 seeds"
-    within = replace(STUDY, within=(("labels", 250), ("labels", 50)))
-    assert row(within, "dagger", "within_table") == {
-        "arm, validation": "dagger",
-        "within 250 labels": "90.0 % (90.0, 90.0)",
-        "within 50 labels": "",
-    }
 
 
 def test_compare_json_holds_every_round_and_what_the_verdict_rests_on():

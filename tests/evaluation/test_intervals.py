@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from manip_il.errors import UsageError
 from manip_il.evaluation.intervals import (
-    PairedComparison,
+    Pairs,
     Proportion,
-    compare_paired,
     confidence_sequence,
     format_p,
     mean_interval,
@@ -97,54 +96,30 @@ def test_newcombes_paired_interval_agrees_with_worked_examples(
 ):
     digits = 5e-5 if round(low, 3) != low else 5e-4
     both, only_first, only_second, neither = table
-    paired = PairedComparison("second", "first", both, only_second, only_first, neither)
-    assert paired.interval == pytest.approx((low, high), abs=digits)
-
-
-def mcnemar(only_left: int, only_right: int) -> float:
-    return PairedComparison("A", "B", 0, only_left, only_right, 1).p_value
+    assert Pairs(both, only_second, only_first, neither).interval == pytest.approx((low, high), abs=digits)
 
 
 @pytest.mark.parametrize(
     ("only_a", "only_b", "p"),
     [(1, 7, 18 / 256), (0, 5, 2 / 32), (0, 6, 2 / 64), (3, 3, 1.0), (0, 0, 1.0), (10, 2, 2 * 79 / 4096)],
 )
-def test_mcnemar_is_the_exact_binomial(only_a: int, only_b: int, p: float):
-    assert mcnemar(only_a, only_b) == pytest.approx(p, rel=1e-12)
+def test_with_one_training_seed_the_test_is_mcnemars_with_the_exact_binomial(only_a: int, only_b: int, p: float):
+    assert sign_flip_exact([-1] * only_a + [1] * only_b + [0] * 3) == pytest.approx(p, rel=1e-12)
 
 
 @given(outcomes)
 def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(pairs: list[tuple[bool, bool]]):
     a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    forward, backward = compare_paired(a, b), compare_paired(b, a)
+    forward, backward = Pairs.of(zip(a, b, strict=True)), Pairs.of(zip(b, a, strict=True))
     low, high = forward.interval
     assert -1 <= low <= forward.difference <= high <= 1
     assert backward.interval == pytest.approx((-high, -low), abs=1e-12)
     assert forward.difference == pytest.approx((sum(b) - sum(a)) / len(pairs))
 
 
-def test_the_verdict_names_the_better_policy_and_its_margin():
-    left, right = [True] * 60 + [False] * 40, [True] * 100
-    verdict = compare_paired(left, right, ("BC", "DAgger")).verdict
-    assert verdict.startswith("DAgger is better than BC by 40.0 points [")
-    assert "p < 0.001" in verdict
-    assert compare_paired(right, left, ("DAgger", "BC")).verdict == verdict
-
-
-def test_without_a_significant_difference_the_verdict_says_so():
-    verdict = compare_paired([True, False, True], [True, True, True], ("BC", "DAgger")).verdict
-    assert verdict.startswith("No difference shown between DAgger and BC")
-
-
 def test_p_values_read_well():
     assert format_p(0.03125) == "p = 0.031"
     assert format_p(1e-9) == "p < 0.001"
-
-
-@given(st.integers(0, 40), st.integers(0, 40), st.integers(0, 40))
-def test_with_one_training_seed_the_test_is_mcnemars(only_left: int, only_right: int, same: int):
-    differences = [-1] * only_left + [1] * only_right + [0] * same
-    assert sign_flip_exact(differences) == pytest.approx(mcnemar(only_left, only_right), rel=1e-12)
 
 
 @given(few)

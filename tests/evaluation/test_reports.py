@@ -8,8 +8,14 @@ from pathlib import Path
 import pytest
 
 from manip_il.evaluation.arm import Arm
-from manip_il.evaluation.compare_report import arm_colours, compare_report
-from manip_il.evaluation.eval_report import eval_report, phase_meanings, phase_table, run_report
+from manip_il.evaluation.eval_report import (
+    arm_colours,
+    compare_report,
+    eval_report,
+    phase_meanings,
+    phase_table,
+    run_report,
+)
 from manip_il.evaluation.figures import Bar, Curve, curve_figures, rates_figure
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.report import Film, Still, flatten

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError
+from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import confidence_sequence, wilson_interval
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, compare_results, merge_results
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, merge_results
 from manip_il.sim.conditions import Condition
 
 SETTINGS = EvalSettings(horizon=150, tolerance=0.02)
@@ -165,19 +166,22 @@ def test_no_episode_and_a_repeated_seed_are_refused():
         replace(made, episodes=(made.episodes[0], made.episodes[0]))
 
 
+def compared(left: EvalResult, right: EvalResult) -> Comparison:
+    return Comparison(left.policy, right.policy, ((left, right),))
+
+
 def test_results_are_compared_on_the_seeds_they_share():
-    comparison = compare_results(result([True, False, False]), result([True, True], first_seed=101, policy="act"))
-    assert (comparison.n, comparison.only_right, comparison.only_left) == (2, 2, 0)
-    assert (comparison.left, comparison.right) == ("mlp", "act")
+    [pairs] = compared(result([True, False, False]), result([True, True], first_seed=101, policy="act")).pairs
+    assert (pairs.n, pairs.only_right, pairs.only_left) == (2, 2, 0)
 
 
 def test_unlike_results_are_not_compared():
     with pytest.raises(ManipError, match="share no seed"):
-        compare_results(result([True]), result([True], first_seed=500))
+        compared(result([True]), result([True], first_seed=500))
     with pytest.raises(MismatchError, match="task differs: mlp has pick, act has push"):
-        compare_results(result([True]), result([True], policy="act", task="push"))
+        compared(result([True]), result([True], policy="act", task="push"))
     with pytest.raises(MismatchError, match="suite differs: mlp has nominal, mlp has knocked"):
-        compare_results(result([True]), result([True], settings=replace(SETTINGS, suite="knocked")))
+        compared(result([True]), result([True], settings=replace(SETTINGS, suite="knocked")))
 
 
 def part(first: int, outcomes: list[bool], **changes: Any) -> EvalResult:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.rounds import Rule, history, largest_dip
+from manip_il.evaluation.rounds import Rule, history
 
 SUCCESS = (0.5, 0.9, 0.8, 0.9, 0.7)
 
@@ -73,9 +73,3 @@ def test_a_run_without_a_round_that_early_is_refused():
         Rule("best", "labels").limited(late).select(late["late"], "late")
     with pytest.raises(UsageError, match="y has no rounds"):
         Rule("best", "labels").limited({"x": RUN, "y": ()})
-
-
-def test_a_dip_is_measured_from_the_best_before():
-    assert largest_dip(RUN) == pytest.approx(0.2)
-    assert largest_dip(RUN[:2]) == 0
-    assert largest_dip(history(records((0.9, 0.1, 0.95)), "x")) == pytest.approx(0.8)

@@ -113,9 +113,7 @@ MISTAKES = {
     "has no task": ("x = 1", "has the tasks none; expected exactly one"),
     "has two": (f"{TOUCH}\nclass Other(Touch): pass\n", "has the tasks Touch, Other; expected exactly one"),
     "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
-    "has no rungs": (TOUCH.replace("    rungs = (", "    rungs = () and ("), "has no rungs"),
     "has another's name": (TOUCH.replace('name = "touch"', 'name = "lift"'), "called 'lift', as one that ships"),
-    "has no limits": (TOUCH.replace("limits = Limits(", "limits = dict("), "limits is a dict; expected Limits"),
 }
 
 

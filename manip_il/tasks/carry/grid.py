@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
+from manip_il.robots.reach import reach_of
+from manip_il.robots.robot import Robot
 from manip_il.tasks.carry.layout import Layout
 from manip_il.tasks.carry.reward import Reward
 
@@ -34,25 +36,13 @@ _SLACK = 0.003  # of the room on the way from beside a node, which is as near to
 _WORSE = 1e-4  # of the room at the start, on the way out of where there is none [m]
 
 
-@dataclass(frozen=True, eq=False)
-class Space:
-    """Workspace of an arm: its middle on the table (x, y) and half its width [m], and where the hand gets to.
-
-    origin: of the map of that (3,) [m]; cell: of it [m]; there: whether the hand gets to all corners of each cell.
-    """
-
-    centre: tuple[float, float]
-    half_width: float
-    origin: tuple[float, float, float]
-    cell: float
-    there: NDArray[np.bool_]
-
-    def has(self, points: F64) -> NDArray[np.bool_]:
-        """Return whether the hand gets to points (N, 3) [m], (N,)."""
-        index = np.floor((points - np.array(self.origin)) / self.cell).astype(np.int64)
-        last = np.array(self.there.shape) - 1
-        inside = ((index >= 0) & (index <= last)).all(axis=1)
-        return inside & self.there[tuple(index.clip(0, last).T)]
+def reaches(robot: Robot, points: F64) -> NDArray[np.bool_]:
+    """Return whether a robot's hand gets to points (N, 3) [m], (N,)."""
+    reach = reach_of(robot)
+    index = np.floor((points - reach.origin) / reach.cell).astype(np.int64)
+    last = np.array(reach.arrives.shape) - 1
+    inside = ((index >= 0) & (index <= last)).all(axis=1)
+    return inside & reach.arrives[tuple(index.clip(0, last).T)]
 
 
 class _Links(NamedTuple):
@@ -83,17 +73,16 @@ class Grid:
     shape: nodes along x, y and z; origin (3,) [m] and cell [m]; goal: number of the node at the goal.
     """
 
-    def __init__(self, layout: Layout, space: Space):
-        self.layout, self.cell = layout, CELL * layout.scale
-        half = space.half_width + BEYOND * layout.scale
-        goal, low = np.array(layout.goal), np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
+    def __init__(self, layout: Layout, robot: Robot):
+        self.layout, self.cell, self._robot = layout, CELL * layout.scale, robot
+        (x, y), half = robot.workspace.centre, robot.workspace.half_width + BEYOND * layout.scale
+        goal, low = np.array(layout.goal), np.array([x - half, y - half, 0.0])
         sizes = np.array([2 * half, 2 * half, TOP * layout.scale])
         before = np.floor((goal - low) / self.cell + 1e-9).astype(np.int64)  # nodes on this side of the goal
         self.origin = goal - self.cell * before
         counts = np.maximum(np.floor(sizes / self.cell + 1e-9).astype(np.int64), before) + 1
         self.shape: tuple[int, int, int] = tuple(counts.tolist())
         self.goal = int(np.ravel_multi_index(tuple(before.clip(0)), self.shape))
-        self._space = space
 
     @cached_property
     def points(self) -> F64:
@@ -112,7 +101,7 @@ class Grid:
         layout, points = self.layout, self.points
         off = np.hypot(*(points[:, :2] - np.array(layout.goal[:2])).T)
         low = (points[:, 2] < layout.half + LIFTED - 1e-9) & (off > DOWN * layout.scale)
-        found = self._space.has(points) & (layout.room(points) >= 0) & ~low
+        found = reaches(self._robot, points) & (layout.room(points) >= 0) & ~low
         found[self.goal] |= bool(layout.room(points[[self.goal]])[0] >= 0)
         return found
 
@@ -269,7 +258,7 @@ class Descent:
 
 
 @lru_cache(KEPT)
-def descent(layout: Layout, reward: Reward, space: Space) -> Descent:
+def descent(layout: Layout, reward: Reward, robot: Robot) -> Descent:
     """Return the descent of a layout's costs-to-go for a reward, computed once and kept for a while."""
-    grid, weights = Grid(layout, space), np.array(reward.weights)
+    grid, weights = Grid(layout, robot), np.array(reward.weights)
     return Descent(grid, grid.costs_to_go(weights), weights)

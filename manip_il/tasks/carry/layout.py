@@ -119,13 +119,6 @@ class Layout:
         bottoms, radii = np.array(self.parts).T
         return bottoms, radii
 
-    def line_features(self, starts: F64, ends: F64, count: int = 2) -> F64:
-        """Return features of lines between points (N, 3) [m], (N, K), by Simpson's rule over `count` pieces."""
-        shares, weights = _simpson(count)
-        points = starts[:, None] + shares[:, None] * (ends - starts)[:, None]
-        densities = self.densities(points.reshape(-1, 3)).reshape(len(starts), len(shares), -1)
-        return np.linalg.norm(ends - starts, axis=1)[:, None] * np.einsum("s,nsk->nk", weights, densities)
-
     def free(self, starts: F64, ends: F64, spare: float = 0.0) -> NDArray[np.bool_]:
         """Return whether straight lines from (N, 3) to (N, 3) [m] keep room to spare, (N,)."""
         shares = np.linspace(0.0, 1.0, _pieces(starts, ends) + 1)
@@ -137,20 +130,16 @@ def path_features(layout: Layout, positions: F64) -> F64:
     """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along it, (K,)."""
     if len(positions) < 2:
         return np.zeros(len(FEATURES))
-    starts, ends = positions[:-1], positions[1:]
-    return layout.line_features(starts, ends, _pieces(starts, ends)).sum(axis=0)
+    starts, ways = positions[:-1], np.diff(positions, axis=0)
+    count = _pieces(starts, positions[1:])
+    points = starts[:, None] + ((np.arange(count) + 0.5) / count)[:, None] * ways[:, None]
+    densities = layout.densities(points.reshape(-1, 3)).reshape(len(starts), count, -1).mean(axis=1)
+    return np.linalg.norm(ways, axis=1) @ densities
 
 
 def _pieces(starts: F64, ends: F64) -> int:
     longest = float(np.linalg.norm(ends - starts, axis=1).max(initial=0.0))
     return max(1, int(np.ceil(longest / (2 * STEP))))
-
-
-def _simpson(count: int) -> tuple[F64, F64]:
-    """Places along a line, 0 to 1, and their weights, which sum to 1, (2 count + 1,) each."""
-    weights = np.ones(2 * count + 1)
-    weights[1::2], weights[2:-1:2] = 4.0, 2.0
-    return np.arange(2 * count + 1) / (2 * count), weights / weights.sum()
 
 
 def _beside(points: F64, middle: F64, half: F64) -> F64:

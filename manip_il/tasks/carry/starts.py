@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.carry.hand import hand_of
 from manip_il.tasks.carry.layout import THINGS, Layout
-from manip_il.tasks.carry.things import EDGE, PARKED, Pose, make_layout, scale_of
+from manip_il.tasks.carry.things import EDGE, PARKED, Pose, hand_of, make_layout, scale_of
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 

@@ -20,19 +20,19 @@ from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry.grid import Descent, descent
-from manip_il.tasks.carry.hand import fits, hand_of
+from manip_il.tasks.carry.grid import Descent, descent, reaches
 from manip_il.tasks.carry.layout import ABOVE, ASIDE, FULL, THINGS
 from manip_il.tasks.carry.reward import DEFAULT, TASTES, Reward
 from manip_il.tasks.carry.starts import draw_names, draw_things
 from manip_il.tasks.carry.things import (
     TASTE_BODIES,
     add_things,
+    fits,
+    hand_of,
     layout_of,
     observe_things,
     reward_in,
     scale_of,
-    space_of,
 )
 from manip_il.tasks.grasp import grasp_of
 from manip_il.tasks.ladder import (
@@ -60,7 +60,7 @@ _GRASPED = 0.5  # progress of an object that is held
 
 def descent_of(world: World) -> Descent:
     """Return the descent of the costs-to-go of a world's episode."""
-    return descent(layout_of(world, OBJECT), reward_in(world), space_of(world.scene.robot))
+    return descent(layout_of(world, OBJECT), reward_in(world), world.scene.robot)
 
 
 def _look(world: World) -> tuple[float, F64 | None]:
@@ -230,4 +230,4 @@ def _has_way(world: World, at: F64, goal: F64) -> bool:
     height = scale * max(thing.height for thing in THINGS.values()) + max(world.extents(OBJECT)) / 2 + 2 * ABOVE
     over = [np.array([*one[:2], max(height, goal[2])], np.float64) for one in (at, goal)]
     lines = [np.linspace(start, end, 12) for start, end in ((at, over[0]), (over[0], over[1]), (over[1], goal))]
-    return bool(space_of(world.scene.robot).has(np.concatenate(lines, dtype=np.float64)).all())
+    return bool(reaches(world.scene.robot, np.concatenate(lines, dtype=np.float64)).all())

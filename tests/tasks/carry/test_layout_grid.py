@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from manip_il.rewards.paths import cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
-from manip_il.tasks.carry.grid import Grid, descent
+from manip_il.tasks.carry.grid import Grid, descent, reaches
 from manip_il.tasks.carry.layout import THINGS, Edge, Layout, Part, path_features
 from manip_il.tasks.carry.reward import FEATURES, TASTES, Reward
-from manip_il.tasks.carry.things import space_of
 
 from ...tables import every_robot
 
@@ -30,14 +29,14 @@ LAYOUT = Layout(
     half=0.025,
     parts=PARTS,
 )
-SPACE = space_of(get_robot("panda"))
+ROBOT = get_robot("panda")
 STARTS = np.array([[0.35, -0.13, 0.07], [0.58, -0.12, 0.09], [0.45, 0.0, 0.25], [0.3, 0.1, 0.2]])
 CAREFUL = TASTES["careful"]
 
 
 @cache
 def grid() -> Grid:
-    return Grid(LAYOUT, SPACE)
+    return Grid(LAYOUT, ROBOT)
 
 
 def node_near(position: np.ndarray) -> int:
@@ -87,7 +86,7 @@ def test_a_heavier_weight_keeps_planned_paths_no_nearer(name: str):
 
 @given(st.integers(0, 2**32 - 1))
 def test_the_descent_leads_to_the_goal_past_all_things(seed: int):
-    down, rng = descent(LAYOUT, CAREFUL, SPACE), np.random.default_rng(seed)
+    down, rng = descent(LAYOUT, CAREFUL, ROBOT), np.random.default_rng(seed)
     position = grid().points[rng.choice(np.flatnonzero(grid().free))] + rng.uniform(-0.01, 0.01, 3)
     cost, heading = down.look(position)
     room, costs = LAYOUT.room(position[None])[0], [cost]
@@ -106,7 +105,7 @@ def test_the_descent_leads_to_the_goal_past_all_things(seed: int):
 
 @given(st.integers(0, 2**32 - 1))
 def test_the_descent_leads_on_from_beside_any_node(seed: int):
-    down, rng = descent(LAYOUT, CAREFUL, SPACE), np.random.default_rng(seed)
+    down, rng = descent(LAYOUT, CAREFUL, ROBOT), np.random.default_rng(seed)
     node = rng.choice(np.flatnonzero(np.isfinite(down.costs)))
     position = grid().points[node] + rng.uniform(-1e-3, 1e-3, 3)
     heading = down.look(position)[1]
@@ -125,7 +124,7 @@ def test_free_nodes_and_edges_keep_their_room():
 
 @given(st.integers(0, 2**32 - 1))
 def test_a_straight_line_becomes_a_path_no_longer_than_the_grids_shortest(seed: int):
-    empty = Grid(replace(LAYOUT, places=(), edge=None), SPACE)
+    empty = Grid(replace(LAYOUT, places=(), edge=None), ROBOT)
     rng = np.random.default_rng(seed)
     start = np.array([0.45, 0.0, 0.17]) + rng.uniform(-1, 1, 3) * [0.15, 0.15, 0.1]
     line = np.linspace(start, LAYOUT.goal, 15) + rng.normal(0, 5e-4, (15, 3))
@@ -136,7 +135,7 @@ def test_a_straight_line_becomes_a_path_no_longer_than_the_grids_shortest(seed: 
 
 
 def test_a_path_that_is_snapped_costs_about_what_it_does():
-    down = descent(LAYOUT, CAREFUL, SPACE)
+    down = descent(LAYOUT, CAREFUL, ROBOT)
     weights = down.weights
     for start in STARTS:
         position, path = start, [start]
@@ -153,7 +152,7 @@ def test_a_path_that_is_snapped_costs_about_what_it_does():
 
 def test_where_no_free_path_is_there_is_nowhere_to_head_for():
     shut = replace(LAYOUT, places=(("vase", LAYOUT.goal[:2]),))
-    down = descent(shut, CAREFUL, SPACE)
+    down = descent(shut, CAREFUL, ROBOT)
     assert np.isinf(np.delete(down.costs, down.grid.goal)).all()
     assert down.look(STARTS[0]) == (np.inf, None)
     assert not down.leads(STARTS[0])
@@ -171,11 +170,15 @@ def test_a_path_has_no_features_of_things_that_are_not_there_and_its_parts_add_u
 
 
 @every_robot
-def test_a_space_is_the_map_of_where_the_hand_gets_to(robot: str):
-    space, reach = space_of(get_robot(robot)), reach_of(get_robot(robot))
-    points = np.array([*space.centre, 0.1]) + np.random.default_rng(0).uniform(-0.4, 0.4, (500, 3)) * [1, 1, 0.5]
-    assert space.has(points).tolist() == [reach.has(point) for point in points]
-    assert 0 < space.has(points).sum() < len(points)
+def test_the_grid_takes_the_map_of_where_the_hand_gets_to(robot: str):
+    arm, reach = get_robot(robot), reach_of(get_robot(robot))
+    points = np.array([*arm.workspace.centre, 0.1]) + np.random.default_rng(0).uniform(-0.4, 0.4, (500, 3)) * [
+        1,
+        1,
+        0.5,
+    ]
+    assert reaches(arm, points).tolist() == [reach.has(point) for point in points]
+    assert 0 < reaches(arm, points).sum() < len(points)
 
 
 def test_things_that_stand_in_one_another_are_seen():
