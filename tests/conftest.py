@@ -47,6 +47,7 @@ forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignor
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
 LONG = (
     "docs/test_commands.py",
+    "course/test_notebooks.py",
     "evaluation/test_certificate.py",
     "store/test_kills.py",
     "lerobot_commands/test_policies.py",

@@ -1,0 +1,72 @@
+"""The course's notebooks run from a fresh kernel, and every check in them fails until the reader has done its part."""
+
+from __future__ import annotations
+
+import contextlib
+from copy import deepcopy
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+
+COURSE = Path(__file__).resolve().parents[2] / "docs" / "course"
+WHOLE = ("1_cloning", "3_seeing", "4_rewards")  # nothing to fill in
+EXERCISES, SOLUTIONS = "2_dagger", "2_dagger_solutions"
+SECONDS = 900  # of a cell, on a machine that does much else
+
+
+def read(name: str) -> nbformat.NotebookNode:
+    return nbformat.read(COURSE / f"{name}.ipynb", as_version=4)
+
+
+def client_of(book: nbformat.NotebookNode, folder: Path, monkeypatch: pytest.MonkeyPatch) -> NotebookClient:
+    """A client whose kernel runs in `folder`, keeps its files there, and has nowhere to fetch anything from."""
+    monkeypatch.setenv("TMPDIR", str(folder))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    return NotebookClient(book, timeout=SECONDS, resources={"metadata": {"path": str(folder)}})
+
+
+def tag_of(cell: nbformat.NotebookNode) -> str:
+    return next(iter(cell.metadata.get("tags", [])), "")
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_notebook_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    client_of(read(name), tmp_path, monkeypatch).execute()
+
+
+@pytest.mark.slow
+def test_each_check_fails_on_the_unfilled_cell_and_passes_on_the_solution(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    cells = read(EXERCISES).cells
+    solved = read(SOLUTIONS)
+    client, checks = client_of(deepcopy(solved), tmp_path, monkeypatch), 0
+    with client.setup_kernel():
+        for place, (unfilled, cell) in enumerate(zip(cells, solved.cells, strict=True)):
+            if tag_of(cell) == "exercise":
+                assert tag_of(cells[place + 1]) == "check"
+                with contextlib.suppress(CellExecutionError):
+                    client.execute_cell(deepcopy(unfilled), place)
+                with pytest.raises(CellExecutionError):
+                    client.execute_cell(deepcopy(cells[place + 1]), place + 1)
+                checks += 1
+            client.execute_cell(cell, place)
+    assert checks == sum(tag_of(cell) == "check" for cell in cells) >= 5
+
+
+def test_the_solutions_differ_from_the_exercises_in_the_exercises_alone():
+    for unfilled, solved in zip(read(EXERCISES).cells, read(SOLUTIONS).cells, strict=True):
+        assert (unfilled.source != solved.source) == (tag_of(unfilled) == "exercise"), solved.source
+
+
+@pytest.mark.parametrize("path", sorted(COURSE.glob("*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_is_small_and_holds_no_output(path: Path):
+    cells = [cell for cell in read(path.stem).cells if cell.cell_type == "code"]
+    assert path.stat().st_size < 200_000
+    assert [cell for cell in cells if cell.outputs or cell.execution_count] == []
