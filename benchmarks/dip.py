@@ -68,7 +68,7 @@ def jumping_labels() -> Iterator[None]:
     make_expert.cache_clear()
     unbounded: dict[str, Any] = {
         "_clip_norm": lambda vector, _longest: vector,
-        "_turn_towards": lambda _rotation, target, _largest: target,
+        "turned_towards": lambda _rotation, target, _largest: target,
     }
     with patch.object(ArmIK, "step", unclipped), patch.multiple(expert, **unbounded):
         yield

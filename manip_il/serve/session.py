@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 
 from manip_il.errors import ManipError
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.cameras import Cameras
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.log import SessionLog
-from manip_il.serve.operator import HELD, URGENT, Operator
+from manip_il.serve.operator import HELD, URGENT, Operator, weigh_session
 from manip_il.serve.station import Station
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
@@ -43,7 +43,7 @@ def serve(
     sys.setswitchinterval(5e-4)  # of threads [s]: a bus waits for no other
     with contextlib.suppress(OSError):  # a servo answers within milliseconds, whatever else runs
         os.nice(-URGENT)
-        Path("/proc/self/autogroup").write_text("-20")  # Linux weighs sessions before it weighs processes
+    weigh_session()
     with contextlib.ExitStack() as stack:
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
@@ -53,6 +53,9 @@ def serve(
         there = set(log.seeds if log is not None else [])
         seeds = (seed for seed in stream_seeds("demonstrations", BLOCK, config.seed) if seed not in there)
         station.reset(next(seeds))
+        gc.collect()
+        gc.freeze()  # a collection of all that LeRobot and torch have imported takes longer than a client waits
+        stack.callback(gc.unfreeze)
         if cameras is not None:
             shown = Cameras(station, cameras, config.camera_port)
             stack.callback(shown.close, warn)

@@ -118,7 +118,7 @@ def test_train_refuses_a_dataset_with_nan(demos, tmp_path, error):
     [path] = broken.glob("data/*/*.parquet")
     edit_table(path, lambda columns: columns["action"][5].__setitem__(0, math.nan))
     assert main(["train", f"--dataset.root={broken}", f"--output_dir={tmp_path / 't'}"]) == 1
-    assert "column action, row 5" in error()
+    assert "column action: nan at frame 5" in error()
 
 
 def test_train_to_eval(policy, tmp_path, capsys, error):

@@ -84,8 +84,8 @@ def feature(kind: str, *shape: int) -> dict[str, object]:
         (lambda policy: (policy / "model.safetensors").unlink(), "no model.safetensors in"),
         (lambda policy: (policy / "pytorch_model.bin").write_bytes(b"\x80\x04N."), "pytorch_model.bin is a pickle"),
         (
-            {"input_features": {STATE: feature("STATE", 8), "observation.images.top": feature("VISUAL", 3, 32, 32)}},
-            "unknown camera 'top'; known: front, side, wrist",
+            {"input_features": {STATE: feature("STATE", 8), "observation.images.belly": feature("VISUAL", 3, 32, 32)}},
+            "unknown camera 'belly'; known: front, side, wrist",
         ),
         (
             {"input_features": {STATE: feature("STATE", 8), "observation.effort": feature("STATE", 8)}},

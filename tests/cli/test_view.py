@@ -123,4 +123,4 @@ def test_what_cannot_be_watched_is_refused(words: list[str], says: str, here, er
 def test_a_display_that_does_not_answer_is_said_in_one_line(monkeypatch, error):
     monkeypatch.setenv("DISPLAY", ":77")
     assert main(REACH) == 1
-    assert "no window can be opened on the display (DISPLAY=:77)" in error()
+    assert "no display: DISPLAY=:77" in error()

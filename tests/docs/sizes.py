@@ -72,7 +72,8 @@ def small_words(words: Sequence[str]) -> list[str]:
         return list(words)
     known = {option.name for option in options_of(load(name)) if not option.positional}
     given = option_names(own)
-    small = {option: size for option, size in SMALL.items() if option != "env.horizon" or not _is_stock(own)}
+    as_it_is = _is_stock(own) or "configs/studies/ten_tasks.yaml" in own  # whose drawer takes more steps
+    small = {option: size for option, size in SMALL.items() if option != "env.horizon" or not as_it_is}
     sizes = {option: size for option, size in (small | OF_COMMAND.get(name, {})).items() if option in known}
     sizes |= {option: size for option, size in GIVEN.items() if option in given}
     if {"policy", "policy.width"} & known:

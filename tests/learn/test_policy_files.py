@@ -34,7 +34,7 @@ def test_pictures_that_no_environment_has_are_refused(tmp_path):
         visual = {f"observation.images.{name}": {"type": "VISUAL", "shape": shape} for name, shape in pictures.items()}
         edit_config(folder, input_features=features | visual)
 
-    for pictures, words in (({"top": [3, 32, 32]}, "camera 'top'"), ({"front": [3, 33, 32]}, "height 33")):
+    for pictures, words in (({"belly": [3, 32, 32]}, "camera 'belly'"), ({"front": [3, 33, 32]}, "height 33")):
         look_at(**pictures)
         with pytest.raises(ManipError, match=words):
             policy_cameras(folder)

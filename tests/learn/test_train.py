@@ -417,7 +417,7 @@ def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerob
         f"--output_dir={tmp_path / 'd'}",
     ]
     assert main([*again, "--policy.type=act", "--observation=images"]) == 1
-    assert "has no sim_state: it was not recorded in simulation" in capsys.readouterr().err
+    assert "has no sim_state, so rollouts cannot be added to it" in capsys.readouterr().err
     config = run / "checkpoints/last/pretrained_model/train_config.json"
     more = [f"--dataset.root={root}", f"--output_dir={run}", "--steps=6", "--num_workers=0"]
     done = warm_lerobot.run("lerobot-train", f"--config_path={config}", "--resume=true", *more)

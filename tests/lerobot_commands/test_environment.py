@@ -100,7 +100,11 @@ def test_the_plugin_brings_our_policies():
     [
         ({"task": "PandaPick-v0"}, UnknownName, "did you mean 'PandaPickPlace-v0'"),
         ({"task": "PandaLift-v0", "robot": "fetch"}, UsageError, "--env.robot is 'fetch'.*is panda's"),
-        ({"observation": "images", "cameras": "front, top"}, UnknownName, "unknown camera 'top'.*front, side, wrist"),
+        (
+            {"observation": "images", "cameras": "front, belly"},
+            UnknownName,
+            "unknown camera 'belly'.*front, side, wrist",
+        ),
         ({"fps": 501}, UsageError, "expected 1 to 500"),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,8 @@ Run = Callable[..., list[Episode]]
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Run:
-    """Runs a program against `lift`; returns what was logged. arms: that it opens."""
+def run(tmp_path: Path, start: Callable[..., ForkServerProcess]) -> Run:
+    """Runs a program against `lift`, served by a process of its own; returns what was logged. arms: that it opens."""
 
     def run(program: str, *words: str, arms: str = "follower leader", served: tuple[str, ...] = ()) -> list[Episode]:
         root, path = tmp_path / "arm", Path(sys.executable).with_name(program)
@@ -29,7 +30,9 @@ def run(tmp_path: Path) -> Run:
         robot, teleop = [*robot, f"--robot.calibration_dir={root}"], [*teleop, f"--teleop.calibration_dir={root}"]
         options = [*(robot if "follower" in arms else []), *(teleop if "leader" in arms else []), *words]
         own = ["serve", "--task.type=lift", f"--output_dir={root}", f"--log={tmp_path}/log", *served]
-        assert main([*own, "--", str(path), *options]) == 0
+        served_by = start(*own, "--", str(path), *options, log=tmp_path / "said")
+        served_by.join()
+        assert served_by.exitcode == 0, (tmp_path / "said").read_text()[-3000:]
         return [read_journal(path)[1] for path in list_episodes(tmp_path / "log")]
 
     return run
