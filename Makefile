@@ -46,13 +46,16 @@ demo-eyes: setup  ## a policy from pictures, from nothing, in half an hour: runs
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
 # A file's tests stay in one worker, so that what they share is made once; tests/conftest.py puts long files first.
 # A worker that dies ends the run: what comes after it would wait for ever.
-TWO := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
+TWO := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0 --ignore=tests/serve
+# Those that run by the clock come last and alone: LeRobot waits 50 ms for an answer.
 test: setup .venv/.robots  ## every test
 	@.ci/system browser sshd
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO)
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/serve
 
 test-fast: setup .venv/.robots  ## the tests that take seconds and need no OpenGL
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO) -m "not slow and not gl"
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/serve -m "not slow and not gl"
 
 FUZZ ?= 20000
 fuzz: setup  ## FUZZ=20000 mutated inputs of every kind that is read: each accepted, or refused in one line
