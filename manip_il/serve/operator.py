@@ -310,9 +310,9 @@ def _start(command: Sequence[str]) -> tuple[int, int]:
 
 
 def weigh_session() -> None:
-    """Let the session of this process come before others, if we may: Linux weighs sessions before processes.
+    """Raise the priority of this process's session if permitted; Linux shares its time among sessions first.
 
-    A program and its servos are two sessions: each must answer the other within milliseconds.
+    The program and its servos run in two sessions, and each must answer the other within milliseconds.
     """
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text("-20")

@@ -40,7 +40,7 @@ def serve(
     Raises `UsageError` for a robot without Feetech servos or a port that is taken, `ManipError` if the program failed.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.setswitchinterval(5e-4)  # of threads [s]: a bus waits for no other
+    sys.setswitchinterval(5e-4)  # [s]: the threads of the buses get their turn within it
     with contextlib.suppress(OSError):  # a servo answers within milliseconds, whatever else runs
         os.nice(-URGENT)
     weigh_session()
