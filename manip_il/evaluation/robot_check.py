@@ -158,7 +158,7 @@ def check_report(
         f"Starts: of {STARTS} that are drawn, how many find a place within reach before one does not. Random actions: "
         "a tenth of the control steps, the gripper's too. Intervals are Wilson's score intervals."
     )
-    home = "Of ee, x is red, y (the fingers' way) green, z (out of the hand) blue."
+    home = "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue."
     reach = (
         f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table: where "
         "it is green."
