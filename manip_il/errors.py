@@ -37,10 +37,6 @@ class UsageError(ManipError):
     exit_code = 2
 
 
-class NoEffect(UsageError):
-    """A suite or a variation changes nothing in a task."""
-
-
 class UnknownName(UsageError):
     """A name that is not in a table of names; says which names are, and the nearest."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -18,6 +18,7 @@ from manip_il.tasks.config import EnvConfig
 if TYPE_CHECKING:
     from manip_il.evaluation.arm import Arm
     from manip_il.evaluation.comparison import Study
+    from manip_il.evaluation.runner import Trial
 
 EPISODES = 500  # of a test
 _YAML = (".yaml", ".yml")
@@ -69,60 +70,71 @@ class CompareOptions(Tested, Seeded, Trusting):
                 raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML of one study")
 
     def _run_study(self, path: Path) -> None:
-        from manip_il.cli.study import expert_trials, learn, read_plan, tested
-
-        plan = read_plan(path, self.training_seeds, self.trust)
-        experts = expert_trials(plan)
-        with self.output.open(plan.file) as folder:
-            learn(plan, folder, self.engine)
-            study = tested(plan, experts, folder, self.engine, self.trust)
-            result = study.arms[0].members[0].test
-            what = f"{result.robot} {result.task}" if plan.baseline else result.robot
-            self._answer(study, folder, f"Study: {what}, {path.stem}", to_plain(plan.file))
-
-    def _compare(self, left: Path, right: Path) -> None:
-        from manip_il.cli.inputs import check_policies
-        from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.evaluation.arm import read_arm, require_pair
+        from manip_il.cli.study import learn, learnt, read_plan
+        from manip_il.evaluation.arm import select_rounds
         from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
-        from manip_il.evaluation.runner import Trial
-        from manip_il.seeding import stream_seeds
+
+        plan = read_plan(path, self.training_seeds, self.trust)
+        file = plan.file
+        with self.output.open(file) as folder:
+            learn(plan, folder, self.engine)
+            rule, arms = select_rounds(Rule(file.checkpoint, file.at), learnt(plan, folder))
+            trials = [self._trial(plan.envs[arm.name], [arm], file.eval.n_episodes) for arm in arms]
+            study = Study(self._measure(arms, trials, folder), plan.baseline, rule, file.target)
+            result = study.arms[0].members[0].test
+            what = f"{result.robot} {result.task}" if plan.baseline else result.robot
+            self._answer(study, folder, f"Study: {what}, {path.stem}", to_plain(file))
+
+    def _compare(self, left: Path, right: Path) -> None:
+        from manip_il.data.fingerprint import compare_fingerprints
+        from manip_il.evaluation.arm import read_arm, require_pair, select_rounds
+        from manip_il.evaluation.comparison import Study
+        from manip_il.evaluation.rounds import Rule
 
         both = (read_arm(left), read_arm(right))
         require_pair(*both)
-        members = [member for arm in both for member in arm.members]
-        rule = Rule(self.checkpoint, self.at).limited({one.name: one.history for one in members})
-        both = tuple(arm.map(lambda one: one.select(rule)) for arm in both)
-        trial, (first, *others) = None, members
-        if first.result is None:
-            policies = {one.name: one.policy for arm in both for one in arm.members if one.policy is not None}
-            seeds = stream_seeds("test", self.eval.n_episodes or EPISODES, self.seed)
-            trial = Trial.of(self._env(both, policies), seeds, self.suite, policies.values(), self.trust)
-            check_policies(policies, trial)
-        else:
+        rule, both = select_rounds(Rule(self.checkpoint, self.at), both)
+        first, *others = [member for arm in both for member in arm.members]
+        trial = None if first.result else self._trial(self._env(both), both, self.eval.n_episodes)
+        if trial is None:
             assert Study(both, both[0].name, rule).comparisons  # raises unless they can be compared
             for other in others:
                 warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
         with self.output.open(self) as folder:
-            if trial is not None:
-                with Stages(f"every finished episode, in {folder}") as stages, self.engine.open() as engine:
-                    last = (trial, folder, engine, stages)
-                    both = tuple(arm.map(lambda one: one.measure(*last)) for arm in both)
-            study, test = Study(both, both[0].name, rule), both[0].members[0].test
+            measured = self._measure(both, [trial] * 2, folder) if trial else both
+            study, test = Study(measured, measured[0].name, rule), measured[0].members[0].test
             self._answer(study, folder, f"{left} against {right}: {test.robot} {test.task}", to_plain(self))
 
-    def _env(self, arms: tuple[Arm, ...], policies: Mapping[str, Path]) -> EnvConfig:
+    def _env(self, arms: Sequence[Arm]) -> EnvConfig:
         """Return the environment that all are tested in: the runs' own, else that of the policies."""
         from manip_il.evaluation.arm import require_same_env
         from manip_il.learn.checkpoint import Checkpoint
 
         given = {name: value for name, value in self.env.items() if value is not None}
-        runs = [member for arm in arms for member in arm.members if member.history]
-        if runs:
+        members = [member for arm in arms for member in arm.members]
+        if runs := [member for member in members if member.history]:
             return require_same_env({run.name: replace(run.env(given.get("task")), **given) for run in runs})
-        origins = {name: Checkpoint.open(policy).origin for name, policy in policies.items()}
+        origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
         return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
+
+    def _trial(self, env: EnvConfig, arms: Sequence[Arm], n_episodes: int | None) -> Trial:
+        """Return the test of these arms; raises, before any episode runs, if one of their policies cannot take it."""
+        from manip_il.cli.inputs import check_policies
+        from manip_il.evaluation.runner import Trial
+        from manip_il.seeding import stream_seeds
+
+        policies = {one.name: one.policy for arm in arms for one in arm.members if one.policy is not None}
+        seeds = stream_seeds("test", n_episodes or EPISODES, self.seed)
+        trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)
+        check_policies(policies, trial)
+        return trial
+
+    def _measure(self, arms: Sequence[Arm], trials: Sequence[Trial], folder: Path) -> tuple[Arm, ...]:
+        """Return the arms with the results of their tests."""
+        with Stages(f"every finished episode, in {folder}") as stages, self.engine.open() as engine:
+            pairs = zip(arms, trials, strict=True)
+            return tuple(arm.measure(trial, folder, engine, stages) for arm, trial in pairs)
 
     def _answer(self, study: Study, folder: Path, title: str, config: Mapping[str, Any]) -> None:
         """Write the result and the page, print the tables and the verdict."""

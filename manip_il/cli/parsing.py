@@ -34,7 +34,11 @@ from manip_il.option import check_bound
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
 # What has taken an option's place; files may still hold it empty.
-MOVED = {"task.reward": "--task.type=carry:REWARD", "within": "read off the page's curves"}
+MOVED = {
+    "task.reward": "--task.type=carry:REWARD",
+    "within": "read off the page's curves",
+    "expert": "measured by manip-il eval --policy.type=expert",
+}
 _FEW = 3
 type Known = Mapping[str, Option]
 

@@ -5,7 +5,6 @@ An arm is `manip-il dagger`, or an algorithm that begins with what round 0 of su
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,21 +13,18 @@ from typing import Any, Literal
 from manip_il import checks
 from manip_il.cli.common_options import Demonstrations, EngineOptions, TrialGroup
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.inputs import check_policies
 from manip_il.cli.learning import AirlOptions, GailOptions, PpoOptions
 from manip_il.cli.options import Open, group
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.parsing import from_layers, from_yaml
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.progress import say
 from manip_il.data.json_lines import read_lines
-from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
+from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.arm import Arm, Member, read_member, require_same_env
-from manip_il.evaluation.comparison import TARGET, Study
-from manip_il.evaluation.rounds import METRICS_FILE, At, Rule, history
-from manip_il.evaluation.runner import FOLDER, Trial
-from manip_il.evaluation.suites import varied
+from manip_il.evaluation.comparison import TARGET
+from manip_il.evaluation.rounds import METRICS_FILE, At, history
 from manip_il.option import option
-from manip_il.seeding import MAX_SEED, stream_seeds
+from manip_il.seeding import MAX_SEED
 from manip_il.tasks.config import EnvConfig
 
 ROUND_0 = "round_000"
@@ -40,30 +36,16 @@ EPISODES = 500  # of a test
 
 
 @dataclass(frozen=True)
-class ExpertTest:
-    """One test of the expert in every arm's task, by default on the arm's robot.
-
-    suite: as of `manip-il eval`. vary: as of `manip-il dagger`, in place of a suite.
-    """
-
-    robot: str | None = None
-    suite: str = "nominal"
-    vary: list[str] = field(default_factory=list[str])
-    n_episodes: int = option(EPISODES, "test episodes", at_least=1)
-
-
-@dataclass(frozen=True)
 class StudyFile:
     """Content of a study's YAML file.
 
     common: options of `manip-il dagger` that all its arms share. arms: name -> options in which an arm differs; with
-    `algorithm: gail`, `airl` or `ppo` those of that command, where `dataset.root` and `init` name another arm. Where
-    the task differs, nothing is compared, and expert (name -> `ExpertTest`) adds what the expert solves of each.
+    `algorithm: gail`, `airl` or `ppo` those of that command, where `dataset.root` and `init` name another arm. If
+    tasks differ, nothing is compared.
     """
 
     common: Open = field(default_factory=dict[str, Any])
     arms: Open = field(default_factory=dict[str, Any])
-    expert: Open = field(default_factory=dict[str, Any])
     training_seeds: int = option(3, "runs of every arm", at_least=1, at_most=MAX_SEED, grows=True)
     eval: TrialGroup = group(TrialGroup(EPISODES))
     checkpoint: Literal["best", "last"] = "best"
@@ -85,7 +67,6 @@ class Plan:
     starts: Mapping[str, str]
     baseline: str | None
     envs: Mapping[str, EnvConfig]
-    experts: Mapping[str, ExpertTest]
 
 
 def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
@@ -112,8 +93,7 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
         except ManipError as error:
             raise UsageError(f"{path}: arm {name!r}: {error}") from error
         arms[name] = options
-    experts = {name: from_layers(ExpertTest, [(f"{path}: expert.{name}", file.expert[name])]) for name in file.expert}
-    return Plan(file, arms, starts, _baseline(file, envs), envs, experts)
+    return Plan(file, arms, starts, _baseline(file, envs), envs)
 
 
 def read_arm(common: Mapping[str, Any], own: Any) -> ArmOptions:
@@ -157,23 +137,6 @@ def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
     return file.baseline or next(iter(envs))
 
 
-def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
-    """Return the expert's tests in every arm's task, arm -> name of the test -> trial.
-
-    Without those that change nothing there, such as another object if there is none. Raises `ManipError` for names.
-    """
-    found: dict[str, dict[str, Trial]] = {name: {} for name in plan.envs}
-    for name, arms_env in plan.envs.items():
-        for test, one in plan.experts.items():
-            env, seeds = replace(arms_env, robot=one.robot or arms_env.robot), stream_seeds("test", one.n_episodes, 0)
-            with contextlib.suppress(NoEffect):
-                if one.vary:
-                    found[name][test] = Trial(env, seeds, "+".join(one.vary), varied(one.vary, env, sees=False))
-                else:
-                    found[name][test] = Trial.of(env, seeds, one.suite)
-    return found
-
-
 def learn(plan: Plan, root: Path, engine: EngineOptions) -> None:
     """Run what is not there yet, seed by seed, so that a study that is stopped early has all arms."""
     runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
@@ -186,34 +149,10 @@ def learn(plan: Plan, root: Path, engine: EngineOptions) -> None:
             replace(options, settings=settings, output=output, engine=engine).run()
 
 
-def tested(
-    plan: Plan, experts: Mapping[str, Mapping[str, Trial]], root: Path, engine_options: EngineOptions, trust: bool
-) -> Study:
-    """Return all runs, with the tests of their policies and of the expert."""
-    file, seeds = plan.file, range(plan.file.training_seeds)
-    arms = [Arm(name, tuple(_member(plan, root, name, seed) for seed in seeds)) for name in plan.arms]
-    rule = Rule(file.checkpoint, file.at)
-    rule = rule.limited({member.name: member.history for arm in arms for member in arm.members})
-    arms = [arm.map(lambda one: one.select(rule)) for arm in arms]
-    trials: dict[str, Trial] = {}
-    for arm in arms:
-        policies = {one.name: one.policy for one in arm.members if one.policy is not None}
-        test_seeds = stream_seeds("test", file.eval.n_episodes or EPISODES, 0)
-        trials[arm.name] = Trial.of(plan.envs[arm.name], test_seeds, "nominal", policies.values(), trust)
-        check_policies(policies, trials[arm.name])
-    with Stages(f"every finished run and episode, in {root}") as stages, engine_options.open() as engine:
-        arms = [
-            Arm(arm.name, tuple(one.measure(trials[arm.name], root, engine, stages) for one in arm.members))
-            for arm in arms
-        ]
-        solved = {
-            name: {
-                test: trial.measure(None, f"expert, {name}, {test}", root / FOLDER / f"{name} {test}", engine, stages)
-                for test, trial in tests.items()
-            }
-            for name, tests in experts.items()
-        }
-    return Study(tuple(arms), plan.baseline, rule, file.target, solved)
+def learnt(plan: Plan, root: Path) -> tuple[Arm, ...]:
+    """Return the runs of every arm."""
+    seeds = range(plan.file.training_seeds)
+    return tuple(Arm(name, tuple(_member(plan, root, name, seed) for seed in seeds)) for name in plan.arms)
 
 
 def with_start_policy(options: ArmOptions, start: Path) -> ArmOptions:

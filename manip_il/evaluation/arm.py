@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from statistics import fmean
@@ -93,9 +93,15 @@ class Arm:
         """Whether every policy comes from a run."""
         return all(member.history for member in self.members)
 
-    def map(self, change: Callable[[Member], Member]) -> Arm:
-        """Return the arm with every member changed."""
-        return replace(self, members=tuple(map(change, self.members)))
+    def measure(self, trial: Trial, folder: Path, engine: Engine, progress: Progress) -> Arm:
+        """Return the arm with the evaluations of its policies, see `Member.measure`."""
+        return replace(self, members=tuple(one.measure(trial, folder, engine, progress) for one in self.members))
+
+
+def select_rounds(rule: Rule, arms: Sequence[Arm]) -> tuple[Rule, tuple[Arm, ...]]:
+    """Return the rule with the limit of all runs, and the arms with the rounds that it chooses."""
+    rule = rule.limited({member.name: member.history for arm in arms for member in arm.members})
+    return rule, tuple(replace(arm, members=tuple(one.select(rule) for one in arm.members)) for arm in arms)
 
 
 def read_arm(path: Path) -> Arm:

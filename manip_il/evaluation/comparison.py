@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import fmean
@@ -142,15 +142,13 @@ class Study:
     """Arms with the same training seeds, each tested, and what they had cost.
 
     baseline: the arm that the others are compared with; arms of different tasks have none (None). rule: chose each
-    run's round. target: validation success whose cost is told. experts: tests of the expert in an arm's task, arm ->
-    name of the test -> result.
+    run's round. target: validation success whose cost is told.
     """
 
     arms: tuple[Arm, ...]
     baseline: str | None
     rule: Rule = field(default_factory=Rule)
     target: float = TARGET
-    experts: Mapping[str, Mapping[str, EvalResult]] = field(default_factory=dict)
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
@@ -200,22 +198,19 @@ class Study:
         return (self.target_table(),) if all(arm.has_histories for arm in self.arms) else ()
 
     def results_table(self) -> Table:
-        """Return an arm a row: the expert's success, mean costs, validation, test success, difference.
+        """Return an arm a row: mean costs, validation, test success, difference.
 
         In brackets each training seed, of one alone the interval.
         """
-        tests, costs = list(dict.fromkeys(test for found in self.experts.values() for test in found)), self._costs
         rows: list[tuple[str, ...]] = []
         for arm in self.arms:
-            found, against = self.experts.get(arm.name, {}), self.comparisons.get(arm.name)
-            cells = [format_percent(found[test].success.rate) if test in found else "" for test in tests]
-            chosen = [member.chosen for member in arm.members if member.chosen]
-            cells += [_mean_cost(cost, chosen) if chosen else "" for cost in costs]
+            against, chosen = self.comparisons.get(arm.name), [one.chosen for one in arm.members if one.chosen]
+            cells = [_mean_cost(cost, chosen) if chosen else "" for cost in self._costs]
             cells.append(_rates([one.validation for one in chosen]) if chosen else "")
             cells.append(_rates([one.test.success for one in arm.members]))
             points = against and f"{format_points(against.difference, against.interval)}, {format_p(against.p_value)}"
             rows.append((arm.name, *cells, points or ""))
-        head = ("arm", *tests, *map(_head, costs), "validation", "test", f"test, against {self.baseline}")
+        head = ("arm", *map(_head, self._costs), "validation", "test", f"test, against {self.baseline}")
         return Table(head, tuple(rows))
 
     def condition_table(self) -> Table:
@@ -276,7 +271,6 @@ class Study:
             "settings": test.settings.to_json(),
             "test_success": arm.test_rate,
             "against_baseline": against.to_json() if against else None,
-            "expert": {name: found.success.to_json() for name, found in self.experts.get(arm.name, {}).items()},
             "training_seeds": [
                 member.to_json() | {"first_at_target": first.to_json() if first else None}
                 for member, first in zip(arm.members, self._reached(arm), strict=True)

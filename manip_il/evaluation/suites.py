@@ -8,7 +8,7 @@ from pathlib import Path
 
 import manip_il
 from manip_il import checks
-from manip_il.errors import ManipError, NoEffect, UnknownName, UsageError
+from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.sim.conditions import Condition, merged
 from manip_il.sim.shape import draws_shape
 from manip_il.tasks.config import EnvConfig
@@ -35,7 +35,7 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
     left = [one for condition in asked if (one := _for_task(condition, env, sees=sees)) is not None]
     if not left:
         blind = "" if sees else " and a policy without cameras"
-        raise NoEffect(f"--suite={suite} changes nothing for {env.task}{blind}; choose another suite")
+        raise UsageError(f"--suite={suite} changes nothing for {env.task}{blind}; choose another suite")
     return tuple(left)
 
 
@@ -50,7 +50,7 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
         raise UnknownName("--vary", odd, CONDITIONS[1:])
     kept = _for_task(merged([read_condition(name) for name in names]), env, sees=sees)
     if kept is None:
-        raise NoEffect(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
+        raise UsageError(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
     return (kept,)
 
 

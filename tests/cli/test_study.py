@@ -11,7 +11,7 @@ import pytest
 
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import main
-from manip_il.cli.study import expert_trials, read_plan
+from manip_il.cli.study import read_plan
 from manip_il.errors import MismatchError
 
 from .made_runs import make_run
@@ -147,8 +147,7 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
         ("target: 0.6", "baseline: clonning", "did you mean 'cloning'?"),
         ("at: labels", "at: label", "did you mean 'labels'?"),
         ("method: cloning", "env.horizon: 9", "horizon differs: cloning has 9, dagger has 8"),
-        ("at: labels", "expert: {a: 3}", "x.yaml: expert.a: expected a mapping of options, got 3"),
-        ("at: labels", "expert: {a: {vary: [objects]}}", "did you mean 'object'?"),
+        ("at: labels", "expert: {a: {n_episodes: 3}}", "expert is now measured by manip-il eval --policy.type=expert"),
         (FILE, "", "arms is empty"),
         (FILE, "- 1", "expected a mapping"),
     ],
@@ -178,19 +177,6 @@ def test_arms_of_different_tasks_have_no_baseline_and_each_its_own_environment(h
     (here / "x.yaml").write_text(text + "baseline: lift\n")
     with pytest.raises(MismatchError, match="task differs: cloning has reach, lift has lift"):
         read_plan(here / "x.yaml", None)
-
-
-def test_the_expert_is_tested_where_a_test_changes_something(here):
-    tests = "expert: {own: {n_episodes: 3}, other: {vary: [object]}, noise: {suite: random_actions, robot: fetch}}\n"
-    (here / "x.yaml").write_text(FILE.replace("  dagger:", "  lift: {task.type: lift}") + tests)
-    trials = expert_trials(read_plan(here / "x.yaml", None))
-    assert {arm: list(found) for arm, found in trials.items()} == {
-        "cloning": ["own", "noise"],
-        "lift": ["own", "other", "noise"],
-    }
-    noise = trials["lift"]["noise"]
-    assert (noise.env.robot, noise.env.task, len(noise.seeds)) == ("fetch", "lift", 500)
-    assert noise.conditions[0].ranges == {"random_actions": (0.1, 0.1)}
 
 
 @pytest.mark.slow
@@ -235,6 +221,5 @@ def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_pa
         copy.write_text(re.sub(r"dataset\.root: \w+/[^,}\n]+,? ?", "", path.read_text()))  # which are made before
         plan = read_plan(copy, None)
         assert (plan.baseline is None) == (len({env.task for env in plan.envs.values()}) > 1)
-        assert all(len(found) >= len(plan.experts) - 1 for found in expert_trials(plan).values())
         first = path.read_text().splitlines()[0]
         assert first == f"# manip-il compare configs/studies/{path.name} --output_dir=runs/{path.stem}"
