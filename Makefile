@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-eyes test test-fast fuzz lint format docker docker-test bench lock clean
+.PHONY: help setup demo demo-eyes test test-fast lint format docker docker-test bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= $(or $(shell command -v python3.12),$(shell command -v python3.13),python3.12)
@@ -57,11 +57,7 @@ test-fast: setup .venv/.robots  ## the tests that take seconds and need no OpenG
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO) -m "not slow and not gl"
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/serve -m "not slow and not gl"
 
-FUZZ ?= 20000
-fuzz: setup  ## FUZZ=20000 mutated inputs of every kind that is read: each accepted, or refused in one line
-	OMP_NUM_THREADS=1 FUZZ=$(FUZZ) $(BIN)/pytest -n 2 tests/test_fuzz.py
-
-lint: setup  ## style, types, who may import whom, and the form of docstrings
+lint: setup  ## style, types, who may import whom, and shapes in docstrings
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright

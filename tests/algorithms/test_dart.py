@@ -10,7 +10,6 @@ import pytest
 
 from manip_il.algorithms import dart
 from manip_il.data.dataset import Dataset
-from manip_il.errors import ManipError
 from manip_il.learn.policy import LearnedPolicy
 
 
@@ -58,8 +57,3 @@ def test_noise_is_the_mean_outer_product_of_the_errors_where_labels_are_sound(ta
 def test_a_policy_is_episodes_in_the_order_of_time(table, monkeypatch):
     _, policy = noise(table, np.zeros((6, 2)), monkeypatch)
     assert policy.episodes == [[0, 1], [0, 1], [0], [0]]
-
-
-def test_without_a_sound_label_there_is_nothing_to_measure(table, monkeypatch):
-    with pytest.raises(ManipError, match="no valid label"):
-        noise(table | {"label_valid": np.zeros(6, np.int64)}, np.zeros((6, 2)), monkeypatch)

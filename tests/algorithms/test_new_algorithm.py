@@ -18,7 +18,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode
 from manip_il.tasks.config import make_config
 
-from .trees import check_same_data
+from ..damage import check_same_data
 
 pytestmark = pytest.mark.slow
 

@@ -14,18 +14,17 @@ from manip_il.algorithms.config import BetaSchedule, RunConfig
 from manip_il.algorithms.results import Result, Watch, best_result
 from manip_il.algorithms.rounds import round_folder
 from manip_il.algorithms.run import Run
-from manip_il.collect.query import Query
 from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset, joined_columns
-from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.evaluation.results import EvalResult
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import make_config
 
+from ..damage import check_same_data, digests
 from ..learn.tiny_policies import ACT
-from .trees import check_same_data, files
 
 pytestmark = pytest.mark.slow  # every test here waits for a whole run
 
@@ -62,7 +61,7 @@ def test_a_round_leaves_its_episodes_dataset_policy_and_evaluation_and_the_run_i
         assert Dataset.open(here / "dataset").info.episodes == episodes
         assert (results[round_].policy / "model.safetensors").is_file()
         assert EvalResult.read(here / "eval.json") == results[round_].validation
-    assert files(folder / "best" / "pretrained_model") == files(best_result(results).policy)
+    assert digests(folder / "best" / "pretrained_model") == digests(best_result(results).policy)
 
 
 def test_the_numbers_of_a_round_are_those_of_its_data(run):
@@ -91,17 +90,6 @@ def test_every_seed_is_from_its_own_stream(run):
     assert seeds == {seed for stream, count in streams for seed in stream_seeds(stream, count)}
 
 
-def test_of_equally_good_rounds_the_later_is_best(run):
-    _, results, _ = run
-
-    def result(round_: int, *outcomes: bool) -> Result:
-        episodes = tuple(EpisodeResult(i, won, won, 1, 0.0, "carry", {}) for i, won in enumerate(outcomes))
-        return replace(results[0], number=round_, validated=replace(results[0].validation, episodes=episodes))
-
-    assert best_result([result(0, True, False), result(1, True, True), result(2, False, True)]).number == 1
-    assert best_result([result(0, True, False), result(1, False, True), result(2, False, False)]).number == 1
-
-
 def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
     folder, _, _ = run
     table = Dataset.open(folder / "dataset").columns(("action", "executed_action", "actor", "round", "episode_index"))
@@ -119,7 +107,7 @@ def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
 
 def test_running_it_again_computes_nothing_anew(run, monkeypatch):
     folder, results, _ = run
-    before = files(folder)
+    before = digests(folder)
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("nothing is left to do")
@@ -129,7 +117,7 @@ def test_running_it_again_computes_nothing_anew(run, monkeypatch):
     again = list(Run(CONFIG, folder, Engine(), Watch(on_log=logged.append)).results())
     assert logged == []
     assert [replace(result, seconds={}) for result in again] == [replace(result, seconds={}) for result in results]
-    assert files(folder) == before
+    assert digests(folder) == before
 
 
 class Stop(Exception):
@@ -157,7 +145,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
 def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, begun):
     results = list(Run(replace(CONFIG, refit="warm"), tmp_path, Engine()).results())
     assert set(begun) == {None, results[0].policy}
-    assert files(results[1].policy) != files(run[1][1].policy)
+    assert digests(results[1].policy) != digests(run[1][1].policy)
 
 
 @pytest.fixture
@@ -195,7 +183,7 @@ def test_a_run_begins_with_a_policy_and_goes_on_from_its_weights(run, tmp_path, 
     start = before[1].policy
     config = replace(CONFIG, start=start, datasets=tuple(datasets(folder, 0)) if with_data else (), beta=ALONE)
     results = list(Run(config, tmp_path, Engine()).results())
-    assert files(results[0].policy) == files(start)
+    assert digests(results[0].policy) == digests(start)
     assert (results[0].labels > 0) == with_data
     assert set(begun) == {start}  # round 0 fits nothing
     assert results[1].labels > results[0].labels
@@ -227,26 +215,6 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
     assert held_out.is_dir() == (method == "dart")
     extra = Dataset.open(held_out).info.frames if method == "dart" else 0
     assert results[1].metrics["queries"] == results[1].labels + extra
-
-
-def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(tmp_path, caplog):
-    config = replace(CONFIG, beta=ALONE, query_rule=Query("safety", 1000), rounds=2)
-    results = list(Run(config, tmp_path, Engine()).results())
-    assert len({result.labels for result in results}) == 1
-    assert not (round_folder(tmp_path, 1) / "dataset").exists()
-    assert "the expert was queried in none of its rollouts" in caplog.text
-    assert results[2].metrics["queries"] > results[0].metrics["queries"]  # it was queried in every state, to know
-    assert Dataset.open(tmp_path / "dataset").info.episodes == 4
-
-
-def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
-    config = replace(CONFIG, beta=ALONE, query_rule=Query("ensemble", 0.05), ensemble=2)
-    results = list(Run(config, tmp_path, Engine()).results())
-    first, second = (round_folder(tmp_path, 0) / name for name in ("policy", "policy_1"))
-    assert files(first).keys() == files(second).keys()
-    weights = "checkpoints/000020/pretrained_model/model.safetensors"
-    assert (first / weights).read_bytes() != (second / weights).read_bytes()
-    assert results[1].labels > results[0].labels
 
 
 @pytest.mark.parametrize(("label", "length"), [("per_state", None), ("takeover", None), ("branch", 4)])

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
-from manip_il.collect.environments import make_expert
-from manip_il.collect.rollout import Turn
 from manip_il.learn.action_spaces import Conversion
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
@@ -27,12 +25,6 @@ def lockstep(count: int, hold: int | None = 2, horizon: int = 12) -> Lockstep:
     ones = np.ones(8, np.float32)
     episodes = [RobotEpisode(ENV, hold) for _ in range(count)]
     return Lockstep(episodes, ActionRange(0 * ones, ones, -ones, ones), horizon, HAND)
-
-
-def expert_action(episode: RobotEpisode) -> np.ndarray:
-    env = episode._env
-    turn = Turn(0, 0, env.observe(), env.get_state(), make_expert(ENV))
-    return turn.query().action
 
 
 def test_a_target_reaches_the_robot_as_the_joints_it_means():
@@ -69,26 +61,6 @@ def test_an_episode_that_has_ended_leaves_the_others_as_they_are():
     assert beside.simulated == 4
 
 
-@pytest.mark.parametrize("hold", [0, 3])
-def test_an_episode_ends_as_many_steps_after_success_as_demonstrations_do(hold):
-    episode = RobotEpisode(ENV, hold)
-    episode.start(3)
-    after = 0
-    while not episode.ended:
-        episode.advance(expert_action(episode))
-        after += episode.solved
-    assert after == hold + 1
-
-
-def test_without_a_hold_an_episode_goes_on_after_success():
-    episode = RobotEpisode(ENV, None)
-    episode.start(3)
-    for _ in range(40):
-        episode.advance(expert_action(episode))
-    assert episode.solved
-    assert not episode.ended
-
-
 def test_an_episode_depends_on_its_seed_alone():
     alone, beside = lockstep(1), lockstep(3)
     alone.seed(7)
@@ -113,13 +85,3 @@ def test_no_episode_says_that_it_ends_and_time_is_the_last_number():
         assert not rewards.any()
     assert env.simulated == 24
     assert np.concatenate(env.executed).shape == (24, 8)
-
-
-def test_normalised_actions_mean_their_targets_within_the_range():
-    mean, scale = np.float32([0.1, 0.0018]), np.float32([0.2, 0.0])
-    actions = ActionRange(mean, scale, np.float32([-0.3, 0.0018]), np.float32([0.7, 0.0018]))
-    targets = np.float32([[0.3, 0.0018], [-0.2, 0.0018]])
-    assert actions.raw(actions.normalised(targets)) == pytest.approx(targets)
-    assert actions.raw(np.float32([[9, 9]])) == pytest.approx(np.float32([[0.7, 0.0018]]))
-    assert actions.space.low == pytest.approx(np.float32([-2, -1]))
-    assert actions.space.high == pytest.approx(np.float32([3, 1]))

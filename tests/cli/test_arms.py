@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from manip_il.cli.learning import AirlOptions, GailOptions, PpoOptions
-from manip_il.cli.main import main
 from manip_il.cli.study import read_plan, with_start_cost, with_start_policy
 from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.arm import Member
@@ -25,16 +23,6 @@ arms:
   gail: {algorithm: gail, dataset.root: cloning, init: cloning, steps: 300}
   scratch: {algorithm: airl, dataset.root: cloning}
   ppo: {algorithm: ppo, init: cloning, reward: somewhere}
-"""
-TINY = """
-common: {task.type: reach, demonstrations: 2, steps: 30, validation_episodes: 2, policy: {width: 16}}
-arms:
-  cloning: {rounds: 0}
-  gail:
-    {algorithm: gail, dataset.root: cloning, init: cloning, steps: 150, episodes: 2, ppo.minibatches: 1, warmup: 0,
-    validation_every: 100, validation_episodes: 2}
-training_seeds: 1
-eval: {n_episodes: 2}
 """
 
 
@@ -57,22 +45,6 @@ def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
     assert isinstance(ppo, PpoOptions)
     assert (ppo.init, ppo.reward) == (start / "policy", Path("somewhere"))
     assert len({*plan.envs.values()}) == 1
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "words"),
-    [
-        ("algorithm: gail", "algorithm: gale", "arm 'gail': unknown algorithm 'gale'"),
-        ("init: cloning, steps", "init: clone, steps", "dataset.root and init are clone, cloning; expected"),
-        ("steps: 300", "rounds: 3", "arm 'gail': unknown key in its options: 'rounds'"),
-    ],
-)
-def test_an_arm_that_cannot_begin_is_one_line(before, after, words, file, error):
-    assert before in FILE
-    file.write_text(FILE.replace(before, after, 1))
-    assert main(["compare", str(file.name), "--output_dir=s"]) in (1, 2)
-    assert words in error()
-    assert not Path("s").exists()
 
 
 def lines(*validated: float | None) -> list[dict[str, Any]]:
@@ -104,24 +76,3 @@ def test_a_run_is_charged_for_the_demonstrations_it_begins_with_and_for_the_fit_
         last = found.history[-1]
         assert (last.labels, last.episodes, last.steps) == (100, 2 + 2, 100 + 100)
         assert last.seconds == own.history[-1].seconds + seconds
-
-
-@pytest.mark.slow
-def test_a_study_of_cloning_and_gail_tests_both_and_goes_on(file, tmp_path):
-    file.write_text(TINY)
-    words = ["compare", file.name, "--output_dir=s", "--workers=1"]
-    assert main(words) == 0
-    data = json.loads(Path("s/compare.json").read_text())
-    [gail] = data["arms"]["gail"]["training_seeds"]
-    rounds = gail["rounds"]
-    assert (
-        rounds[0]["validation_success"]
-        == data["arms"]["cloning"]["training_seeds"][0]["rounds"][0]["validation_success"]
-    )
-    assert rounds[0]["steps"] == rounds[0]["labels"] < rounds[-1]["steps"]
-    assert rounds[-1]["labels"] == rounds[0]["labels"]
-    assert {one["n_episodes"] for one in (gail, *data["arms"]["cloning"]["training_seeds"])} == {2}
-    done = Path("s/gail/seed_0/metrics.jsonl").read_bytes()
-    assert main([*words, "--resume=true"]) == 0
-    assert Path("s/gail/seed_0/metrics.jsonl").read_bytes() == done
-    assert "Validation success over steps" in Path("s/report.html").read_text()

@@ -43,18 +43,6 @@ def test_the_file_and_the_tables_say_the_same(tmp_path, capsys):
     assert (folder / "config.yaml").is_file()
 
 
-def test_the_same_seed_gives_the_same_certificate(tmp_path):
-    path = tmp_path / "c" / "certificate.json"
-
-    def certificate(*words: str) -> bytes:
-        assert main([*WORDS, f"--output_dir={path.parent}", *words]) == 0
-        return path.read_bytes()
-
-    first = certificate()
-    assert certificate("--overwrite=true") == first
-    assert certificate("--overwrite=true", "--seed=1") != first
-
-
 def test_a_policy_brings_its_robot_and_task(policy, tmp_path, capsys):
     words = ["robot", "certify", f"--policy.path={policy}", "--env.horizon=60", "--cases=2", "--workers=1"]
     assert main([*words, f"--output_dir={tmp_path / 'c'}"]) == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -17,16 +16,13 @@ import numpy as np
 import pytest
 
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.demo import demo_verdict
 from manip_il.cli.main import load, main
 from manip_il.cli.options import command_line, options_of
 from manip_il.cli.outputs import ResumableOutput
 from manip_il.cli.parsing import from_yaml, parse
 from manip_il.data.dataset import Dataset
 from manip_il.data.json_lines import read_lines
-from manip_il.evaluation import film
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.tables import PolicyRow
+from manip_il.evaluation.results import EvalResult
 
 from ..damage import edit_table
 from .made_runs import files
@@ -96,21 +92,13 @@ def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
     words = [sys.executable, "-m", "manip_il.cli.main", *record(tmp_path / "d", 60)]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
-    while not list((tmp_path / "d.journals").glob("episode-*")):
+    while process.poll() is None and not list((tmp_path / "d.journals").glob("episode-*")):
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGINT)
-    err = process.communicate(timeout=120)[1]
+    err = process.communicate(timeout=600)[1]
     assert process.returncode == 130
     assert "kept: every finished episode" in err
     assert err.rstrip().endswith("continue with --resume=true")
-
-
-def test_a_dataset_that_is_there_is_refused_or_replaced(demos, tmp_path, error):
-    assert main(record(demos, 3)) == 2
-    assert "exists already" in error()
-    assert main(record(tmp_path / "d", 1)) == 0
-    assert main(record(tmp_path / "d", 1, "--seed=2", "--overwrite=true")) == 0
-    assert Dataset.open(tmp_path / "d").columns(["seed"])["seed"][0] > 200_000_000
 
 
 def test_train_refuses_a_dataset_with_nan(demos, tmp_path, error):
@@ -138,14 +126,6 @@ def test_train_to_eval(policy, tmp_path, capsys, error):
     assert "robot differs: the policy has panda" in error()
 
 
-def test_the_expert_is_measured_by_name(tmp_path):
-    words = ["eval", "--policy.type=expert", "--eval.n_episodes=2", "--eval.stream=validation"]
-    assert main([*words, "--workers=1", "--eval.films=0", f"--output_dir={tmp_path / 'e'}"]) == 0
-    data = json.loads((tmp_path / "e" / "eval.json").read_text())
-    assert (data["success_rate"], data["n_episodes"], data["policy"]) == (1.0, 2, "expert")
-    assert data["episodes"][0]["seed"] == 3_000_000
-
-
 @pytest.mark.slow
 def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error):
     run = tmp_path / "run"
@@ -160,34 +140,6 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
     assert Dataset.open(run / "dataset").info.episodes == 3 + 2 * 2
 
 
-@pytest.mark.slow
-def test_the_demo_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
-    sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
-    words = ["demo", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
-    assert main(words) == 0
-    out = capsys.readouterr().out
-    assert "report: " in out
-    page = (tmp_path / "q" / "report.html").read_text()
-    assert all(name in page for name in ("expert", "cloning, as many labels", "DAgger (round"))
-    before = files(tmp_path / "q" / "evaluations")
-    assert main([*words, "--resume=true"]) == 0
-    assert files(tmp_path / "q" / "evaluations") == before
-
-
 def test_a_command_line_can_be_copied_from_a_report():
     options = DaggerOptions(settings={"rounds": 2}, output=ResumableOutput(Path("runs/a b")))
     assert command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"
-
-
-def result(successes: int, n: int) -> EvalResult:
-    episodes = tuple(EpisodeResult(seed, seed < successes, seed < successes, 5, 0.0) for seed in range(n))
-    return EvalResult("p", "panda", "reach", {}, episodes, EvalSettings(100, 0.02))
-
-
-def test_the_demo_says_where_nothing_is_shown():
-    rows = [PolicyRow(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
-    assert demo_verdict(rows, significant=False).endswith(
-        "no difference between DAgger and cloning with as many labels."
-    )
-    assert demo_verdict(rows, significant=True).endswith("with the first demonstrations alone.")

@@ -78,13 +78,6 @@ def test_the_robots_joints_are_compared(root, capsys):
     assert "error    meta/manip_il.json: joint_names differs: the dataset has " in capsys.readouterr().out
 
 
-def test_a_robot_of_the_users_own_is_no_finding(root, capsys):
-    edit_json(root / layout.OURS, lambda ours: ours["spec"].update(robot="so100"))
-    edit_json(root / layout.INFO, lambda info: info.update(robot_type="so100"))
-    assert main(["data", "check", str(root)]) == 0
-    assert "warning" not in capsys.readouterr().out
-
-
 def test_two_datasets_become_one_with_the_episodes_of_both(root, capsys):
     other = shutil.copytree(root, root.with_name("other"))
     words = ["data", "merge", str(root), str(other), f"--output={root.with_name('both')}"]

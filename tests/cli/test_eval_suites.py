@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
-import manip_il
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
 from manip_il.errors import UsageError
@@ -56,17 +54,6 @@ def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
         suite_conditions("object", make_config(task="reach"), sees=True)
 
 
-def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
-    expected = suite_conditions("all", make_config(task="pick_place"), sees=True)
-    folder = tmp_path / "share" / "manip_il" / "suites"
-    folder.mkdir(parents=True)
-    for name in CONDITIONS:
-        (folder / f"{name}.yaml").write_bytes((Path("configs/suites") / f"{name}.yaml").read_bytes())
-    monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    monkeypatch.setattr(manip_il, "__file__", str(tmp_path / "lib" / "manip_il" / "__init__.py"))
-    assert suite_conditions("all", make_config(task="pick_place"), sees=True) == expected
-
-
 def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, capsys):
     assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=10", *SMALL) == 0
     data = json.loads(Path("e/eval.json").read_text())
@@ -92,8 +79,6 @@ def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys, error):
     for text, what in (
         ("mass: [0.5, 0.4]", "heavy: mass is [0.5, 0.4]; expected low <= high"),
         ("mas: 1", "did you mean 'mass'?"),
-        ("- 1", "holds list; expected a mapping of names to ranges"),
-        ("mass: [", "is not YAML"),
         ("brightness: [0.5, 2]", "changes nothing for pick_place and a policy without cameras"),
     ):
         Path("heavy.yaml").write_text(text)
@@ -150,14 +135,6 @@ def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys, 
     assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error()
 
 
-def test_no_room_for_the_result_is_said_before_the_first_episode(here, monkeypatch, error):
-    monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
-    Path("file").touch()
-    for folder in ("/proc/nothing/here", "file/below"):
-        assert evaluate(folder, *REACH, "--eval.n_episodes=1") == 1
-        assert folder.split("/")[0] in error()
-
-
 def test_overwrite_empties_the_folder_in_place_as_it_may_be_a_mount(here):
     assert evaluate("e", *REACH, "--eval.n_episodes=2") == 0
     Path("e/more").mkdir()
@@ -169,9 +146,8 @@ def test_overwrite_empties_the_folder_in_place_as_it_may_be_a_mount(here):
     assert len(EvalResult.read(Path("e")).episodes) == 1
 
 
-@pytest.mark.parametrize("suite", ["all", "nominal"])
-def test_every_line_of_eval_json_can_be_replayed_alone(suite, act, here, capsys):
-    assert evaluate("e", f"--policy.path={act}", f"--suite={suite}", "--eval.n_episodes=4", *SMALL) == 0
+def test_every_line_of_eval_json_can_be_replayed_alone(act, here, capsys):
+    assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=4", *SMALL) == 0
     result = EvalResult.read(Path("e"))
     for episode in result.episodes:
         capsys.readouterr()
@@ -223,11 +199,3 @@ def test_failures_and_successes_are_filmed_and_a_replay_films_one(act, here):
     assert Path("bad/report.html").read_text().count("<video") == 2
     assert main(["eval", "bad", "--replay=4000001", "--video=deep/one.mp4"]) == 0
     assert Path("deep/one.mp4").read_bytes() == (Path("bad/films") / names[1]).read_bytes()
-
-
-@pytest.mark.usefixtures("no_opengl")
-def test_without_opengl_the_report_says_why_it_has_no_films(act, here, capsys, caplog):
-    assert evaluate("e", f"--policy.path={act}", "--eval.n_episodes=1", *SMALL, "--eval.films=1") == 0
-    assert "no OpenGL here" in capsys.readouterr().err + caplog.text
-    assert "No films: no OpenGL here" in Path("e/report.html").read_text()
-    assert not Path("e/films").exists()

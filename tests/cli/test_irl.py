@@ -6,32 +6,9 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.options import choices, options_of
-from manip_il.cli.reward import IrlOptions
-from manip_il.rewards import methods
 from manip_il.tasks.carry.reward import FEATURES, Reward
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
-
-
-def test_the_methods_of_the_command_are_those_there_are():
-    [method] = [one for one in options_of(IrlOptions) if one.name == "method"]
-    assert {*choices(method.type)} == {*methods.METHODS}
-
-
-@pytest.mark.parametrize(
-    ("line", "says", "code"),
-    [
-        ("reward irl nowhere", "nowhere does not exist; expected a LeRobot v3.0 dataset", 2),
-        (f"reward irl {SAMPLE} --method=max_entrpy", "did you mean 'max_entropy'?", 2),
-        (f"reward irl {SAMPLE} --seed=-1", "seed is -1", 2),
-        (f"reward irl {SAMPLE}", "expected a dataset of manip-il record --task.type=carry", 1),
-    ],
-)
-def test_bad_input_is_one_line(line, says, code, here, error):
-    assert main([*line.split(), "--quiet"]) == code
-    assert says in error()
-    assert list(here.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -41,19 +41,3 @@ def test_what_is_exported_is_imported_and_what_the_mapping_leaves_out_is_said(da
     np.testing.assert_array_equal(
         Dataset.open(tmp_path / "new").columns()["action"], Dataset.open(dataset).columns()["action"][::2, 1]
     )
-
-
-def test_an_export_is_replaced_only_when_told_to_and_never_its_own_dataset(dataset, tmp_path, error):
-    out = tmp_path / "out"
-    words = ["data", "to-mcap", str(dataset), str(out)]
-    assert main(words) == 0
-    before = {path.name: path.read_bytes() for path in out.glob("*.mcap")}
-    assert len(before) == 2
-    assert main(words) == 2
-    assert "out exists already" in error()
-    (out / "episode_000000.mcap").unlink()
-    assert main([*words, "--overwrite=true"]) == 0
-    assert {path.name: path.read_bytes() for path in out.glob("*.mcap")} == before
-    for out in (dataset, dataset / ".." / dataset.name, dataset.parent):
-        assert main(["data", "to-mcap", str(dataset), str(out), "--overwrite=true"]) == 2
-        assert "overlaps" in error()

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.cli.main import COMMANDS, load, main
+from manip_il.cli.main import COMMANDS, load
 from manip_il.cli.options import Given, Open, command_line, options_of, word
 from manip_il.cli.options import given as given_of
 from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml, parse
@@ -60,17 +60,13 @@ def fails(words: list[str], cls: type = Options) -> str:
     [
         ([], {}),
         (["--dataset.num_episodes=7"], {"dataset": Dataset(num_episodes=7)}),
-        (["--small.repo_id=a=b"], {"small": Dataset(repo_id="a=b", num_episodes=3)}),
         (["--dataset.root=x/y"], {"dataset": Dataset(root=Path("x/y"))}),
-        (["--dataset.root=null"], {}),
         (["--dataset.root=~/x"], {"dataset": Dataset(root=Path.home() / "x")}),
         (["--cameras=front,wrist"], {"cameras": ["front", "wrist"]}),
         (["--cameras=['front', 'wrist']"], {"cameras": ["front", "wrist"]}),
         (["--gains=1,2.5"], {"gains": [1.0, 2.5]}),
         (["--lr", "-1e-4"], {"lr": -1e-4}),
-        (["--note="], {"note": ""}),
         (["--resume", "--loss=l1"], {"resume": True, "loss": "l1"}),
-        (["--resume", "false"], {}),
         (["--loss=l1", "--loss=mse"], {}),
     ],
 )
@@ -85,16 +81,10 @@ def test_words_change_what_they_name(words, change):
         (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--dataset.repo_id' or '--small.repo_id'?)"]),
         (["--dataset=x"], ["--dataset is a group", "--dataset.num_episodes"]),
         (["--lr=fast"], ["--lr", "expected a number", "'fast'"]),
-        (["--lr=nan"], ["expected a number"]),
         (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "a whole number", "'1.5'"]),
-        (["--dataset.num_episodes=0"], ["num_episodes is 0"]),
         (["--loss=l2"], ["one of mse, l1", "'l2'", "did you mean 'l1'"]),
         (["--resume=yes"], ["true or false", "'yes'"]),
-        (["--dataset.root="], ["a path or null"]),
         (["--gains=1,x"], ["comma-separated list", "a number"]),
-        (["--lr"], ["--lr has no value", "a number"]),
-        (["lr=1"], ["unexpected 'lr=1'; options are written --name=value"]),
-        (["--config_path=absent.yaml"], ["cannot read absent.yaml"]),
     ],
 )
 def test_a_users_mistake_is_named_with_what_was_expected(words, parts):
@@ -124,12 +114,8 @@ def test_words_beat_yaml_beats_defaults(tmp_path):
     ("text", "parts"),
     [
         ("dataset: {num_episode: 9}", ["dataset.num_episode", "did you mean 'dataset.num_episodes'"]),
-        ("losss: l1", ["'losss'", "did you mean 'loss'"]),
-        ("dataset: 5", ["dataset: expected a mapping"]),
         ("resume: 1", ["resume: expected true or false, got 1"]),
-        ("dataset: {num_episodes: true}", ["expected a whole number, got True"]),
         ("dataset: {repo_id: no}", ["expected text, got False", "quotes"]),
-        ("- 1", ["expected a mapping"]),
         ("a: [", ["is not YAML"]),
     ],
 )
@@ -164,6 +150,7 @@ any_options = st.builds(
 )
 
 
+@settings(max_examples=30)
 @given(any_options)
 def test_options_survive_yaml(tmp_path_factory, options):
     path = tmp_path_factory.mktemp("yaml") / "config.yaml"
@@ -224,17 +211,6 @@ def test_a_layers_error_says_which_layer():
         from_layers(Fit, [("x.yaml: common", {"steps": 3}), ("x.yaml: arms.a", {"stepps": 3})])
     with pytest.raises(UsageError, match=r"x.yaml: arms.a: data.num_episodes: expected a whole number, got 'many'"):
         from_layers(Fit, [("x.yaml: arms.a", {"data": {"num_episodes": "many"}})])
-
-
-@pytest.mark.parametrize(
-    ("command", "text"),
-    [("record", "dataset: [" + "1, " * 10_000 + "1]"), ("demo", "x" * 1_000 + ": 1")],
-    ids=["list", "name"],
-)
-def test_an_error_prints_of_a_large_value_as_much_as_one_reads(command, text, tmp_path, error):
-    (tmp_path / "x.yaml").write_text(text)
-    assert main([command, f"--config_path={tmp_path / 'x.yaml'}"]) == 2
-    assert len(error()) < 1_000
 
 
 # Names that mean one thing in one command and another in the next; every other option is declared once.

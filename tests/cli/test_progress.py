@@ -7,7 +7,6 @@ import sys
 
 import pytest
 
-from manip_il.cli import progress as module
 from manip_il.cli.progress import progress, say, set_quiet, warn
 
 
@@ -27,28 +26,6 @@ def test_short_work_prints_one_line_at_the_end(capsys):
     assert captured.err.count("\n") == 1
     assert captured.err.startswith("record: 3/3 (")
     assert "success 0.1235" in captured.err
-
-
-def test_long_work_prints_a_line_an_interval_and_one_at_the_end(capsys, monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    with progress(None, "train") as bar:
-        for _ in range(20):
-            now[0] += 1.0
-            bar.step(10)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [f"train: {done} (10/s)" for done in (50, 100, 150, 200, 200)]
-
-
-def test_work_that_fails_still_says_how_far_it_came(capsys):
-    def work() -> None:
-        with progress(9, "record") as bar:
-            bar.step(2)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
-    assert "record: 2/9" in capsys.readouterr().err
 
 
 def test_quiet_silences_progress_and_not_say(capsys):

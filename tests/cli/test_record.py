@@ -12,12 +12,11 @@ import pytest
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
-from manip_il.data.atomic import write_file
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.sim import render
-from manip_il.sim.config import CameraConfig, Look
+from manip_il.sim.config import Look
 from manip_il.tasks.config import make_config
 
 from .made_runs import files
@@ -61,20 +60,6 @@ def test_a_damaged_journal_is_named_and_its_seed_runs_again_once_it_is_deleted(r
     assert files(tmp_path / "x") == files(recorded)
 
 
-def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, error):
-    words = ["data", "build", str(journals_of(recorded)), str(tmp_path / "x")]
-    assert main(words) == 0
-    before = files(tmp_path / "x")
-    assert main(words) == 2
-    assert "--overwrite=true replaces it" in error()
-    assert main([*words, "--overwrite=true", "--repo_id=you/demos"]) == 0
-    assert {name for name, data in files(tmp_path / "x").items() if data != before[name]} == {"meta/manip_il.json"}
-    mine = tmp_path / "mine" / "thesis.tex"
-    write_file(mine, b"")
-    assert main([*words[:2], str(mine.parent), "--overwrite=true"]) == 2
-    assert mine.exists()
-
-
 @pytest.mark.slow
 @pytest.mark.gl
 def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_or_two(tmp_path):
@@ -110,19 +95,6 @@ def demos(here) -> Path:
 
 @pytest.mark.gl
 @pytest.mark.slow
-def test_the_command_makes_a_dataset_with_the_asked_pictures(demos, capsys):
-    assert main(["data", "render", "demos", "seen", "--workers=1", "--image.height=48", "--image.width=64"]) == 0
-    said = capsys.readouterr()
-    assert "rendered 3 episodes, 18 frames\ndataset: seen\n" in said.out
-    assert "seen: 3/3" in said.err
-    assert Dataset.open(Path("seen")).spec == env_spec(ENV, CameraConfig(("front", "side", "wrist"), 48, 64))
-    np.testing.assert_array_equal(
-        Dataset.open(Path("seen")).columns()["sim_state"], Dataset.open(demos).columns()["sim_state"]
-    )
-
-
-@pytest.mark.gl
-@pytest.mark.slow
 def test_two_workers_write_the_bytes_of_one(demos):
     words = ["--cameras=wrist", "--image.height=32", "--image.width=32", "--look.shadows=true", "--look.light_turn=30"]
     assert main(["data", "render", "demos", "one", "--workers=1", *words]) == 0
@@ -132,21 +104,6 @@ def test_two_workers_write_the_bytes_of_one(demos):
     assert Dataset.open(Path("one")).provenance["rendered"]["cameras"]["look"] == asdict(
         Look(shadows=True, light_turn=30)
     )
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
-        (["demos", "demos", "--overwrite=true"], 2, "demos overlaps demos"),
-        (["demos", "full", "--overwrite=true"], 2, "full holds something that manip-il did not make"),
-    ],
-)
-def test_wrong_words_are_answered_with_one_line_and_nothing_changes(demos, error, words, code, message):
-    write_file(Path("full/thesis.txt"), b"")
-    before = files(Path())
-    assert main(["data", "render", *words]) == code
-    assert message in error()
-    assert files(Path()) == before
 
 
 def test_without_opengl_what_was_there_stays(demos, error, monkeypatch):

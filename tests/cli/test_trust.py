@@ -14,15 +14,12 @@ from manip_il.cli.main import load, main
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import dump_yaml, parse
 from manip_il.cli.study import read_plan
-from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.job import RolloutJob
-from manip_il.collect.workers import Engine
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.lerobot_config import lerobot_options
 
 from ..damage import edit_json
-from .made_runs import ENV, make_eval, make_policy, make_run
+from .made_runs import make_eval, make_policy, make_run
 
 COMMANDS = ("train", "dagger", "eval", "compare", "robot certify")
 SAMPLE = Path(__file__).resolve().parents[2] / "datasets" / "sample"
@@ -70,13 +67,6 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, pol
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
         lerobot_options(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"]).config())  # pyright: ignore[reportAttributeAccessIssue]
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-def test_a_worker_trusts_only_what_its_job_does(hostile):
-    job = RolloutJob(ENV, PolicyDriver((hostile,)), label="last", batch=1)
-    with Engine(2) as engine, pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
-        list(engine.run(job, [0, 1]))
 
 
 @pytest.mark.parametrize("command", COMMANDS)

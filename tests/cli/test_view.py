@@ -76,18 +76,6 @@ def test_a_file_holds_every_step_and_a_picture_of_every_camera(tmp_path, capsys)
         assert [bytes(np.array(one, np.uint8).ravel()[:2]) for one in pictures] == [b"\xff\xd8"] * sum(steps)  # JPEG
 
 
-@pytest.mark.gl
-def test_a_policy_is_watched_and_one_of_another_robot_refused(policy, tmp_path, error):
-    path = tmp_path / "p.rrd"
-    words = ["view", f"--policy.path={policy}", "--n_episodes=1", "--env.horizon=6", f"--output={path}"]
-    assert main(words) == 0
-    executed, labels = (np.array(column(path, name, SCALARS)) for name in (schema.EXECUTED_ACTION, schema.ACTION))
-    assert executed.shape == labels.shape == (6, 8)
-    assert (executed != labels).any(axis=1).all()
-    assert main([*words, "--robot.type=fetch"]) == 1
-    assert "robot differs: the policy has panda" in error()
-
-
 def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
     class Window:
         commands = np.zeros(0)
@@ -104,23 +92,3 @@ def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
     np.testing.assert_allclose(steps[-1].executed_action[scene.actions.arm], window.commands[scene.arm_ctrl])
     np.testing.assert_allclose(env.data.ctrl[scene.gripper.ctrl], 0.03, atol=1e-6)
     np.testing.assert_allclose(env.data.qpos[scene.arm_q], window.commands[scene.arm_ctrl], atol=5e-3)
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["--policy.type=sliders"], "needs a window: a DISPLAY, and no --output"),
-        (["--n_episodes=0"], "expected at least 1"),
-        (["--policy.type=expert", "--policy.path=x"], "no policy in x"),
-    ],
-)
-def test_what_cannot_be_watched_is_refused(words: list[str], says: str, here, error):
-    assert main(["view", *words]) == 2
-    assert says in error()
-    assert list(here.iterdir()) == []
-
-
-def test_a_display_that_does_not_answer_is_said_in_one_line(monkeypatch, error):
-    monkeypatch.setenv("DISPLAY", ":77")
-    assert main(REACH) == 1
-    assert "no display: DISPLAY=:77" in error()

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from manip_il.collect.drivers import PolicyDriver, RandomDriver, Setting
-from manip_il.collect.query import Query, drawn_step, parse_query
+from manip_il.collect.query import Query, drawn_step
 from manip_il.collect.rollout import Turn
-from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State
 from manip_il.tasks.envs import scene_of
 
@@ -91,17 +90,6 @@ def test_a_learner_is_told_whose_turn_it_is_and_of_what_and_sees_the_pictures_of
         *(("begin", [20]), ("told", {20: "do 20"}), ([10, 20], [11, 20])),
         ([10], [12]),
     ]
-
-
-@pytest.mark.parametrize("text", ["every", "one", "probability:0.1", "ensemble:0.2", "safety:0.5"])
-def test_a_rule_is_written_as_it_is_read(text: str):
-    assert str(parse_query(text)) == text
-
-
-@pytest.mark.parametrize("text", ["evry", "every:1", "probability", "probability:0", "safety:-1", "ensemble:nan"])
-def test_a_rule_that_cannot_be_is_refused(text: str):
-    with pytest.raises(ManipError, match=r"query|unknown"):
-        parse_query(text)
 
 
 def test_safety_queries_where_expert_and_learner_differ_by_more_than_the_bound():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -27,11 +26,9 @@ from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.scenes import CHUNK, Scenes
 from manip_il.collect.workers import map_in_order
-from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.errors import ManipError
 from manip_il.mdp import Episode, State
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
@@ -42,7 +39,7 @@ from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.stock.table import ROBOT as STOCK
 
-from ..damage import digests, edit_json
+from ..damage import digests
 from ..tables import SCENES, one_arm_per_task
 
 ENV, REACH = make_config("panda", "pick_place"), make_config("fetch", "reach")
@@ -135,29 +132,6 @@ def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path
             exact = render_states(ENV, cameras, episode.columns[schema.SIM_STATE])
             for key in spec.image_keys:  # but for what the video's compression costs
                 assert np.abs(episode.columns[key].astype(int) - exact[key]).mean() < 4
-
-
-def edit_own_file(part: str, **entries: object) -> Callable[[Path], None]:
-    return lambda root: edit_json(root / layout.OURS, lambda ours: ours[part].update(entries))
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (edit_own_file("spec", robot="ur5"), "the robot 'ur5' .* states cannot be restored"),
-        (edit_own_file("spec", task="juggle"), "the task 'juggle', of which not all is known here"),
-        (edit_own_file("spec", sim_state_size=7), "size of sim_state differs: .* has 7"),
-        (lambda root: (root / layout.INFO).unlink(), "is not a LeRobot dataset"),
-    ],
-)
-def test_states_of_an_unknown_world_are_refused(change: Callable[[Path], None], words: str, demos, tmp_path):
-    root = write(Dataset.open(demos).read_episodes(), tmp_path / "demos", ENV)
-    edit_own_file("fingerprint", model_sha256="0" * 64, torch="1.0")(root)
-    (warning,) = open_source(root).warnings
-    assert "compiled MuJoCo model differs" in warning
-    change(root)
-    with pytest.raises(ManipError, match=words):
-        open_source(root)
 
 
 def redrawn(source: Source, root: Path, frames: int, workers: int = 1, **settings) -> list[Episode]:

@@ -16,7 +16,6 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Query
 from manip_il.data.episodes import parts
 from manip_il.data.schema import ordered_columns
-from manip_il.errors import UsageError
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
@@ -135,15 +134,3 @@ def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJo
             assert (branch.columns["actor"] == Actor.EXPERT).all()
             np.testing.assert_array_equal(branch.columns["executed_action"], branch.columns["action"])
         assert episode.success == path.success
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"driver": ExpertDriver(), "label": "takeover"}, "takes over from a policy; this .* driven by 'expert'"),
-        ({"query": Query("ensemble", 0.1)}, "needs other policies to disagree with"),
-    ],
-)
-def test_what_a_job_lacks_is_said_before_it_runs(job: RolloutJob, changes, words: str):
-    with pytest.raises(UsageError, match=words):
-        next(replace(job, **changes).run(SEEDS))

@@ -34,7 +34,7 @@ CHANGED = [
     for robot, task in SCENES
     for kind in kinds_for(TASKS[task])
     if KINDS[kind].change is not None
-    for at in ((6, 16) if (robot, task) in WITH_A_CUBE else (6,))  # on the way to the cube; with it in the hand
+    for at in ((6, 16) if task == "pick_place" else (6,))  # on the way to the cube; with it in the hand
 ]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..pictures import numbered_episodes, write
@@ -22,6 +20,32 @@ from ..pictures import numbered_episodes, write
 pytestmark = pytest.mark.slow
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 RECORDED = ("video", "image")
+SIZE = (64, 96, 3)
+
+
+def record(root: Path, kind: str, episodes: int) -> None:
+    """Episodes of numbers, text and two cameras by LeRobot's own writer. kind: of these, `video` or `image`."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    table: dict[str, Any] = {
+        "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
+        "action": {"dtype": "float32", "shape": (2,), "names": {"motors": ["x", "y"]}},
+        "note": {"dtype": "string", "shape": (1,), "names": None},
+        "flag": {"dtype": "bool", "shape": (1,), "names": None},
+        **{one: {"dtype": kind, "shape": SIZE, "names": ["height", "width", "channels"]} for one in (FRONT, WRIST)},
+    }
+    dataset: Any = LeRobotDataset.create("a/b", 10, table, root=root, robot_type="so100", use_videos=kind == "video")
+    rng = np.random.default_rng(0)
+    for episode in range(episodes):
+        for t in range(15 + episode):
+            row: dict[str, Any] = {"task": f"task {episode % 2}", "note": f"frame {t}", "flag": np.array([t % 2 == 0])}
+            row |= {key: rng.normal(size=table[key]["shape"]).astype(np.float32) for key in list(table)[:2]}
+            for camera in (FRONT, WRIST):
+                row[camera] = np.zeros(SIZE, np.uint8)
+                row[camera][:, 5 * t % 80 : 5 * t % 80 + 10, episode % 3] = 255
+            dataset.add_frame(row)
+        dataset.save_episode()
+    dataset.finalize()
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +54,6 @@ def roots(
 ) -> dict[str, Path]:
     """Ours with either codec, in several files; what LeRobot records; what it makes of two by aggregating."""
     from lerobot.datasets.aggregate import aggregate_datasets
-
-    from .record_lerobot import record
 
     folder = tmp_path_factory.mktemp("datasets")
     for codec in ("h264", "libsvtav1"):
@@ -65,12 +87,3 @@ def test_what_is_decoded_at_once_or_when_it_is_read_is_bit_equal_to_what_lerobot
         for key, values in frames.items():
             assert theirs[key].dtype.is_floating_point
             np.testing.assert_array_equal((theirs[key] * 255).numpy(), values[row].astype(np.float32))
-
-
-def test_no_room_for_decoded_pictures_is_one_line(roots, monkeypatch):
-    def full(handle: int, start: int, size: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(ManipError, match=r"cannot write .*: No space left"):
-        Dataset.open(roots["image"]).camera(FRONT).decode()

@@ -5,15 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from manip_il.data import lerobot_layout as layout
@@ -21,10 +17,10 @@ from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 
-from ..damage import DATA, cut, digests, edit_json
+from ..damage import digests, edit_json
 from ..pictures import assert_comes_back, write
 
 FINGERPRINT = {"mujoco": "3.11.0"}
@@ -41,17 +37,6 @@ def root(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path
 
 def test_episodes_come_back_bit_for_bit(root, episodes):
     assert_comes_back(root, episodes)
-
-
-def test_a_table_holds_whole_columns(root, episodes, spec):
-    table = Dataset.open(root).columns()
-    assert list(table) == list(layout.all_features(s.features(spec)))
-    assert table[s.SIM_STATE].shape == (20, spec.sim_state_size)
-    assert table[s.SIM_STATE].dtype == np.float64
-    assert table["episode_index"].tolist() == [0] * 7 + [1] + [2] * 12
-    assert table["frame_index"].tolist() == [*range(7), 0, *range(12)]
-    assert table["index"].tolist() == list(range(20))
-    np.testing.assert_array_equal(table["timestamp"], (table["frame_index"] / spec.fps).astype(np.float32))
 
 
 def test_what_a_dataset_says_of_itself(root, spec):
@@ -136,74 +121,3 @@ def test_a_new_file_starts_where_one_is_full_and_a_missing_one_is_noticed(tmp_pa
     files[-1].unlink()
     with pytest.raises(ManipError, match="counts 80 frames"):
         Dataset.open(tmp_path / "small").columns()
-
-
-def with_column(episode: Episode, key: str, values: np.ndarray | None) -> Episode:
-    """None: without it."""
-    columns = episode.columns | {key: values}
-    return dataclasses.replace(episode, columns={k: v for k, v in columns.items() if v is not None})
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        (lambda e: with_column(e, s.BETA, None), MismatchError, "columns differs: seed 9 has"),
-        (lambda e: with_column(e, "acton", e.columns[s.ACTION]), MismatchError, "acton"),
-    ],
-)
-def test_an_episode_that_does_not_fit_is_refused(tmp_path, make_episode, spec, change, error, message):
-    with pytest.raises(error, match=message):
-        write_dataset([change(make_episode(9))], tmp_path / "lift", spec, **OPTIONS)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_not_there_is_named(root, tmp_path):
-    for folder in (tmp_path, tmp_path / "nothing"):
-        with pytest.raises(ManipError, match="is not a LeRobot dataset"):
-            Dataset.open(folder)
-    with pytest.raises(UnknownName, match=r"did you mean 'observation\.state'"):
-        Dataset.open(root).columns(["observation.stat"])
-    with pytest.raises(UsageError, match="has no episode 3; it has 0 to 2"):
-        Dataset.open(root).rows_of(3)
-
-
-def test_a_truncated_file_broken_json_and_another_version_are_named(root):
-    cut(root / DATA, 0.5)
-    with pytest.raises(ManipError, match=Path(DATA).name):
-        Dataset.open(root).columns()
-    edit_json(root / layout.INFO, lambda info: info.update(codebase_version="v2.1"))
-    with pytest.raises(ManipError, match=r"codebase_version is .v2\.1."):
-        Dataset.open(root)
-    (root / layout.INFO).write_text("{")
-    with pytest.raises(ManipError, match=r"info\.json is not valid JSON"):
-        Dataset.open(root)
-
-
-def test_importing_costs_no_torch():
-    code = """
-import sys
-import manip_il.data.build
-heavy = {"torch", "lerobot", "datasets", "pandas", "mujoco", "mink"}
-sys.exit(", ".join(heavy & set(sys.modules)))
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=HERE.parents[1], capture_output=True, text=True, check=False
-    )
-    assert done.stderr.strip() == ""
-
-
-@pytest.mark.parametrize(
-    ("key", "column"),
-    [
-        (s.ACTION, [[1.0, 2.0], [1.0]] * 10),
-        (s.ACTION, [[1.0, 2.0, 3.0], None] * 10),
-        (s.ACTION, ["text"] * 20),
-        (layout.EPISODE_INDEX, [float("nan")] * 20),
-        (s.SUCCESS, [{"a": 1}] * 20),
-    ],
-)
-def test_a_column_of_another_kind_or_with_gaps_is_named(root, key, column):
-    table = pq.read_table(root / DATA)
-    pq.write_table(table.set_column(table.column_names.index(key), key, pa.array(column)), root / DATA)
-    with pytest.raises(ManipError, match=f"'{key}' h"):
-        Dataset.open(root).columns([key])

@@ -15,7 +15,6 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
-from manip_il.data.joined import JoinedDatasets
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.store.transfer import open_remote, pull, push
@@ -69,10 +68,7 @@ def test_such_a_dataset_is_not_pulled(root: Path, tmp_path: Path, monkeypatch: p
 
 DECODED: dict[str, Any] = {
     "another picture": {"_type": "Image"},
-    "audio": {"_type": "Audio"},
     "in a list": {"feature": {"_type": "Image"}, "_type": "List"},
-    "in a table": {"a": {"_type": "Pdf"}},
-    "unknown": {"_type": "Dataset"},
 }
 
 
@@ -94,12 +90,3 @@ def test_a_playlist_is_no_video(tmp_path: Path, two: s.RobotTaskSpec, filmed: li
     path.write_bytes(b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:1/a.ts\n" + path.read_bytes())
     with pytest.raises(ManipError, match=r"Invalid data found .*\.mp4"):
         check_arrived(root)
-
-
-def test_a_row_whose_task_has_no_text_is_one_line(root: Path):
-    meta = JoinedDatasets([root, root])
-    own = np.zeros(meta.total_frames, np.int64)
-    assert meta.joint_tasks(own).tolist() == own.tolist()
-    own[-1] = 7
-    with pytest.raises(ManipError, match=r"lift: rows have the task 7, which meta/tasks\.parquet lacks"):
-        meta.joint_tasks(own)

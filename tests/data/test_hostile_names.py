@@ -13,10 +13,8 @@ from manip_il.cli.main import main
 from manip_il.data import journal
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.build import Recording, local_id
 from manip_il.data.dataset import Dataset
-from manip_il.errors import ManipError, UsageError
-from manip_il.sim.conditions import Condition
+from manip_il.errors import ManipError
 
 from ..damage import digests, edit_json
 from ..pictures import numbered_episodes, with_cameras, write
@@ -81,15 +79,6 @@ def test_a_spec_refuses_what_it_cannot_be(spec, change, words):
 
 
 @pytest.mark.parametrize(
-    ("folder", "wanted"),
-    [("my demos", "local/my_demos"), ("...", "local/dataset"), ("é", "local/_"), ("a..b", "local/a.b")],
-)
-def test_a_folder_of_any_name_gives_a_repository_id(folder, wanted, tmp_path):
-    assert local_id(folder) == wanted
-    assert Recording.read(tmp_path / f"{folder}.journals").repo_id == wanted
-
-
-@pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"video_path": "../victim/{chunk_index:03d}/{file_index:03d}.mp4"}, "video_path is"),
@@ -104,9 +93,3 @@ def test_what_info_says_is_checked_by_its_reader(victim, change, words):
     with pytest.raises(ManipError) as error:
         Dataset.open(victim)
     assert words in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["../x", "a b", "", ".hidden", "x" * 200])
-def test_a_condition_is_named_so_that_a_file_may_be(name):
-    with pytest.raises(UsageError, match="a condition's name is"):
-        Condition(name)

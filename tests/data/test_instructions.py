@@ -15,7 +15,6 @@ from manip_il.data.build import build, merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, read_journal
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 RED, BLUE = "Put the red cube into its bin.", "Put the blue cube into its bin."
@@ -62,9 +61,3 @@ def test_merging_numbers_the_texts_anew(tmp_path, told, spec, root):
     merge_datasets([tmp_path / "other", root], tmp_path / "merged", repo_id="local/merged")
     assert texts(tmp_path / "merged") == [BLUE, RED, *TEXTS]
     assert pq.read_table(tmp_path / "merged" / layout.TASKS)["task"].to_pylist() == [BLUE, RED]
-
-
-def test_a_number_without_a_text_is_an_error(root):
-    pq.write_table(layout.tasks_table([RED]), root / layout.TASKS)
-    with pytest.raises(ManipError, match=r"rows have the task 1, which meta/tasks\.parquet lacks"):
-        texts(root)

@@ -5,19 +5,14 @@ from __future__ import annotations
 import io
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
-import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -32,23 +27,6 @@ from ..synthetic import MakeEpisode
 FINGERPRINT = {"mujoco": "3.11.0", "model_sha256": "ab" * 32}
 HERE = Path(__file__).parent
 
-DTYPES = st.sampled_from(["<f4", "<f8", ">f8", "<f2", "i1", "u1", "<i8", "<u8", "?"])
-
-
-@st.composite
-def any_episode(draw: st.DrawFn) -> Episode:
-    length = draw(st.integers(1, 5))
-    shapes = st.sampled_from([(length,), (length, 1), (length, 3), (length, 2, 2), (length, 0)])
-    arrays = DTYPES.flatmap(
-        lambda dtype: hnp.arrays(
-            dtype, shapes, elements={"allow_nan": False, "allow_infinity": False} if "f" in dtype else None
-        )
-    )
-    names = st.sampled_from([s.SEED, s.SIM_STATE, s.BETA, "a/b", "é %s", "x.npy", s.ROUND])
-    columns: dict[str, Any] = draw(st.dictionaries(names, arrays, min_size=1, max_size=5))
-    seed = draw(st.integers(0, 2**63 - 1))
-    return Episode(seed, columns, draw(st.booleans()), draw(st.booleans()))
-
 
 def assert_same(left: Episode, right: Episode) -> None:
     assert (left.seed, left.success, left.success_at_end) == (right.seed, right.success, right.success_at_end)
@@ -57,15 +35,6 @@ def assert_same(left: Episode, right: Episode) -> None:
         mine = left.columns[key]
         assert (mine.dtype, mine.shape) == (values.dtype, values.shape)
         assert mine.tobytes() == values.tobytes()  # bits: a minus zero is one
-
-
-@settings(max_examples=60)
-@given(any_episode())
-def test_any_columns_come_back_bit_for_bit(episode):
-    spec = s.RobotTaskSpec("r", "t", 30, ("a", "b", "%s"), ("ee.x", "ee.y", "ee.z"), 1, "")
-    with tempfile.TemporaryDirectory() as folder:
-        path = journal.Journal(Path(folder), spec, {}).write(episode)
-        assert_same(journal.read_journal(path)[1], episode)
 
 
 def test_an_episode_comes_back_with_its_header_and_gives_the_same_bytes_again(tmp_path, episodes, spec):
@@ -94,22 +63,6 @@ def test_pictures_come_back_bit_for_bit(filmed, make_episode, spec):
     columns = journal.read_journal(filmed)[1].columns
     for key in (s.IMAGES + "front", s.IMAGES + "wrist"):
         np.testing.assert_array_equal(columns[key], written.columns[key])
-
-
-@given(st.integers(0, 10**9), st.integers(1, 255))
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_changed_byte_anywhere_is_refused_by_name_or_changes_nothing(filmed, place, change):
-    data = bytearray(filmed.read_bytes())
-    data[place % len(data)] ^= change
-    changed = filmed.with_name("episode-000000000018.mcap")
-    changed.write_bytes(data)
-    try:
-        assert_same(journal.read_journal(changed)[1], journal.read_journal(filmed)[1])  # it was in the index
-    except ManipError as error:
-        message = str(error)
-    else:
-        return
-    assert re.match(r"^.*episode-000000000018\.mcap is not a complete episode: .*$", message)
 
 
 def test_a_file_cut_short_is_refused_by_name(path):

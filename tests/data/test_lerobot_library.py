@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 from collections.abc import Callable
@@ -104,21 +103,6 @@ def assert_loads(root: Path, episodes: list[Episode]) -> None:
             np.testing.assert_array_equal(item[key].numpy(), values[t])
         assert (item["episode_index"], item["frame_index"], item["index"]) == (number, t, index)
         assert item["timestamp"] == pytest.approx(t / dataset.fps)
-
-
-def test_video_settings_are_the_librarys():
-    from lerobot.configs.video import RGBEncoderConfig
-
-    for ours, theirs in (
-        (VideoConfig("libsvtav1"), RGBEncoderConfig()),
-        (VideoConfig("libsvtav1", "yuv420p10le", 5, 20, 8), RGBEncoderConfig("libsvtav1", "yuv420p10le", 5, 20, 8)),
-        (VideoConfig("h264", crf=30, preset="fast"), RGBEncoderConfig("h264", preset="fast")),
-    ):
-        for field in dataclasses.fields(ours):
-            assert getattr(ours, field.name) == getattr(theirs, field.name), field.name
-        options = ours.options()
-        options.pop("bf", None)  # ours alone: no frames out of order
-        assert options == theirs.get_codec_options(encoder_threads=1, as_strings=True)
 
 
 def test_files_and_info_equal_those_of_lerobots_writer(pair):

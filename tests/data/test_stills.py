@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.camera import decode_picture
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.mdp import Episode
 
-from ..pictures import encoded, episode_frames
+from ..pictures import episode_frames
 
 FRONT, SIDE = s.IMAGES + "front", s.IMAGES + "side"
 
@@ -50,16 +49,3 @@ def test_pictures_come_back_bit_for_bit(root, seen, pictured):
     np.testing.assert_array_equal(episode_frames(root, SIDE, 2), seen[2].columns[SIDE])
     blind = next(Dataset.open(root).read_episodes(pictures=False))
     assert FRONT not in blind.columns
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (None, "cannot identify"),
-        (b"GIF89a", "cannot identify"),
-        (encoded(np.zeros((4, 4), np.uint8)), "a picture of mode L; expected RGB"),
-    ],
-)
-def test_a_picture_that_is_none_or_grey_is_refused(content: bytes | None, words: str):
-    with pytest.raises((OSError, ValueError), match=words):
-        decode_picture(content)

@@ -6,7 +6,6 @@ and its card in `tests/store/test_cards.py`, datasets of every shape that is tra
 
 from __future__ import annotations
 
-import re
 import shutil
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import pytest
 from lerobot.datasets.dataset_tools import merge_datasets, modify_tasks, split_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from manip_il.cli.main import COMMANDS, main
+from manip_il.cli.main import main
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.dataset import Dataset
 from manip_il.store.cards import write_cards
@@ -83,9 +82,3 @@ def test_depth_in_lerobots_formats_is_whole_and_comes_back(tmp_path: Path, kind:
     for words in (("data", "check", root), ("push", root, url), ("pull", url, tmp_path / "got")):
         assert main([*map(str, words)]) == 0
     assert digests(tmp_path / "got") == digests(root)
-
-
-def test_a_command_that_a_remedy_names_is_there():
-    rooms = [path for room in ("collect", "data", "doctor", "mcap", "store") for path in (PACKAGE / room).rglob("*.py")]
-    named = {word for path in rooms for word in re.findall(r"manip-il ((?:data )?[a-z][a-z-]+)", path.read_text())}
-    assert {"data check", "data repair"} <= named <= COMMANDS.keys()

@@ -13,7 +13,6 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.journal import list_episodes
 from manip_il.doctor.examine import examine_folder, repair
-from manip_il.doctor.finding import Finding
 from manip_il.errors import ManipError
 
 from ..damage import DATA, cut, digests, edit_json, edit_table, lines
@@ -100,7 +99,3 @@ def test_no_file_that_is_cut_or_missing_stops_the_examination_or_goes_unseen(our
             assert found, path
             assert not any("a check failed" in line for line in found), (path, found)
         path.write_bytes(whole)
-
-
-def test_a_finding_is_one_printable_line():
-    assert str(Finding("a\x1b[31m", "b\nc", "d")).isprintable()

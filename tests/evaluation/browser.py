@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 HEIGHT = 900
+PATIENCE = 600.0  # for anything, on a machine that does much else [s]
 
 
 @dataclass
@@ -28,7 +29,7 @@ class Opened:
         """The value of an expression, or of a function of `argument`, in the page."""
         return self.page.evaluate(script, argument)
 
-    def wait_until(self, script: str, argument: object = None, seconds: float = 60.0) -> None:
+    def wait_until(self, script: str, argument: object = None, seconds: float = PATIENCE) -> None:
         """Wait until that is true. Playwright's `wait_for_function` evaluates in the page, which a page may forbid."""
         end = time.monotonic() + seconds
         while not self.evaluate(script, argument):
@@ -43,7 +44,7 @@ def chromium() -> Iterator[Browser]:
     assert found, f"no Chromium ({', '.join(NAMES)}) on the PATH; as root: .ci/system browser"
     with sync_playwright() as playwright:
         # Its sandbox cannot be had as root, nor in most containers; the pages are our own.
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=1000 * PATIENCE)
         yield browser
         browser.close()
 
@@ -52,6 +53,7 @@ def chromium() -> Iterator[Browser]:
 def opened(browser: Browser, path: Path, width: int, scheme: Literal["light", "dark"] = "light") -> Iterator[Opened]:
     """`path` in a window of this width [px], without a network."""
     context = browser.new_context(viewport={"width": width, "height": HEIGHT}, color_scheme=scheme, offline=True)
+    context.set_default_timeout(1000 * PATIENCE)
     page = context.new_page()
     window, own = Opened(page), path.resolve().as_uri()
     page.on("console", lambda message: window.console.append(f"{message.type}: {message.text}"))

@@ -92,80 +92,6 @@ def test_a_file_whose_reward_was_a_setting_has_it_in_the_tasks_name():
     assert EvalResult.from_json(data).task == "carry:length=1,height=3"
 
 
-def test_failures_are_counted_by_phase():
-    assert result([True, False, False]).failures == {"CARRY": 2}
-    assert result([True, False]).steps_to_success is None
-
-
-def test_steps_to_success_counts_the_episodes_that_succeeded():
-    made = result([True, True, False])
-    counts = (10, 21, None)
-    episodes = tuple(replace(e, detail={"steps_to_success": n}) for e, n in zip(made.episodes, counts, strict=True))
-    assert replace(made, episodes=episodes).steps_to_success == 15.5
-
-
-def refusal(path: Path, text: str) -> str:
-    """The error of reading `text`, one short line that names the file."""
-    path.write_text(text)
-    with pytest.raises(ManipError) as raised:
-        EvalResult.read(path)
-    message = str(raised.value)
-    assert len(message) < 1_000
-    assert "\n" not in message
-    assert str(path) in message
-    return message
-
-
-@pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        (("episodes", 0, "seed"), "five"),
-        (("episodes", 0, "steps"), None),
-        (("episodes", 0), 5),
-        (("episodes",), []),
-        (("settings", "conditions"), [{"name": "a", "knock": 10**400}]),
-        (("settings",), None),
-        (("task",), "tasks/mine.py"),
-    ],
-)
-def test_an_odd_value_is_one_short_line(tmp_path: Path, place: tuple[str | int, ...], value: object):
-    data: Any = result([True]).to_json()
-    holder = data
-    for key in place[:-1]:
-        holder = holder[key]
-    holder[place[-1]] = value
-    assert "not an eval.json" in refusal(tmp_path / "eval.json", json.dumps(data))
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("", "not valid JSON"),
-        ('{"success_rate": 0.5, "epis', "not valid JSON"),
-        ("[" * 100_000, ""),
-        (json.dumps(result([True]).to_json()).replace("1.0", "NaN"), ""),
-        ("[]", "expected an object"),
-        ("{}", "is missing"),
-        ('{"a": 1}', "is missing"),
-    ],
-)
-def test_what_is_no_eval_json_is_one_short_line(tmp_path: Path, text: str, complaint: str):
-    assert complaint in refusal(tmp_path / "eval.json", text)
-
-
-def test_a_missing_file_says_what_writes_it(tmp_path: Path):
-    with pytest.raises(ManipError, match="manip-il eval"):
-        EvalResult.read(tmp_path / "eval.json")
-
-
-def test_no_episode_and_a_repeated_seed_are_refused():
-    with pytest.raises(ManipError, match="no episodes"):
-        result([])
-    made = result([True, True])
-    with pytest.raises(ManipError, match="2 episodes on 1 seeds"):
-        replace(made, episodes=(made.episodes[0], made.episodes[0]))
-
-
 def compared(left: EvalResult, right: EvalResult) -> Comparison:
     return Comparison(left.policy, right.policy, ((left, right),))
 
@@ -217,10 +143,3 @@ def test_a_policy_is_the_same_wherever_it_lay():
 def test_what_differs_is_named_with_both_sides(changes, what):
     with pytest.raises(MismatchError, match=f"{what} differs: a has .*, b has"):
         merge_results({"a": part(0, [True]), "b": part(1, [True], **changes)})
-
-
-def test_parts_that_do_not_add_up_are_refused_by_name():
-    with pytest.raises(ManipError, match="4 episodes on 3 seeds"):
-        merge_results({"a": part(0, [True] * 3), "b": part(2, [True])})
-    with pytest.raises(ManipError, match="b stopped by --until_width"):
-        merge_results({"a": part(0, [True]), "b": part(1, [True], until_width=0.1)})

@@ -2,9 +2,6 @@
 
 from typing import Any
 
-import pytest
-
-from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.rounds import Rule, history
 
 SUCCESS = (0.5, 0.9, 0.8, 0.9, 0.7)
@@ -34,24 +31,6 @@ def test_wall_clock_adds_up_without_validating():
     assert str(RUN[1].validation) == "90.0 % [59.6, 98.2]"
 
 
-def test_the_order_of_the_lines_does_not_matter():
-    assert history(records()[::-1], "x") == RUN
-
-
-@pytest.mark.parametrize(
-    ("lines", "words"),
-    [
-        ([], "no finished round"),
-        ([{"step": 100, "loss": 0.1}], "not written by a run of manip-il"),
-        ([records()[0] | {"seconds": None}], "not written by a run of manip-il"),
-    ],
-)
-def test_lines_that_are_no_runs_are_refused_by_name(lines, words):
-    with pytest.raises(ManipError, match=words) as error:
-        history(lines, "runs/x")
-    assert "runs/x" in str(error.value)
-
-
 def test_best_is_the_later_of_equals_and_last_is_last():
     assert Rule("best").select(RUN, "x").round == 3
     assert Rule("last").select(RUN, "x").round == 4
@@ -65,11 +44,3 @@ def test_rounds_count_up_to_what_every_run_reached():
     assert limits == {"end": None, "labels": 360, "episodes": 9, "seconds": 50}
     assert [rules["seconds"].select(run, "x").round for run in (RUN, shorter)] == [4, 0]
     assert [rules["labels"].select(run, "x").round for run in (RUN, shorter)] == [2, 2]
-
-
-def test_a_run_without_a_round_that_early_is_refused():
-    late = {"x": RUN, "late": history(records((0.1,), labels=900), "late")}
-    with pytest.raises(UsageError, match="the first round of late took 900 labels, another run had 500 labels"):
-        Rule("best", "labels").limited(late).select(late["late"], "late")
-    with pytest.raises(UsageError, match="y has no rounds"):
-        Rule("best", "labels").limited({"x": RUN, "y": ()})

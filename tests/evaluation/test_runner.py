@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from manip_il.collect.drivers import PolicyDriver, RandomDriver
@@ -14,12 +13,12 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.evaluation import runner
 from manip_il.evaluation.results import EpisodeResult
-from manip_il.evaluation.runner import episode_result, evaluate
+from manip_il.evaluation.runner import evaluate
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import NOMINAL, Condition, draw
+from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import env_of, make_env
+from manip_il.tasks.envs import env_of
 
 from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint
@@ -81,26 +80,6 @@ def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
     assert result.settings.conditions == ALL
 
 
-def test_places_are_the_true_ones_of_first_and_last_state():
-    job = RolloutJob(make_config("fetch"), label="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),))
-    [episode] = job.run(SEEDS[:1])
-    result = episode_result(job, episode)
-    env = make_env("fetch")
-    env.start(SEEDS[0])
-    assert result.detail["start"]["object"] == pytest.approx(env.world.pose("object").position, abs=1e-4)
-    assert result.detail["start"]["hand"] == pytest.approx(env.data.site_xpos[env.scene.ee_site], abs=1e-4)
-    assert result.success
-    assert np.linalg.norm(np.subtract(result.detail["end"]["object"], result.detail["goal"])) < 0.02
-    [observed] = episode.columns["observation.environment_state"][:1]
-    assert np.abs(observed[12:15] - result.detail["start"]["object"]).max() > 0.01  # it was told another place
-
-
-def test_a_task_without_an_object_has_no_place_of_one(act):
-    job = RolloutJob(make_config("fetch", "reach", horizon=8), label="last")
-    [one] = evaluate(Engine(1), job, SEEDS[:1], "expert").episodes
-    assert set(one.detail["start"]) == {"hand"}
-
-
 class Coins(Engine):
     """Its episodes are their seeds, in reverse; `asked` is what was to be run."""
 
@@ -141,12 +120,6 @@ def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
     assert shorter.success.interval[1] - shorter.success.interval[0] > 0.05
     assert [episode.seed for episode in found.episodes] == list(range(len(found.episodes)))
     assert max(map(max, engine.asked)) == len(found.episodes) - 1  # nothing beyond it was run
-
-
-def test_until_width_gives_up_at_the_last_seed(coins):
-    found = evaluate(coins([True] * 150), COIN, range(150), "coin", until_width=0.001)
-    assert len(found.episodes) == 150
-    assert found.to_json()["interval_method"].startswith("confidence sequence")
 
 
 def test_what_is_done_is_not_run_again_and_changes_nothing(coins):

@@ -3,7 +3,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,30 +114,6 @@ def act(spec, tmp_path) -> Path:
     from .tiny_policies import write_checkpoint
 
     return write_checkpoint(tmp_path / "policy", "act", spec, origin=Origin.of(spec))
-
-
-class Curves:
-    """Options that ask for TensorBoard and Weights & Biases, and what these left behind."""
-
-    options: ClassVar[dict[str, Any]] = {
-        "tensorboard": True,
-        "wandb": {"enable": True, "mode": "offline", "disable_artifact": True},
-    }
-
-    def steps(self, run: Path) -> list[int]:
-        """The steps of the loss in TensorBoard's file, once there is a run of Weights & Biases, too."""
-        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-        assert list((run / "wandb").glob("offline-run-*"))
-        events = EventAccumulator(str(run / "tensorboard"))
-        events.Reload()
-        return [point.step for point in events.Scalars("loss")]
-
-
-@pytest.fixture
-def curves(tmp_path, monkeypatch) -> Curves:
-    monkeypatch.setenv("WANDB_DIR", str(tmp_path))
-    return Curves()
 
 
 def read(path: Path) -> dict[str, torch.Tensor]:

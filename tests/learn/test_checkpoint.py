@@ -15,8 +15,8 @@ import pytest
 
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
-from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import Checkpoint, Origin, read_origin
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_class, policy_config, policy_types
 from manip_il.learn.names import PLAIN
@@ -31,11 +31,6 @@ EVIL = {
     "registry_name": "action_tokenizer_processor",
     "config": {"action_tokenizer_name": "evil/tokenizer", "trust_remote_code": True},
 }
-
-
-@pytest.fixture
-def mlp(dataset, tmp_path) -> Path:
-    return Trainer(dataset, FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8), tmp_path / "run").fit()
 
 
 def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured, tmp_path):
@@ -56,10 +51,8 @@ def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured
     ("change", "words"),
     [
         ({"numbers": {"observation.state": 5}}, r"observation\.state .*the policy has 5, arm/reach has 4"),
-        ({"numbers": {"observation.effort": 4}}, r"observation\.effort .*the policy has 4, arm/reach has None"),
         ({"action": 7}, r"action differs: the policy has 7, arm/reach has 4"),
         ({"pictures": {"top": (32, 48)}}, r"images\.top .*the policy has \(32, 48\), arm/reach has None"),
-        ({"pictures": {"wrist": (48, 32)}}, r"images\.wrist .*\(48, 32\).*\(32, 48\)"),
         ({"robot": "leg"}, r"robot of the inverse kinematics.*the policy has leg, arm/reach has arm"),
     ],
 )
@@ -68,16 +61,7 @@ def test_an_environment_that_lacks_an_input_is_refused_by_both_names(change, wor
         replace(Checkpoint.open(act), **change).check_fits(pictured)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"robot": "leg"},
-        {"fps": 50},
-        {"joint_names": ("a", "c", "b", "gripper")},
-        {"environment_state_names": ("x",)},
-        {"action_meaning": "torques"},
-    ],
-)
+@pytest.mark.parametrize("change", [{"robot": "leg"}, {"fps": 50}, {"joint_names": ("a", "c", "b", "gripper")}])
 def test_a_policy_for_something_else_is_refused_naming_both(change, act, spec):
     with pytest.raises(MismatchError) as error:
         Checkpoint.open(act).check_fits(replace(spec, **change))
@@ -118,79 +102,6 @@ def test_a_folder_with_a_pickle_is_refused_and_the_pickle_not_opened(name, act, 
     (act / name).write_bytes(pickle.dumps(Bomb(mark)))
     refused(act, rf"{name} is a pickle.*convert it to safetensors")
     assert not mark.exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("config.json", r"no config\.json in"),
-        ("model.safetensors", r"no model\.safetensors in .*weights are missing"),
-        ("policy_preprocessor.json", r"no .*policy_preprocessor\.json"),
-    ],
-)
-def test_a_file_that_is_missing_is_named(name, words, act):
-    (act / name).unlink()
-    refused(act, words)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"width": 32}, "do not match"),
-        ({"activation": "sqrt"}, "unknown activation 'sqrt'"),
-        ({"action_space": "nowhere"}, "unknown action space"),
-        ({"type": 5}, "names no type"),
-        ({"output_features": {"move": {"type": "ACTION", "shape": [4]}}}, "features that cannot be read"),
-    ],
-)
-def test_an_mlps_config_that_cannot_be_is_one_line(changes, words, mlp):
-    edit_config(mlp, **changes)
-    refused(mlp, words)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"dim_model": "wide"}, "dim_model"),
-        ({"no_such_option": 3}, r"LeRobot cannot load it.*no_such_option"),
-        ({"dim_model": 32}, "LeRobot cannot load it.*size mismatch"),
-    ],
-)
-def test_a_config_of_lerobots_that_cannot_be_is_one_line(changes, words, act):
-    edit_config(act, **changes)
-    refused(act, words, longest=1_500)
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"width": 0}, r"policy\.width is 0"),
-        ({"clamp": -1}, r"policy\.clamp is -1"),
-        ({"type": "cnn", "channels": [16]}, r"policy\.channels is \[16\].*expected two layers"),
-        ({"type": "cnn", "aux_weight": -1}, r"policy\.aux_weight is -1"),
-    ],
-)
-def test_options_of_our_own_policies_are_checked_where_they_are_made(settings, words):
-    with pytest.raises(UsageError, match=words):
-        policy_config(FitConfig(settings | {"device": "cpu"}))
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [({"robot": "../../x"}, "robot is"), ({"joint_names": 5}, "int"), ({"colour": "red"}, "colour")],
-)
-def test_what_a_policy_was_trained_for_is_read_or_refused_in_one_line(changes: dict[str, Any], words, act):
-    path = act / "manip_il.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-    with pytest.raises(ManipError, match=rf"manip_il\.json cannot be read \(.*{words}"):
-        read_origin(act)
-
-
-@pytest.mark.parametrize("kind", ["mlp", "act"])
-def test_weights_that_are_broken(kind, request):
-    policy = request.getfixturevalue(kind)
-    (policy / "model.safetensors").write_bytes(b"")
-    refused(policy, r"model\.safetensors cannot be read|do not match|LeRobot cannot load it")
 
 
 @pytest.fixture
@@ -251,8 +162,6 @@ def test_a_worker_trusts_only_what_its_job_does(act, ran):
     [
         ({"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}}, "--trust=true"),
         ({"registry_name": "groot_n1_7_pack_inputs_v1", "config": {}}, "--trust=true"),
-        ({"registry_name": "x" * 90, "config": {"y" * 10_000: "z" * 10_000}}, "--trust=true"),
-        ({"registry_name": "device_processor", "config": {"hook": "evil"}}, "LeRobot cannot load it"),
         ({"class": "subprocess.Popen", "config": {"args": "true"}}, r"subprocess\.Popen"),
         *(
             ({"registry_name": "normalizer_processor", "config": {}, "state_file": name}, "cannot be read")

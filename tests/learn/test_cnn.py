@@ -13,10 +13,10 @@ from lerobot.optim.optimizers import save_optimizer_state
 from lerobot.policies.factory import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
 
 from manip_il.data.schema import features
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import UsageError
 from manip_il.learn import mlp
 from manip_il.learn.cnn import CNNConfig, CNNPolicy
-from manip_il.learn.keypoints import KeypointEncoder, heat_map_losses
+from manip_il.learn.keypoints import KeypointEncoder
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
 
@@ -195,52 +195,6 @@ def test_offsets_that_are_read_off_or_given_enter_at_several_scales_too(meta, ta
         new_policy(meta, scales=scales)
 
 
-def test_truth_that_is_an_input_is_not_learnt(meta, table):
-    policy = new_policy(meta, observation="both")
-    assert policy.privileged is None
-    assert policy.model.input_mean.shape == (4 + 6 + 24,)
-    assert policy.select_action(make_batch(table)).shape == (20, 4)
-
-
-def test_features_that_do_not_fit_are_refused_in_one_line(meta):
-    with pytest.raises(UsageError, match=r"needs pictures \(observation\.images\.\*\); the inputs are observation"):
-        new_policy(meta, observation="state")
-    config = CNNConfig(**SMALL)
-    config.input_features, config.output_features = policy_features(meta.features, INPUTS["images"])
-    del config.input_features["observation.state"]
-    with pytest.raises(UsageError, match=r"cnn policy needs observation\.state and action"):
-        CNNPolicy(config)
-    for key, shape, words in (
-        ("action", (3,), r"\(4,\).*\(3,\)"),
-        ("observation.images.front", (SIDE, SIDE, 1), r"images\.front has \(1, 32, 32\)"),
-    ):
-        columns = meta.features | {key: meta.features[key] | {"shape": shape}}
-        with pytest.raises(MismatchError, match=words):
-            new_policy(SimpleNamespace(features=columns, root=meta.root, stats={}))
-
-
-def test_a_heat_map_is_best_where_the_point_is_and_between_cells_where_it_lies_between():
-    height, width = 5, 6
-    places = torch.tensor([[[9.5 / 24, 8.5 / 20, 1.0]], [[10.5 / 24, 8.5 / 20, 1.0]], [[0.9, 0.9, 0.0]]])
-    peaks = torch.zeros(3, 1, height, width)
-    peaks[:, 0, 2, 2] = 20.0  # which is pixel 8, 8
-    maps = peaks.flatten(2).log_softmax(-1).view_as(peaks)
-    on, beside, unseen = heat_map_losses(maps, places).tolist()
-    assert on == pytest.approx(20.0 * 1 / 4, abs=0.1)  # a pixel off, of four
-    assert beside == pytest.approx(20.0 * 2 / 4, abs=0.1)
-    assert unseen == 0.0
-    free = torch.zeros(1, 1, height, width, requires_grad=True)
-    optimizer = torch.optim.Adam([free], lr=0.5)
-    for _ in range(200):
-        loss = heat_map_losses(free.flatten(2).log_softmax(-1).view_as(free), places[1:2]).sum()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    weights = free.detach().flatten(2).softmax(-1).view_as(free)[0, 0]
-    assert (weights.sum(0) @ torch.arange(6.0)).item() == pytest.approx(10 / 4, abs=0.05)
-    assert (weights.sum(1) @ torch.arange(5.0)).item() == pytest.approx(8 / 4, abs=0.05)
-
-
 @pytest.fixture
 def named(meta, spec, table, monkeypatch):
     """The same dataset with the places of two points."""
@@ -280,10 +234,3 @@ def test_named_points_get_keypoints_of_their_own_that_learn_where_they_are(named
     policy.save_pretrained(tmp_path)
     again = CNNPolicy.from_pretrained(tmp_path, strict=True)
     assert torch.equal(again.eval().select_action(batch), policy.eval().select_action(batch))
-
-
-def test_heat_maps_without_named_points_are_refused(meta):
-    with pytest.raises(
-        UsageError, match=r"heatmap_weight is 0\.1, but the dataset has no privileged\.keypoints\.front"
-    ):
-        new_policy(meta, heatmap_weight=0.1)

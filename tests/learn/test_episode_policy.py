@@ -10,12 +10,11 @@ import pytest
 import torch
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-from manip_il.errors import MismatchError, UnknownName, UsageError
+from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Origin
-from manip_il.learn.episode_policy import EpisodePolicy
 from manip_il.learn.policy import LearnedPolicy
 
-from .tiny_policies import edit_config, observations, write_checkpoint
+from .tiny_policies import observations, write_checkpoint
 
 STEPS = 11
 POLICIES = {
@@ -95,21 +94,6 @@ def test_draws_belong_to_the_episode_and_leave_the_global_generator_alone(spec, 
     assert np.array_equal(policy.act(state[:1], environment[:1], None, [1])[0], left)
 
 
-def test_the_past_is_an_episodes_own_and_the_weights_are_not(checkpoint):
-    policy = LearnedPolicy.load(checkpoint)
-    states, environments = observations(STEPS, 0)
-    policy.act(states[:2], environments[:2], None, [4, 5])
-    inner = policy._policy
-    assert isinstance(inner, EpisodePolicy)
-    one, two = inner._memories.values()
-    if isinstance(one, dict):  # queues of observations and plans
-        assert one is not two
-        return
-    assert all(a is b for a, b in zip(one.parameters(), two.parameters(), strict=True))
-    name = "temporal_ensembler" if hasattr(one, "temporal_ensembler") else "_action_queue"
-    assert getattr(one, name) is not getattr(two, name)
-
-
 def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
     tasks = []
 
@@ -124,27 +108,6 @@ def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
     policy.instruct({1: "no, here"})
     policy.act(*observations(2, 0))
     assert tasks[STEPS:] == [["put it there"], ["no, here"]]
-
-
-def test_a_policy_of_mixed_precision_acts_in_it(act):
-    states, environments = observations(STEPS, 0)
-    full = LearnedPolicy.load(act).act(states, environments)
-    edit_config(act, use_amp=True)
-    mixed = LearnedPolicy.load(act).act(states, environments)
-    assert not np.array_equal(mixed, full)
-    np.testing.assert_allclose(mixed, full, atol=0.05)
-
-
-def test_a_type_that_is_not_known_is_named_with_the_nearest(act):
-    edit_config(act, type="akt")
-    with pytest.raises(UnknownName, match=r"policy 'akt' \(did you mean 'act'\?\); known: act, .*diffusion, .*mlp"):
-        LearnedPolicy.load(act)
-
-
-def test_a_graphics_card_that_is_not_there_is_refused(act, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(UsageError, match="'cuda'"):
-        LearnedPolicy.load(act, device="cuda")
 
 
 def test_pictures_must_be_those_of_the_checkpoint(pictured, tmp_path):

@@ -29,7 +29,7 @@ from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 
-from .tiny_policies import edit_config, write_checkpoint
+from .tiny_policies import write_checkpoint
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 SIDES = (48, 64)  # height and width of pictures
@@ -144,20 +144,6 @@ def test_the_metadata_name_every_number_with_its_unit(tmp_path):
     assert [(one["name"], one["dtype"], one["shape"]) for one in (front, wrist)] == [
         (f"{IMAGES}{camera}", "uint8", ["batch", *SIDES, 3]) for camera in ("front", "wrist")
     ]
-
-
-def test_a_checkpoint_of_another_tool_gives_what_it_knows(spec, tmp_path):
-    exported = export_onnx(write_checkpoint(tmp_path / "mlp", "mlp", spec), "")
-    assert "robot" not in exported.metadata
-    assert "names" not in exported.metadata["inputs"][0]
-    assert exported.metadata["inputs"][0]["shape"] == ["batch", 4]
-
-
-def test_normalisation_outside_the_network_is_refused(spec, tmp_path):
-    checkpoint = write_checkpoint(tmp_path / "mlp", "mlp", spec)
-    edit_config(checkpoint, normalization_mapping={"STATE": "MEAN_STD", "ACTION": "IDENTITY"})
-    with pytest.raises(ManipError, match=r"normalization_mapping is .*MEAN_STD.*; expected IDENTITY"):
-        export_onnx(checkpoint, "")
 
 
 def test_a_file_that_acts_otherwise_is_refused(spec, tmp_path, monkeypatch):

@@ -12,9 +12,8 @@ import pytest
 import torch
 from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
-from safetensors.torch import load_file, save_file
 
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
@@ -86,16 +85,6 @@ def test_off_the_data_an_arm_target_stays_as_near_as_in_the_data(checkpoint, tab
     relative = table["action"][:, :-1] - table["observation.state"][:, :-1]
     scale = np.abs(states).max() * 1e3
     assert np.abs(actions[:, :-1] - states[:, :-1] * 1e3).max() <= np.abs(relative).max() + 1e-6 * scale
-
-
-def test_actions_that_are_not_finite_are_refused_by_row(checkpoint):
-    weights = load_file(checkpoint / "model.safetensors")
-    weights["model.layers.0.weight"][:, 0] = torch.finfo().max
-    save_file(weights, checkpoint / "model.safetensors")
-    states, environments = observations(3)
-    states[:2, 0] = weights["model.input_mean"][0].item()  # times 0
-    with pytest.raises(NotFiniteError, match="action in row 2"):
-        LearnedPolicy.load(checkpoint).act(states, environments)
 
 
 def test_pictures_go_in_as_lerobot_feeds_them():

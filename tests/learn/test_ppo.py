@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from manip_il.errors import NotFiniteError, UsageError
-from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.learn.ppo import lent_generators
 from manip_il.learn.transitions import Transitions
 
@@ -109,19 +107,3 @@ def test_noise_of_exploration_is_as_wide_as_the_actors_and_within_the_range():
     assert noisy[:, 0].std() == pytest.approx(np.exp(-0.5), rel=0.05)
     assert not noisy[:, 1].any()
     assert noisy[:, 0].max() <= env.range.space.high[0]
-
-
-def test_a_reward_that_is_not_finite_is_refused():
-    one, _ = learner()
-    one.collect()
-    with pytest.raises(NotFiniteError, match="a reward is nan"):
-        one.improve(np.full(STEPS * EPISODES, np.nan, np.float32))
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("lr", 0), ("gamma", 1.1), ("epochs", 0), ("minibatches", 0), ("target_kl", float("nan")), ("entropy", -1)],
-)
-def test_an_option_out_of_range_is_named(option, value):
-    with pytest.raises(UsageError, match=rf"ppo\.{option} is {value}"):
-        PPOConfig(**{option: value})

@@ -15,7 +15,6 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 from manip_il.data.joined import JoinedDatasets
-from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.samples import Pictures, Windows, windows_of
@@ -41,16 +40,6 @@ def test_a_window_never_leaves_its_episode(lengths, deltas) -> None:
     assert (padded == (around[wanted + 4] != episodes[:, None])).all()
 
 
-def test_a_frame_outside_is_the_nearest_one_inside() -> None:
-    rows, padded = Windows(EPISODES, {"action": np.array([-1, 0, 1, 2])}).rows(np.array([0, 4, 5]), "action")
-    assert rows.tolist() == [[0, 0, 1, 2], [3, 4, 4, 4], [5, 5, 6, 6]]
-    assert padded["action_is_pad"].tolist() == [
-        [True, False, False, False],
-        [False, False, True, True],
-        [True, False, False, True],
-    ]
-
-
 @pytest.mark.parametrize(
     ("deltas", "invalid", "drop_last", "usable"),
     [
@@ -62,11 +51,6 @@ def test_a_frame_outside_is_the_nearest_one_inside() -> None:
 def test_samples_with_an_unsound_label_and_last_frames_are_left_out(deltas, invalid, drop_last, usable) -> None:
     valid = ~np.isin(np.arange(11), invalid)
     assert Windows(EPISODES, deltas).usable(valid, drop_last).tolist() == usable
-
-
-def test_nothing_left_to_learn_from_is_an_error() -> None:
-    with pytest.raises(ManipError, match="nothing to learn from"):
-        Windows(EPISODES, {}).usable(np.zeros(11, dtype=bool))
 
 
 def test_the_windows_are_those_that_the_policy_asks_for() -> None:

@@ -7,28 +7,22 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.error import URLError
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
 
-from manip_il import checks
 from manip_il.cli.main import main
-from manip_il.data.dataset import Dataset
 from manip_il.data.json_lines import read_lines
-from manip_il.data.schema import features
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError
-from manip_il.learn import train
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.lerobot_policy import usable_statistics
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import Sources, check_same_sources, input_columns, recorded_look
+from manip_il.learn.sources import Sources, check_same_sources, recorded_look
 from manip_il.learn.train import Trainer
-from manip_il.learn.training_state import METRICS_FILE, json_lines
+from manip_il.learn.training_state import METRICS_FILE
 
 from .conftest import LENGTH, make_table, write_table
 from .tiny_policies import ACT, CNN, DIFFUSION, observations
@@ -169,14 +163,6 @@ def test_a_half_written_checkpoint_is_passed_over(fit, tmp_path, weights):
     assert all(torch.equal(straight[key], after[key]) for key in after)
 
 
-@pytest.mark.parametrize("name", ["training_step.json", "optimizer_state.safetensors"])
-def test_a_run_whose_state_is_broken_is_not_resumed(name, fit, tmp_path):
-    fit()
-    (tmp_path / "run/checkpoints/last/training_state" / name).write_bytes(b"[[[")
-    with pytest.raises(ManipError, match=rf"{name} is not valid JSON|cannot be resumed; .*--overwrite=true"):
-        fit(resume=True)
-
-
 def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(fit):
     path = fit(ACT) / "policy_preprocessor.json"
     values = json.loads(path.read_text())
@@ -196,11 +182,6 @@ def test_nan_is_refused_with_column_and_frame(key, table, write, fit):
     pq.write_table(type(stored).from_pydict(columns, schema=stored.schema), file)
     with pytest.raises(NotFiniteError, match=rf"column {key}: nan at frame 47"):
         fit(data=data)
-
-
-def test_a_loss_that_explodes_says_at_which_step(fit):
-    with pytest.raises(NotFiniteError, match=r"loss is (inf|nan) at step \d"):
-        fit(lr=1e30, steps=20)
 
 
 def test_a_warm_mlp_acts_as_the_one_it_came_from_in_the_units_of_new_data(table, write, fit, weights):
@@ -235,33 +216,6 @@ def test_a_feature_that_never_moves_is_not_seen(table, fit):
     before = policy.act(table["observation.state"], environment)
     environment[:, 2] += 100.0
     assert np.array_equal(before, policy.act(table["observation.state"], environment))
-
-
-def test_a_column_that_hardly_moves_is_not_blown_up():
-    flat = {"mean": np.zeros(2), "std": np.array([1e-7, 0.5]), "min": np.zeros(2), "max": np.array([1e-6, 2.0])}
-    usable = usable_statistics({"observation.state": flat, "observation.images.front": flat})
-    assert usable["observation.state"]["std"].tolist() == [1e-3, 0.5]
-    assert usable["observation.state"]["max"].tolist() == [1e-2, 2.0]
-    assert usable["observation.images.front"]["std"].tolist() == [1e-7, 0.5]
-
-
-def test_a_backbone_that_cannot_be_downloaded_is_one_line_with_two_ways_out(fit, monkeypatch):
-    def no_network(*_args, **_kwargs):
-        raise URLError("no network")
-
-    monkeypatch.setattr("manip_il.learn.lerobot_policy.make_policy", no_network)
-    with pytest.raises(ManipError) as raised:
-        fit(ACT)
-    for word in ("--policy.pretrained_backbone_weights=null", "checkpoints", "ResNet18_Weights"):
-        assert word in str(raised.value)
-
-
-def test_half_precision_trains_in_bfloat16_on_a_cpu(fit, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "_on_this_cpu", lambda: "bf16")  # also one that has it not, slowly
-    path = fit({**ACT, "use_amp": True}, "half")
-    fit(ACT, "full")
-    assert saved(tmp_path / "half")["model.safetensors"] != saved(tmp_path / "full")["model.safetensors"]
-    assert json.loads((path / "config.json").read_text())["use_amp"] is True
 
 
 def test_a_checkpoint_has_lerobots_layout_and_no_place_of_this_machine(fit, spec, dataset, tmp_path):
@@ -317,24 +271,6 @@ def test_datasets_that_mean_other_things_are_refused_with_both_named(spec, write
         with pytest.raises(MismatchError, match=words):
             check_same_sources(*both, pictures=True, language=False)
     check_same_sources(*both, pictures=False, language=False)
-
-
-def test_curves_for_tensorboard_and_weights_and_biases(fit, tmp_path, curves):
-    path, plain = fit(name="r", **curves.options), fit(name="plain")
-    assert curves.steps(tmp_path / "r") == [1, 2, 3, 4]
-    for name in ("model.safetensors", "manip_il.json"):
-        assert (path / name).read_bytes() == (plain / name).read_bytes()
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_number_that_is_not_finite_is_null_and_a_line_that_was_cut_short_is_dropped(tmp_path, value):
-    path = tmp_path / "metrics.jsonl"
-    lines = [json.dumps({"step": step, "grad_norm": math.nan}) for step in (1, 2, 3)]
-    path.write_text("\n".join([*lines, '{"st']))
-    json_lines(path, 2)({"step": 3, "loss": 0.5, "grad_norm": value})
-    expected = {"step": 3, "loss": 0.5, "grad_norm": None}
-    assert read_lines(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None}, expected]
-    assert checks.parse_json("a line", path.read_bytes().splitlines()[-1]) == expected
 
 
 def test_a_datasets_light_is_that_of_its_last_rendering_else_the_default():
@@ -423,24 +359,3 @@ def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerob
     done = warm_lerobot.run("lerobot-train", f"--config_path={config}", "--resume=true", *more)
     assert done.returncode == 0, done.stderr[-2000:]
     assert (run / "checkpoints/last").resolve().name == "000006"
-
-
-@pytest.mark.parametrize(
-    ("lacking", "observation", "words"),
-    [
-        (["action"], "state", "no action: there is nothing to learn"),
-        (["observation.state"], "images", "no observation.state: every policy needs"),
-        (["observation.images.front", "observation.images.wrist"], "both", "no pictures.*--observation=state"),
-        (
-            ["observation.environment_state"],
-            "both",
-            "no observation.environment_state.*--observation=images, or record",
-        ),
-    ],
-)
-def test_what_a_dataset_lacks_is_said_with_the_way_out(lacking, observation, words, write, table, pictured):
-    dataset = Dataset.open(write(table, spec=pictured).roots[0])
-    assert list(features(pictured))[:4] == input_columns(config(ACT, observation="both"), dataset.root, dataset.info)
-    left = {key: feature for key, feature in dataset.info.features.items() if key not in lacking}
-    with pytest.raises(ManipError, match=words):
-        input_columns(config(ACT, observation=observation), dataset.root, replace(dataset.info, features=left))

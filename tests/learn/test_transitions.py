@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from manip_il.errors import NotFiniteError, NothingToLearnError, UsageError
 from manip_il.learn import transitions
 from manip_il.learn.transitions import Demonstrations, read_demonstrations
 from manip_il.mdp import Actor
@@ -48,11 +47,6 @@ def test_where_nothing_says_when_they_succeeded_they_are_not_padded():
     assert not rows.absorbing.any()
 
 
-def test_episodes_shorter_than_a_demonstration_are_refused():
-    with pytest.raises(UsageError, match="episode_steps is 5; expected at least 6"):
-        two().padded(5, doubled)
-
-
 @pytest.fixture
 def read(monkeypatch):
     """Reads a table in place of a dataset."""
@@ -84,15 +78,3 @@ def test_episodes_that_a_learner_drove_or_that_failed_or_have_no_label_are_left_
     valid = np.ones(EPISODES * LENGTH, np.int64)
     valid[2 * LENGTH] = 0
     assert len(read(actor=actor, next__success=success, label_valid=valid).inputs) == EPISODES - 3
-
-
-def test_no_demonstration_is_one_line(read):
-    with pytest.raises(NothingToLearnError, match="none of the 12 episodes in demos is the expert's"):
-        read(actor=np.full(EPISODES * LENGTH, Actor.LEARNER))
-
-
-def test_a_number_that_is_not_finite_is_named(read):
-    action = make_table()["action"]
-    action[7, 1] = np.nan
-    with pytest.raises(NotFiniteError, match="column action: nan at frame 7"):
-        read(action=action)

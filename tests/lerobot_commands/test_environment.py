@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import draccus
 import pytest
-from lerobot.configs import PreTrainedConfig
-from lerobot.envs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
-from manip_il.errors import UnknownName, UsageError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.lerobot_plugin.environment import TASKS
 from manip_il.tasks.config import make_config
@@ -78,36 +74,3 @@ def test_a_task_takes_any_robot():
     config = ManipILEnv(task="Reach-v0", robot="fetch")
     assert vector_env(config, 1).envs[0].unwrapped.scene.robot.name == "fetch"
     assert shapes(ManipILEnv(task="Reach-v0")) == shapes(ManipILEnv(task="PandaReach-v0"))
-
-
-def test_a_film_can_be_left_out():
-    (env,) = vector_env(ManipILEnv(render_mode="none"), 1).envs
-    env.reset(seed=1)
-    assert not env.render().any()
-
-
-def test_a_saved_configuration_gives_the_same_environment():
-    config = ManipILEnv(task="FetchLift-v0", observation="both", cameras="front", tolerance=0.05)
-    assert draccus.decode(EnvConfig, {"type": "manip_il"} | draccus.encode(config)) == config
-
-
-def test_the_plugin_brings_our_policies():
-    assert {"mlp", "cnn"} <= set(PreTrainedConfig.get_known_choices())
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"task": "PandaPick-v0"}, UnknownName, "did you mean 'PandaPickPlace-v0'"),
-        ({"task": "PandaLift-v0", "robot": "fetch"}, UsageError, "--env.robot is 'fetch'.*is panda's"),
-        (
-            {"observation": "images", "cameras": "front, belly"},
-            UnknownName,
-            "unknown camera 'belly'.*front, side, wrist",
-        ),
-        ({"fps": 501}, UsageError, "expected 1 to 500"),
-    ],
-)
-def test_what_cannot_be_is_refused(options: dict[str, object], error: type[Exception], words: str):
-    with pytest.raises(error, match=words):
-        ManipILEnv(**options)

@@ -21,7 +21,7 @@ from manip_il.mcap.mapping import Source
 
 from ..damage import digests
 from ..pictures import encoded
-from .use import Messages, feature, load, ramp, write
+from .use import feature, load, ramp, write
 
 STEADY = range(0, 1000, 100)
 
@@ -72,29 +72,6 @@ def test_pictures_come_in_pixel_for_pixel(tmp_path: Path) -> None:
 
 
 CAMERA = {"field": None, "dtype": "string", "video": False}
-
-
-@pytest.mark.parametrize(
-    ("messages", "changes", "why"),
-    [
-        (ramp([0, 100, 400, 500]), {}, r"topic /a, f: a gap at 0\.2 s .*nearest allows 0\.02 s: raise its tolerance"),
-        ([(0, {"x": "1"})], {}, r"topic /a, f at 0 ns: \['1'\]; expected float64"),
-        ([(0, {"x": 1e39})], {"dtype": "float32"}, r"\[1e\+39\]; expected finite numbers of float32"),
-        ([(0, {"x": 1.5})], {"dtype": "int64"}, r"\[1.5\]; expected finite numbers of int64"),
-        ([(0, {"x": [1, 2]})], {"names": ["a"]}, "f at 0 ns: 2 values; expected 1"),
-        ([(0, {"x": 1}), (100, {"y": 1})], {}, "f at 100000000 ns: no field 'x'"),
-        ([(0, raw(0, "mono8"))], CAMERA, "at 0 ns: a picture encoded as 'mono8'; expected rgb8 or bgr8"),
-        ([(0, b"cdr")], CAMERA, "messages are cdr .*expected protobuf, json or cdr .*ROS 2: pip install mcap-ros2"),
-        (ramp(STEADY), {"topic": "/b"}, "has no messages of /b .*its topics: /a, /late, /steady"),
-        (ramp(STEADY), {"topic": "/late"}, r"/steady ends 4\.1 s before /late starts"),
-    ],
-)
-def test_what_cannot_be_is_refused_by_file_topic_and_time(tmp_path, monkeypatch, messages: Messages, changes, why):
-    monkeypatch.setattr("manip_il.mcap.read.find_spec", lambda name: None)  # mcap-ros2-support may be installed
-    path = write(tmp_path / "bad.mcap", {"/a": messages, "/steady": ramp(STEADY), "/late": ramp([5000, 5100])})
-    steady = {"g": feature("/steady")} if "topic" in changes else {}
-    with pytest.raises(ManipError, match=rf"bad\.mcap.*{why}"):
-        list(read_frames(path, load(tmp_path, {"f": feature(**changes), **steady})))
 
 
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)

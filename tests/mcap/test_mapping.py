@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.mcap.mapping import Mapping, Source, exact_rate, frame_times, load_mapping
 from manip_il.mcap.path import values_at
 
@@ -27,27 +27,6 @@ def test_a_mapping_is_its_file_and_the_example_loads(tmp_path: Path) -> None:
     assert load(tmp_path, **TREE) == Mapping(20, "do it", {"action": number, "observation.images.c": camera})
     example = load_mapping(ROOT / "configs/mcap/panda.yaml")
     assert [one.topic for one in example.sources.values()][:3] == ["/joint_states", "/tf", "/action"]
-
-
-def of_action(**changes: Any) -> dict[str, Any]:
-    return {"features": {"action": NUMBER | changes}}
-
-
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"fsp": 20}, "unexpected keyword argument 'fsp'"),
-        ({"fps": 0}, "fps is 0; expected a finite number from 1"),
-        ({"fps": 29.97}, "whole rates, not at 29.97; observation.images.c needs video: false"),
-        ({"features": {"a/b": NUMBER}}, "a column's name is 'a/b'; expected a name of letters, digits and _ . -"),
-        (of_action(tolerence=1), "features: action: The fields `tolerence` are not valid"),
-        (of_action(resample="hold"), "'hold'.* into one of: nearest, previous"),
-        (of_action(field="a[b"), r"the path 'a\[b' is invalid"),
-    ],
-)
-def test_a_wrong_value_is_refused_by_name_in_one_line(tmp_path: Path, change: dict[str, Any], why: str) -> None:
-    with pytest.raises(UsageError, match=rf"^.*m\.yaml: .*{why}.*$"):
-        load(tmp_path, **(TREE | change))
 
 
 @pytest.mark.parametrize(

@@ -55,39 +55,3 @@ def test_true_progress_scores_without_a_reward(here, capsys):
     assert run("data score good --reward=progress --output_dir=scores") == 0
     assert len(json.loads((here / "scores/scores.json").read_text())["episodes"]) == 8
     assert {path.name for path in (here / "scores").iterdir()} == {"config.yaml", "rabc.parquet", "scores.json"}
-
-
-@pytest.mark.parametrize(
-    ("line", "says", "code"),
-    [
-        ("reward pairs good other", "task differs: good has lift, other has reach", 1),
-        ("reward pairs nowhere", "nowhere is not a LeRobot dataset", 1),
-        ("reward pairs good --count=0", "--count is 0; expected at least 1", 2),
-        ("reward pairs good --clip=99", "the longest episode has 30", 1),
-        ("reward ask nowhere.json", "nowhere.json does not exist; expected pairs.json", 2),
-        ("reward answer good/meta/info.json", "good/meta/info.json holds no manip_il pairs", 1),
-        ("reward answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
-        ("reward fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
-        ("reward fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),
-        ("data score good --reward=nowhere", "no policy in nowhere", 2),
-        ("data score nowhere --reward=progress", "nowhere does not exist; expected a LeRobot v3.0 dataset", 2),
-        (
-            "train --dataset.root=good --weights=nowhere.parquet",
-            "nowhere.parquet does not exist; expected rabc.parquet",
-            2,
-        ),
-        ("train --dataset.root=good,bad --weights=good/meta/info.json", "give one --dataset.root", 2),
-    ],
-)
-def test_bad_input_is_one_line(line, says, code, here, error):
-    before = set(here.rglob("*"))
-    assert run(line) == code
-    assert says in error()
-    assert set(here.rglob("*")) == before
-
-
-def test_a_file_that_is_there_is_not_replaced_unasked(here, error):
-    (here / "pairs.json").write_text("mine")
-    assert run("reward pairs good --clip=10 --count=5") == 2
-    assert "pairs.json exists already" in error()
-    assert run("reward pairs good --clip=10 --count=5 --overwrite=true") == 0

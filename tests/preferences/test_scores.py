@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from lerobot.rewards.sarm.rabc import RABCWeights
 
-from manip_il.errors import ManipError
 from manip_il.learn.samples import rabc_weights
 from manip_il.preferences.frames import Frames, read_frames
-from manip_il.preferences.scores import Scores, episode_scores, roc_auc, write_weights
+from manip_il.preferences.scores import Scores, roc_auc, write_weights
 
 
 @pytest.fixture(scope="module")
@@ -39,29 +34,12 @@ def test_the_area_under_the_curve_is_the_share_of_pairs_in_order():
     assert roc_auc(scores, None) is None
 
 
-@given(st.lists(st.tuples(st.integers(0, 9), st.booleans()), min_size=2, max_size=30))
-def test_the_area_does_not_change_with_the_scale_of_the_scores(rows):
-    scores, succeeded = np.array([a for a, _ in rows]), np.array([b for _, b in rows])
-    assert roc_auc(scores, succeeded) == roc_auc(scores / 10 - 1, succeeded)
-
-
-def test_an_episode_is_scored_by_its_last_second(scored):
-    data, fps = scored.data, scored.data.spec.fps
-    end = data.firsts[4]
-    assert episode_scores(scored.frames, data)[3] == pytest.approx(scored.frames[end - fps : end].mean())
-
-
 def test_failed_episodes_are_found_and_listed_first(scored):
     assert scored.auc == 1
     assert not scored.succeeded[scored.worst(8)].any()
     tree = scored.to_json()
     assert [one["success"] for one in tree["episodes"]] == [True] * 8 + [False] * 8
     assert json.loads(json.dumps(tree)) == tree
-
-
-def test_scores_need_neither_progress_nor_success(scored):
-    bare = replace(scored, data=replace(scored.data, progress=None, success=None))
-    assert bare.auc is None
 
 
 @pytest.mark.parametrize("ahead", [1, 7, 100])
@@ -86,14 +64,6 @@ def test_frames_weigh_by_how_their_episode_ends(scored, tmp_path):
     assert [one["kept"] for one in scored.to_json()["episodes"]] == [True] * 8 + [False] * 8
 
 
-@pytest.mark.parametrize("level", [0.1, 0.9])
-def test_where_all_episodes_end_alike_all_are_kept(level, scored, tmp_path):
-    path, data = tmp_path / "rabc.parquet", scored.data
-    write_weights(path, replace(scored, frames=np.full(len(data.states), level)))
-    weights = rabc_weights(path, data.episodes, 1)
-    assert (np.delete(weights, data.firsts + data.lengths - 1) == 1).all()
-
-
 def test_lerobot_weights_a_batch_by_the_file(scored, tmp_path):
     from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
 
@@ -105,22 +75,3 @@ def test_lerobot_weights_a_batch_by_the_file(scored, tmp_path):
     assert stats["num_zero_weight"] == 1
     assert weights[2] == 0
     assert weights[:2].tolist() == pytest.approx([1.5, 1.5], abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"index": [0, 0, 1]}, "episodes differs"),
-        ({"index": [0, 1, 9]}, "episodes differs"),
-        ({"episode_index": [0, 1, 1]}, "episodes differs"),
-        ({"index": ["a", "b", "c"]}, "is no file of weights"),
-        ({"progress_sparse": None}, "is no file of weights"),
-        ({"progress_sparse": [1.0, 0.0, np.nan], "episode_index": [0, 0, 0]}, "episodes differs"),
-    ],
-)
-def test_a_file_of_other_weights_is_refused(change, says, tmp_path):
-    columns = {"index": [0, 1, 2], "episode_index": [0, 0, 1], "progress_sparse": [0.0, 0.5, 1.0]} | change
-    path = tmp_path / "rabc.parquet"
-    pq.write_table(pa.table({key: value for key, value in columns.items() if value is not None}), path)
-    with pytest.raises(ManipError, match=says):
-        rabc_weights(path, np.array([0, 0, 1]), 1)

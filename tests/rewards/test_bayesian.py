@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chisquare
 
-from manip_il.rewards.bayesian import Choices, Posterior, draw_posterior, fit, prior_tastes, sample
+from manip_il.rewards.bayesian import Choices, Posterior, draw_posterior, fit, sample
 from manip_il.rewards.paths import Demonstration, PathProblem, add_rivals, open_features, rivals
 from tests.rewards.grids import acyclic, all_paths, demonstrations, excess
 
@@ -86,24 +85,3 @@ def test_a_feature_in_which_all_agree_is_open_and_keeps_its_prior():
     found = rivals(shown, rng.exponential(PRIOR, (20, 3)))
     assert open_features(shown, found) == [2]
     assert draw_posterior(Choices.of(found), rng, PRIOR).mean[2] == pytest.approx(PRIOR, rel=0.15)
-
-
-@pytest.mark.slow
-def test_true_weights_rank_evenly_among_the_draws_and_intervals_cover_them():
-    """Simulation-based calibration (Talts et al. 2018): is it the posterior of this prior and likelihood?
-
-    Ranks of a weight are independent, those of a run's weights are not: each weight is tested by itself, and the least
-    probability counts as often as there are weights (Bonferroni).
-    """
-    rng, runs = np.random.default_rng(0), 200
-    ranks, covered = np.empty((runs, 3), np.int64), np.empty((runs, 3), bool)
-    for run in range(runs):
-        sums, truth = [small_choices(rng) for _ in range(8)], prior_tastes(1, 3, rng, PRIOR)[0]
-        choices = Choices.of([choose(one, truth, rng) for one in sums])
-        found = draw_posterior(choices, rng, PRIOR, 2_000, 1_500, chains=24)
-        ranks[run] = (found.thin(99) < truth).sum(axis=0)
-        low, high = np.quantile(found.pooled, [0.05, 0.95], axis=0)
-        covered[run] = (low <= truth) & (truth <= high)
-    counts = [np.bincount(one // 10, minlength=10) for one in ranks.T]
-    assert 3 * chisquare(counts, axis=1).pvalue.min() > 0.05
-    assert 0.85 <= covered.mean() <= 0.95

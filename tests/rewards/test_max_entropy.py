@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from manip_il.rewards.max_entropy import fit, least_weights, loss_of, soft_plan
+from manip_il.rewards.max_entropy import fit, loss_of, soft_plan
 from manip_il.rewards.paths import Demonstration
 from tests.rewards.grids import draw, grid
 
@@ -42,10 +42,3 @@ def test_expected_features_are_the_demonstrations():
 
 def test_weights_are_those_that_drew_the_demonstrations():
     assert fit(demonstrations(300)) == pytest.approx(WEIGHTS, abs=0.8)
-
-
-def test_from_the_least_weights_on_all_sums_are_finite():
-    shown = demonstrations(3)
-    least = least_weights(shown)
-    assert least[0] == pytest.approx(np.log(8), rel=0.01)
-    loss_of(shown, least)

@@ -19,12 +19,6 @@ def test_the_subgradient_is_the_slope():
     assert gradient == pytest.approx(np.array(slopes) / (2 * step), rel=1e-5, abs=1e-5)
 
 
-def test_a_demonstration_misses_no_margin_of_0_for_its_own_weights():
-    for shown in demonstrations(5, TRUTH, **SIZE):
-        assert loss_of(shown, TRUTH, margin=0.0)[0] == pytest.approx(0, abs=1e-9)
-        assert loss_of(shown, TRUTH)[0] >= 0
-
-
 def test_what_is_learnt_plans_as_the_demonstrator_on_unseen_grids():
     shown = demonstrations(20, TRUTH, **SIZE)
     weights = fit(shown)

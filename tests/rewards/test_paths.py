@@ -29,19 +29,6 @@ def test_costs_are_those_of_value_iteration():
     assert plan(problem, weights).costs == pytest.approx(values)
 
 
-def test_a_path_over_edges_that_cost_nothing_ends():
-    problem = grid(np.random.default_rng(2))
-    planned = plan(problem, np.zeros(3))
-    assert not planned.costs.any()
-    assert cheapest_path(problem, planned, 0)[0][-1] == problem.goal
-
-
-def test_edges_of_no_cost_are_edges():
-    edges = np.array([[0, 1], [1, 2], [0, 2]])
-    problem = PathProblem(edges, np.array([[0.0], [0.0], [1.0]]), 3, 2)
-    assert list(cheapest_path(problem, plan(problem, np.ones(1)), 0)[0]) == [0, 1, 2]
-
-
 def test_where_no_path_leads_costs_are_infinite():
     problem = PathProblem(np.array([[0, 1], [2, 0]]), np.ones((2, 1)), 4, 1)
     planned = plan(problem, np.ones(1))
@@ -49,9 +36,3 @@ def test_where_no_path_leads_costs_are_infinite():
     assert list(planned.following) == [1, NOWHERE, 0, NOWHERE]
     with pytest.raises(ManipError, match="no path leads from node 3"):
         cheapest_path(problem, planned, 3)
-
-
-def test_a_path_off_the_edges_is_refused():
-    problem = PathProblem(np.array([[0, 1], [1, 2]]), np.ones((2, 1)), 3, 2)
-    with pytest.raises(ManipError, match="no edge"):
-        problem.sums(np.array([0, 2]))

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.errors import UsageError
-from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import pictures, projections
 from manip_il.sim.scene import camera_id
@@ -59,30 +57,3 @@ def test_the_table_is_as_large_and_as_high_as_said(tmp_path):
     assert model.geom("floor").pos[2] == -0.75
     leg = model.geom("leg0")
     assert leg.pos[2] - leg.size[2] == pytest.approx(-0.75)
-
-
-@pytest.mark.parametrize(
-    ("table", "says"),
-    [
-        ({"hight": 1}, "did you mean 'height'"),
-        ({"size": [0.2, 1.0]}, "table.size is .*; expected .* for the workspace"),
-        ({"height": 0}, "table.height is 0; expected more than 0"),
-    ],
-)
-def test_a_wrong_table_is_one_line(table, says, tmp_path):
-    with pytest.raises(UsageError, match=says):
-        get_robot(str(write(tmp_path, tree=tree_of("slides") | {"table": table})))
-
-
-@pytest.mark.parametrize(
-    ("cameras", "says"),
-    [
-        ({"frnt": PLACED["obliquely"]}, "did you mean 'front'"),
-        ({"front": {"position": [1, 0, 1]}}, "cameras.front is .*`target`"),
-        ({"front": {"position": [0, 0, 1], "target": [0, 0, 1]}}, "the same place"),
-        ({"front": {"position": [0, 0], "target": [0, 0, 1]}}, "has 2 numbers; expected 3"),
-    ],
-)
-def test_a_wrong_place_is_one_line(cameras, says, tmp_path):
-    with pytest.raises(UsageError, match=says):
-        get_robot(str(write(tmp_path, tree=placed(cameras))))

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from manip_il.errors import UsageError
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 from manip_il.robots.table import get_robot
@@ -15,26 +14,6 @@ from manip_il.robots.table import get_robot
 from .own import model_of, tree_of, write
 
 MODEL = model_of()
-
-
-def refusal(path: Path) -> str:
-    """The one line that a robot's YAML is refused with."""
-    with pytest.raises(UsageError) as caught:
-        get_robot(str(path))
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-YAMLS = {
-    "a model without end": (dict(model="/dev/zero"), ["/dev/zero has more than"]),
-}
-
-
-@pytest.mark.parametrize("said", YAMLS)
-def test_a_text_without_end_is_one_line(said: str, tmp_path: Path):
-    more, words = YAMLS[said]
-    line = refusal(write(tmp_path, tree=tree_of() | more))
-    assert all(word in line for word in words)
 
 
 def shaped(folder: Path, file: str, mesh: str, **more: Any) -> Robot:
@@ -53,17 +32,10 @@ def shaped(folder: Path, file: str, mesh: str, **more: Any) -> Robot:
 
 PLACES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "beside the model": ("foot.obj", "foot.obj", {}),
-    "with capitals": ("Foot.OBJ", "Foot.OBJ", {"mend": {"steel": "iron"}}),
-    "in a folder below": ("parts/foot.obj", "parts/foot.obj", {"mend": {"steel": "iron"}}),
     "in the model's folder of meshes": (
         "parts/foot.obj",
         "foot.obj",
         {"mend": {'angle="radian"': 'angle="radian" meshdir="parts"'}},
-    ),
-    "in its folder of all assets": (
-        "parts/foot.obj",
-        "foot.obj",
-        {"mend": {'angle="radian"': 'angle="radian" assetdir="parts"'}},
     ),
     "in the YAML's folder of meshes": ("parts/sub/foot.obj", "sub/foot.obj", {"meshes": "parts"}),
 }

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from manip_il.collect.job import RolloutJob
-from manip_il.errors import ManipError
 from manip_il.robots.gripper import sweep
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import FOUND, Robot
@@ -85,30 +84,6 @@ def test_limits_of_motors_are_those_of_the_model(tmp_path: Path):
     weak = '<motor joint="turn" gear="50" ctrlrange="-1 1" ctrllimited="true"/>'
     model = ARM.replace('<motor name="motor" joint="turn"/>', weak).replace("FINGERS", JAWS["slides"][0])
     assert get_robot(str(write(tmp_path, tree=short(), model=model))).forces[:2] == (50.0, 200.0)
-
-
-MISTAKES = {
-    "unknown hand": (short(hand="hnad"), ["unknown body", "did you mean 'hand'"]),
-    "a hand before every joint": (short(hand="base"), ["no joint turns between the base and 'base'"]),
-    "a workspace out of reach": (
-        short(workspace={"centre": [3.0, 0.0]}),
-        ["the hand does not get over the workspace's centre (3, 0)", "workspace.centre"],
-    ),
-    "a gripper's file that is not there": (
-        short(gripper=tree_of()["gripper"] | {"model": "jaws.xml"}),
-        ["cannot read", "jaws.xml", "No such file"],
-    ),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line(mistake: str, tmp_path: Path):
-    tree, words = MISTAKES[mistake]
-    with pytest.raises(ManipError) as refused:
-        get_robot(str(write(tmp_path, tree=tree)))
-    assert "\n" not in str(refused.value)
-    for word in words:
-        assert word in str(refused.value)
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,16 +12,12 @@ from hypothesis import strategies as st
 
 from manip_il.robots import ROBOTS
 from manip_il.robots.geometry import distance, outline
-from manip_il.robots.gripper import TOUCH, Gripper, sweep
-from manip_il.robots.robot import Robot
-from manip_il.robots.spec import arm_spec
-from manip_il.robots.table import get_robot
+from manip_il.robots.gripper import TOUCH
 from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 
 from ..scenes import started, still, world_at_home
 from ..tables import every_robot
-from .own import JAWS, model_of, write
 
 EDGE = 0.05  # of the model's cube [m]
 
@@ -56,17 +51,6 @@ def test_the_opening_that_is_commanded_is_the_opening_that_is_measured(robot: st
 
 
 @every_robot
-def test_commands_ask_for_the_opening_of_the_actuator_that_they_move_most(robot: str):
-    gripper = world_of(robot).scene.gripper
-    before, wanted = gripper.command(0.02), gripper.command(0.05)
-    assert gripper.commanded(wanted, before) == pytest.approx(0.05, abs=1e-6)
-    for one in range(len(before)):
-        alone = before.copy()
-        alone[one] = wanted[one]
-        assert gripper.commanded(alone, before) == pytest.approx(0.05, abs=1e-6)
-
-
-@every_robot
 def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
     world = world_of(robot)
     gripper = world.scene.gripper
@@ -87,15 +71,6 @@ def test_a_command_is_measured_as_its_opening_within_what_there_is(robot: str, o
     gripper, qpos = world_of(robot).scene.gripper, world_of(robot).data.qpos.copy()
     qpos[gripper.q] = gripper.command(opening)
     assert gripper.opening(qpos) == pytest.approx(np.clip(opening, gripper.least, gripper.most), abs=1e-9)
-
-
-@every_robot
-def test_a_sweep_comes_apart_from_closed_to_open(robot: str):
-    found = sweep(get_robot(robot))
-    assert (np.diff(found.shares) > 0).all()
-    assert (np.diff(found.openings) > 0).all()
-    assert found.openings[0] < 0.005
-    assert sweep(get_robot(robot)) is found
 
 
 @pytest.mark.parametrize(
@@ -133,37 +108,3 @@ def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
         world.update()
         lowest = min(float(outline(world.model, world.data, geom)[:, 2].min()) for geom in gripper.geoms)
         assert lowest - (float(world.ee.position[2]) - world.lowest) > top + 1e-3
-
-
-@pytest.mark.parametrize("jaws", JAWS)
-def test_sliding_and_turning_fingers_are_one_thing(jaws: str, tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
-    robot = get_robot(str(write(tmp_path, jaws=jaws)))
-    model = arm_spec(robot).compile()
-    gripper, data = Gripper(robot, model), mujoco.MjData(model)
-    assert gripper.most - gripper.least > 0.05
-    for opening in (0.06, 0.02, 0.04):
-        data.ctrl[gripper.ctrl] = gripper.command(opening)
-        mujoco.mj_step(model, data, 1_000)
-        assert gripper.opening(data.qpos) == pytest.approx(opening, abs=2e-3)
-
-
-def test_the_stiffer_finger_waits_for_the_other(own: Robot):
-    # One actuator may be anywhere: the opening is what lies between the fingers.
-    model = arm_spec(own).compile()
-    gripper, data = Gripper(own, model), mujoco.MjData(model)
-    data.qpos[gripper.q] = [0.04, 0.0]
-    mujoco.mj_kinematics(model, data)
-    (left,), (right,) = gripper.pads
-    gap = mujoco.mj_geomDistance(model, data, left, right, 1.0, None)
-    assert gripper.opening(data.qpos) == pytest.approx(gap, abs=1e-3)
-
-
-def test_what_carries_a_finger_may_pass_beside_what_carries_the_other(tmp_path: Path):
-    model = model_of()
-    for name, side in (("left", -1), ("right", 1)):
-        carrier = f'<geom type="box" size="0.005 0.025 0.008" pos="{0.02 * side} 0 -0.03" mass="0.01"/>'
-        model = model.replace(f'<joint name="{name}"', f'{carrier}<joint name="{name}"')
-    plain = sweep(get_robot(str(write(tmp_path, "plain"))))
-    carried = sweep(get_robot(str(write(tmp_path, "carried", model=model))))
-    np.testing.assert_allclose(carried.openings, plain.openings, atol=1e-6)

@@ -12,7 +12,7 @@ import pytest
 from manip_il.robots import ik
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import hand_down, rotation_matrix, rotation_vector
+from manip_il.robots.rotations import hand_down
 from manip_il.robots.spec import arm_model
 from manip_il.robots.table import get_robot
 
@@ -68,32 +68,6 @@ def moves(robot: Robot, largest: float, rows: int = 40) -> tuple[np.ndarray, np.
     q = np.asarray(robot.home) + rng.uniform(-0.5, 0.5, (rows, len(robot.home)))
     motions = rng.uniform(-largest, largest, (rows, 6)) * np.repeat([1.0, 3.0], 3)
     return np.clip(q, arm.limits[:, 0], arm.limits[:, 1]), motions
-
-
-def moved_step_by_step(arm: ArmIK, q: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """The joints of one motion: one step of the expert's, then damped least squares, a row by itself."""
-    at, turned = arm.ee_pose(q)
-    position, rotation = at + motion[:3], rotation_matrix(motion[3:]) @ turned
-    first = arm.step(position, rotation, ik._LARGEST)
-    q = arm._within(q if first is None else q + first[0])
-    for _ in range(ik._CORRECTIONS):
-        at, turned = arm.ee_pose(q)
-        error = np.concatenate([position - at, rotation_vector(rotation @ turned.T)])
-        if np.abs(error).max() < ik._EXACT:
-            break
-        jacobian = arm._site_jacobian()
-        dq = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + ik._LEVENBERG * np.eye(6), error)
-        q = arm._within(q + dq * min(1.0, ik._LARGEST / max(float(np.abs(dq).max()), ik._LARGEST)))
-    return q
-
-
-@every_robot
-@pytest.mark.parametrize(("largest", "atol"), [(0.02, 1e-8), (0.3, 1e-6)])  # where a pose is far, rounding grows
-def test_a_batch_of_motions_is_solved_as_one_by_one(robot: str, largest: float, atol: float):
-    arm = ArmIK(get_robot(robot))
-    q, motions = moves(get_robot(robot), largest)
-    expected = np.array([moved_step_by_step(arm, *row) for row in zip(q, motions, strict=True)])
-    np.testing.assert_allclose(arm.moved(q, motions), expected, rtol=0, atol=atol)
 
 
 @every_robot

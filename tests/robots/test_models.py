@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +12,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.suggest import suggest
 from manip_il.robots.table import get_robot
 
-from .own import EXAMPLES, model_of, tree_of, write
+from .own import model_of, tree_of, write
 
 # Angles are in [rad] here, as `A(...)`; the wrist has a joint whose zero is not where the model has it.
 TURNED = (
@@ -104,8 +100,7 @@ def test_an_arm_in_degrees_is_the_arm_in_radians(tmp_path: Path):
         np.testing.assert_allclose(getattr(suggested[1], name), getattr(suggested[0], name), atol=1e-6)
 
 
-@pytest.mark.parametrize("value", [-0.5, 0.0, 0.7])
-@pytest.mark.parametrize("joint", ["turn", "elbow"])
+@pytest.mark.parametrize(("joint", "value"), [("turn", -0.5), ("elbow", 0.7)])
 def test_a_fixed_joint_is_where_mujoco_has_it(joint: str, value: float, tmp_path: Path):
     # Bodies turned by euler inside a turned frame, an anchor beside the body, a skew axis, a zero that is elsewhere,
     # and a second joint of the same body that goes on turning.
@@ -141,30 +136,6 @@ def test_a_fixed_joint_is_where_mujoco_has_it(joint: str, value: float, tmp_path
         mujoco.mj_kinematics(compiled, data)
         poses.append(np.concatenate([data.site("ee").xpos, data.site("ee").xmat]))
     np.testing.assert_allclose(poses[1], poses[0], atol=1e-9)
-
-
-def test_the_first_of_two_joints_of_a_body_goes_on_turning_where_it_did(tmp_path: Path):
-    both = '<joint name="wrist" axis="0 1 0"/><joint name="skew" pos="0 0.01 0" axis="1 0.2 0"/>'
-    model = model_of().replace('<joint name="wrist" axis="0 1 0" range="-0.5 2.8"/>', both)
-    whole = get_robot(str(write(tmp_path, tree=tree_of() | {"fixed": {"skew": 0.6}}, model=model)))
-    held = arm_model(whole)
-    spec = mujoco.MjSpec.from_string(model)
-    free = spec.compile()
-    poses = []
-    for compiled in (held, free):
-        data = mujoco.MjData(compiled)
-        data.joint("wrist").qpos[0] = 0.8
-        if compiled is free:
-            data.joint("skew").qpos[0] = 0.6
-        mujoco.mj_kinematics(compiled, data)
-        poses.append(np.concatenate([data.body("hand").xpos, data.body("hand").xmat]))
-    np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
-
-
-def test_a_free_joint_cannot_be_fixed_at_a_number(tmp_path: Path):
-    model = model_of().replace('<body name="base">', '<body name="base"><freejoint name="float"/>')
-    with pytest.raises(UnknownName, match=r"joint in 'fixed' of robot own: 'float'"):
-        arm_spec(get_robot(str(write(tmp_path, tree=tree_of() | {"fixed": {"float": 1.0}}, model=model))))
 
 
 @pytest.mark.parametrize("kind", ["urdf", "mjcf"])
@@ -207,58 +178,3 @@ def test_of_a_scene_around_a_robot_only_the_robot_is_taken(tmp_path: Path):
     assert inside.ngeom == alone.ngeom
     assert inside.npair == 0
     assert suggest(tmp_path / "around" / "own.xml") == suggest(tmp_path / "own.xml")
-
-
-def test_a_models_defaults_are_not_for_what_is_added(tmp_path: Path):
-    defaults = """<default><site material="steel" rgba="1 0 0 1"/><general gear="7" ctrlrange="-9 9"/>
-      <camera fovy="5"/>
-      <default class="robot"><site material="steel"/></default></default><asset>"""
-    model = (
-        model_of().replace("<asset>", defaults).replace('<body name="base">', '<body name="base" childclass="robot">')
-    )
-    (tmp_path / "plain").mkdir()
-    plain = arm_spec(get_robot(str(write(tmp_path / "plain")))).compile()
-    ours = arm_spec(get_robot(str(write(tmp_path, model=model)))).compile()
-    assert ours.site("ee").matid[0] == -1
-    for name in ("site_rgba", "actuator_gear", "actuator_ctrlrange"):
-        np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
-
-
-FREED = """
-from manip_il.checks import read_yaml
-from manip_il.errors import ManipError
-from manip_il.robots import ROBOTS
-from manip_il.robots.found import complete
-from manip_il.robots.robot import FOUND
-from manip_il.robots.table import _said
-import pathlib, sys
-
-def found(path, **home):
-    said = _said(path, read_yaml(path, ""))
-    said = {name: value for name, value in said.items() if name not in (*FOUND, "costs", "yaw", "lerobot")}
-    try:
-        return {name: value for name, value in complete(said | home).items() if name in FOUND}
-    except ManipError as error:
-        return {"error": str(error)}
-
-for path in map(pathlib.Path, [*ROBOTS.values(), *sys.argv[1:]]):
-    first = found(path)
-    home = {"home": first["home"]} if "home" in first else {}  # found by a long search, of compiled models
-    seen = {repr(found(path, **home)) for _ in range(20)}
-    assert len(seen) == 1, (path, seen)
-"""
-
-
-@pytest.mark.slow
-def test_what_is_found_reads_no_freed_memory():
-    command = [sys.executable, "-c", FREED, *map(str, EXAMPLES)]
-    environment = os.environ | {"PYTHONMALLOC": "debug", "MALLOC_PERTURB_": "165"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
-def test_a_name_that_is_not_utf8_is_no_word_of_mujocos(tmp_path: Path):
-    path = write(tmp_path, tree=short())
-    path.with_name("own.xml").write_bytes(model_of().replace('"elbow"', '"\xe9lbow"').encode("latin-1"))
-    with pytest.raises(UsageError, match=r"a name is not UTF-8 in .*own\.xml"):
-        get_robot(str(path))

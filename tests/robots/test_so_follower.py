@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
 from manip_il.collect.environments import env_actions, env_spec
 from manip_il.data.schema import ACTION, LEROBOT_TYPES, SERVOS, STATE, features
-from manip_il.errors import ManipError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots import ROBOTS
-from manip_il.robots.action_space import ServoUnits
-from manip_il.robots.files import read
-from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv, joint_state
@@ -95,56 +89,9 @@ def test_units_there_and_back_are_the_same_joints_and_opening():
     assert actions.clip(np.full(6, 100.0), 0)[-1] == actions.high[-1]  # the simulated jaw opens to 72
 
 
-def test_a_gripper_whose_numbers_fall_as_it_opens_comes_back_too():
-    units = ServoUnits(np.array([0.0, 0.02, 0.05]), np.array([100.0, 40.0, 0.0]))
-    for opening in (0.0, 0.01, 0.03, 0.05):
-        assert units.back(*units.of(np.zeros(2), opening))[1] == pytest.approx(opening)
-
-
 def test_robots_with_a_name_of_lerobots_are_known_by_it():
     named = {one.lerobot.robot_type: name for name in ROBOTS if (one := get_robot(name)).lerobot is not None}
     assert named == LEROBOT_TYPES
     assert {name: make_config(name).control_hz for name in ROBOTS} == {"panda": 20, "fetch": 20, "so101": 30}
     assert env_spec(make_config("so101", "reach")).action_meaning == SERVOS
     assert ManipILEnv(task="Reach-v0", robot="so101").fps == 30
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"names": ["a", "b"]}, "lerobot.names has 2 names; expected 6"),
-        ({"gripper": [0.5, 0.5]}, "lerobot.gripper is .0.5, 0.5.; expected two places"),
-        ({"gripper": [0.5]}, "lerobot.gripper is .*; expected two places"),
-        ({"fps": 0}, "lerobot.fps is 0"),
-        ({"robot_type": ""}, "lerobot.robot_type"),
-        ({"nmaes": []}, "did you mean 'names'"),
-    ],
-)
-def test_a_mistake_in_the_section_is_one_line(changes: dict[str, Any], words: str):
-    tree = {"robot_type": "so_follower", "names": list("abcdef"), "gripper": [-0.1745, 1.7454], "fps": 30}
-    with pytest.raises(ManipError, match=words) as refused:
-        replace(get_robot("so101"), lerobot=read("lerobot", LeRobotConfig, tree | changes))
-    assert "\n" not in str(refused.value)
-
-
-def test_both_models_of_the_arm_have_the_same_zeros():
-    """The Robot Studio's own model says what a calibrated arm's zeros are; ours is another one."""
-    ours = mujoco.MjSpec.from_file(str(get_robot("so101").files.model)).compile()
-    calibrated = get_robot("so101").files.model.parents[1] / "SO101/so101_new_calib.xml"
-    theirs = mujoco.MjSpec.from_file(str(calibrated)).compile()
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        places, joints = [], {name: rng.uniform(-1, 1) for name in limits()}
-        for model in (ours, theirs):
-            data = mujoco.MjData(model)
-            for name, angle in joints.items():
-                data.joint(name).qpos[0] = angle
-            mujoco.mj_kinematics(model, data)
-            jaw, base = data.body("moving_jaw_so101_v1"), data.body("base")
-            places.append(np.concatenate([jaw.xpos - base.xpos, jaw.xmat]))
-        np.testing.assert_allclose(places[0], places[1], atol=1e-6)
-
-
-def test_no_other_robot_has_units_of_its_own():
-    for name in ("panda", "fetch"):
-        assert scene_of(name, "reach").actions.units is None

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 
 from manip_il.collect.expert import Expert
-from manip_il.errors import ManipError
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import ManipEnv, environment_state_names
 from manip_il.tasks.envs import make_env
-from manip_il.tasks.stock.environment import StockEnv
 
-from ..scenes import bits, started
 from ..tables import every_robot, every_scene, every_scene_with_a_cube
 
 HEAVY = Condition("heavy", mass=(0.3, 0.3), size=(0.06, 0.06), friction=(0.7, 0.7))
 LATE = Condition("late", delay=(3, 3))
-ANY_COLOUR = Condition("any", colour=(0, 1))
-BUMPED = Condition("bumped", action_noise=(0.1, 0.1), knock=(0.06, 0.06))
 NOISY = Condition("noisy", joint_noise=(0.01, 0.01), position_noise=(0.02, 0.02))
 
 
@@ -43,37 +35,6 @@ def test_a_nominal_episode_is_the_plain_environments_to_the_bit(robot: str, task
     plain, other = make_env(robot, task), make_env(robot, task, conditions=[HEAVY, NOMINAL])
     for seed in (2, 3, 5):  # 2 leaves another cube behind
         assert (drive(plain, seed, 15) == drive(other, seed, 15)) == (seed % 2 == 1)
-
-
-@every_scene_with_a_cube
-def test_the_cube_has_the_drawn_mass_size_and_friction(robot: str, task: str):
-    env = started(robot, task, conditions=[HEAVY])
-    model, q = env.world.model, env.scene.objects["object"].q
-    assert model.body("object").mass == pytest.approx(0.3)
-    assert model.geom("object").size == pytest.approx([0.03] * 3)
-    assert env.data.qpos[q + 2] == 0.03
-    assert model.geom("object").friction[0] == 0.7
-
-
-@pytest.mark.filterwarnings("ignore:.*share an object.*:UserWarning")
-@pytest.mark.parametrize("condition", [NOMINAL, HEAVY, LATE, NOISY, BUMPED], ids=lambda one: one.name)
-def test_a_deep_copy_goes_on_by_itself_and_in_the_same_way(condition: Condition):
-    env = gymnasium.make("manip_il/PandaPickPlace-v0", conditions=[condition])
-    env.reset(seed=1)
-    actions = env.get_wrapper_attr("observe")().state + np.random.default_rng(0).normal(0, 0.05, (30, 8))
-    for action in actions[:10]:
-        env.step(action)
-    other, before = copy.deepcopy(env), bits(env.unwrapped)
-    theirs = [str(other.step(action)) for action in actions[10:]]
-    assert bits(env.unwrapped) == before
-    assert [str(env.step(action)) for action in actions[10:]] == theirs
-    assert str(other.reset()) == str(env.reset())
-
-
-@pytest.mark.parametrize("env", [make_env(), StockEnv("FetchReach-v4")], ids=["own", "stock"])
-def test_an_environment_is_not_pickled(env: ManipEnv | StockEnv):
-    with pytest.raises(ManipError, match=r"cannot be .*pickled"):
-        pickle.dumps(env)
 
 
 @every_scene
@@ -133,18 +94,3 @@ def test_pictures_show_the_episodes_own_look_and_plain_ones_after_it():
             assert np.array_equal(ours[camera], theirs[camera]) == (seed % 2 == 1)
         if seed % 2 == 0:
             assert ours["front"].mean() < 0.85 * theirs["front"].mean()
-
-
-@pytest.mark.gl
-def test_the_drawn_colour_is_the_cubes():
-    settings: dict[str, Any] = {"robot": "fetch", "cameras": ("wrist",), "image_size": (64, 64)}
-    seed = next(s for s in range(200) if _is_blue(ANY_COLOUR.draw(s).values["colour"]))
-    blue, plain = (started(seed=seed, conditions=one, **settings) for one in ([ANY_COLOUR], []))
-    ours, theirs = (env.observe().images["wrist"].astype(int) for env in (blue, plain))
-    red = (theirs[..., 0] > 1.7 * theirs[..., 1]) & (theirs[..., 0] > 1.7 * theirs[..., 2])
-    assert red.sum() > 10
-    assert (ours[red][:, 2] > ours[red][:, 0]).mean() > 0.8
-
-
-def _is_blue(colour: list[float]) -> bool:
-    return colour[2] > 0.6 and max(colour[:2]) < 0.3

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
 
-from manip_il.errors import UnknownName, UsageError
-from manip_il.sim.conditions import Condition, Drawn, draw
+from manip_il.sim.conditions import Condition, Drawn
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.events import (
     DROP,
@@ -18,18 +15,14 @@ from manip_il.sim.events import (
     SHIFT,
     STANDARD,
     Events,
-    Perturbation,
     jolt_joints,
-    kinds_for,
     move_object,
-    noisy,
     set_fingers,
 )
 from manip_il.tasks.objects import CUBE_HALF
-from manip_il.tasks.table import TASKS
 
 from ..scenes import SEED, bits, cube, drive_until, in_hand, started, still
-from ..tables import WITH_A_CUBE, every_scene, every_task
+from ..tables import WITH_A_CUBE
 
 MOMENT = 7
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
@@ -73,16 +66,6 @@ def test_a_knock_moves_the_object_alone_and_by_its_distance(env: ManipEnv, seed:
     assert deepest(env) > -0.004
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_dropped_object_falls_onto_the_table(env: ManipEnv, seed: int):
-    assert move_object(env.world, np.random.default_rng(seed), (0.05, 0.1), 0.1)
-    assert cube(env)[2] == pytest.approx(CUBE_HALF + 0.1, abs=1e-3)
-    hold = still(env, 0.04)
-    for _ in range(40):
-        env.advance(hold)
-    assert 0 < cube(env)[2] < 0.1
-
-
 def test_a_share_of_the_actions_is_random_and_the_others_are_as_they_were(env: ManipEnv):
     drawn = Condition("random", random_actions=(0.3, 0.3)).draw(SEED)
     action, two = still(env, 0.04), [Events.of(env.world, drawn, SEED) for _ in range(2)]
@@ -93,14 +76,6 @@ def test_a_share_of_the_actions_is_random_and_the_others_are_as_they_were(env: M
     actions = env.scene.actions
     beyond = np.abs(np.array(executed[0]) - env.observe().state)[:, actions.arm] - actions.scale[actions.arm]
     assert beyond.max() < 1e-6
-
-
-@every_scene
-def test_a_scene_without_an_object_has_none_to_knock(robot: str, task: str):
-    env = started(robot, task)
-    before = bits(env)
-    assert move_object(env.world, np.random.default_rng(0), (0.05, 0.08)) == bool(TASKS[task].objects)
-    assert (bits(env) == before) == (not TASKS[task].objects)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -121,14 +96,6 @@ def test_a_held_object_goes_with_the_jolted_hand(env: ManipEnv):
     np.testing.assert_allclose(in_hand(env), before, atol=1e-9)
 
 
-@pytest.mark.parametrize("wanted", [0.0, 0.05])
-def test_fingers_are_put_where_they_are_wanted(env: ManipEnv, wanted: float):
-    set_fingers(env.world, wanted)
-    gripper = env.scene.gripper
-    assert opening(env) == pytest.approx(max(wanted, gripper.least), abs=1e-6)
-    np.testing.assert_allclose(env.data.ctrl[gripper.ctrl], gripper.command(wanted))
-
-
 def test_fingers_do_not_close_through_an_object(env: ManipEnv):
     drive_until(env, "grasp")
     before = opening(env)
@@ -136,15 +103,6 @@ def test_fingers_do_not_close_through_an_object(env: ManipEnv):
     assert opening(env) == before
     assert deepest(env) > -0.004
     np.testing.assert_array_equal(env.data.ctrl[env.scene.gripper.ctrl], env.scene.gripper.command(0.0))
-
-
-def test_noise_is_a_share_of_the_actions_range(env: ManipEnv):
-    actions = env.scene.actions
-    rng, action = np.random.default_rng(0), np.linspace(-1, 1, len(actions))
-    draws = np.array([noisy(action, env.world, 0.1, rng) - action for _ in range(4_000)])
-    expected = 0.1 * np.where(actions.relative, 2, 1) * actions.scale
-    np.testing.assert_allclose(draws.std(axis=0), expected, rtol=0.06)  # five standard errors
-    assert np.abs(draws.mean(axis=0) / expected).max() < 0.08
 
 
 def run(env: ManipEnv, condition: Condition, seed: int) -> tuple[bytes, dict[int, float]]:
@@ -169,19 +127,6 @@ def test_knocks_and_noise_are_a_function_of_the_seed(env: ManipEnv, condition: C
         [(step, distance)] = knocks.items()
         assert 5 <= step < 25
         assert 0.05 <= distance <= 0.08
-
-
-def test_a_knock_has_the_drawn_step_and_distance(env: ManipEnv):
-    drawn = draw([KNOCKED], 7).values
-    [(step, distance)] = run(env, KNOCKED, 7)[1].items()
-    assert (step, distance) == (drawn["knock_step"], pytest.approx(drawn["knock"]))
-
-
-def test_without_noise_the_action_is_not_touched_and_nothing_may_happen(env: ManipEnv):
-    action = np.zeros(len(env.scene.actions))
-    knocked = Condition(knock=(0.05, 0.08)).draw(1)
-    assert Events(env.world, knocked, 1).action(action, 3) is action
-    assert Events.of(env.world, Condition("heavy", mass=(0.2, 0.2), delay=(1, 1)).draw(1), 1) is None
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -216,77 +161,3 @@ def test_the_world_is_changed_by_as_much_as_the_kind_says(env: ManipEnv, seed: i
     assert dropped[2] == pytest.approx(DROP, abs=CUBE_HALF / 10)
     assert changed("closed")[2] == pytest.approx(max(0.0, env.scene.gripper.least), abs=1e-6)
     assert changed("open")[2] == pytest.approx(env.scene.gripper.most, abs=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["open", "closed"])
-def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, kind: str):
-    drive_until(env, "descend")  # with open fingers; one jaw that moves alone is not all open
-    env.set_state(replace(env.get_state(), streak=3))
-    state = env.get_state()
-    perturbed = started(env.scene.robot.name, env.task, conditions=(Perturbation(kind, {SEED: state.step}),))
-    perturbed.set_state(state)
-    perturbed.begin_step()
-    same = kind == "open" and not env.world.lopsided
-    assert (bits(perturbed) == bits(env)) == same
-    assert perturbed.get_state().streak == (3 if same else 0)
-
-
-def test_a_random_action_is_any_that_a_learner_may_choose(env: ManipEnv):
-    actions, q = env.scene.actions, env.observe().state[env.scene.actions.arm]
-    drawn = np.array([wrong(env, "random", np.zeros(len(actions)), seed) for seed in range(200)])
-    steps = (drawn[:, actions.arm] - q) / actions.scale[actions.arm]
-    assert np.abs(steps).max() <= 1 + 1e-6
-    assert (np.abs(steps).max(axis=0) > 0.95).all()
-    shares = (drawn[:, actions.gripper] - actions.low[actions.gripper]) / actions.scale[actions.gripper]
-    assert 0 <= shares.min() < 0.05
-    assert 0.95 < shares.max() <= 1
-
-
-@pytest.mark.parametrize(("command", "opposite"), [(0.0, 1.0), (0.4, 1.0), (0.6, 0.0), (1.0, 0.0)])
-def test_opposite_actions_mirror_the_step_and_turn_the_gripper_round(env: ManipEnv, command: float, opposite: float):
-    q, actions, gripper = arm(env), env.scene.actions, env.scene.gripper
-    step = np.linspace(-0.1, 0.1, len(q))
-
-    def at(share: float) -> float:
-        return gripper.least + share * (gripper.most - gripper.least)
-
-    action = actions.join(q + step, at(command))
-    mirrored, other = actions.join(q - step, at(opposite)), actions.join(q + step, at(opposite))
-    np.testing.assert_allclose(wrong(env, "opposite", action), mirrored, atol=1e-12)
-    np.testing.assert_allclose(wrong(env, "gripper", action), other, atol=1e-15)
-
-
-@pytest.mark.parametrize("kind", ["jolt", "moved", "dropped", "random"])
-def test_what_is_drawn_follows_from_the_seed(env: ManipEnv, kind: str):
-    def outcome(seed: int) -> bytes:
-        env.start(SEED)
-        one = events(env, kind, seed)
-        one.before(MOMENT)
-        return bits(env) + one.action(np.zeros(len(env.scene.actions)), MOMENT).tobytes()
-
-    assert outcome(1) == outcome(1)
-    assert outcome(1) != outcome(2)
-
-
-@every_task
-def test_without_an_object_neither_it_nor_the_gripper_matters(task: str):
-    expected = KINDS if TASKS[task].objects else ["jolt", "random", "opposite"]
-    assert list(kinds_for(TASKS[task])) == list(expected)
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "words"),
-    [
-        (lambda: Perturbation("jolts", {}), UnknownName, "did you mean 'jolt'"),
-        (lambda: Perturbation("jolt", {1: 3, 2: -1}), UsageError, "step -1"),
-        (lambda: Perturbation("jolt", {1: 3}).draw(2), UsageError, "no moment for seed 2"),
-        (
-            lambda: started("panda", "reach", conditions=(Perturbation("moved", {SEED: 3}),)),
-            UsageError,
-            "'moved' needs an object; reach has none",
-        ),
-    ],
-)
-def test_a_perturbation_that_cannot_be_is_refused(make, error: type[Exception], words: str):
-    with pytest.raises(error, match=words):
-        make()

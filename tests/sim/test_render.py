@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import pkgutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
@@ -14,19 +10,17 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from manip_il.errors import RenderError
 from manip_il.robots import ROBOTS
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.gl import PACKAGES, choose_backend, remedy, require_known_backend
 from manip_il.sim.world import GOAL
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.starts import UPRIGHT
 
-from ..scenes import SEED, bits, started, still
+from ..scenes import SEED, started
 
 
 @pytest.fixture
@@ -48,26 +42,6 @@ def pixels_like(picture: np.ndarray, strongest: int) -> int:
     """Pixels in which one colour (0 red, 1 green, 2 blue) stands out from both others."""
     others = np.delete(picture.astype(int), strongest, axis=2).max(axis=2)
     return int((picture[..., strongest] > others + 40).sum())
-
-
-@pytest.mark.gl
-@with_every_robot
-@pytest.mark.filterwarnings("ignore:.*(infinity|normalized space).*:UserWarning")
-def test_gymnasium_takes_the_one_with_cameras_for_its_own(env: ManipEnv):
-    check_env(env)
-
-
-@pytest.mark.gl
-@with_every_robot
-def test_cameras_show_different_pictures_with_something_on_them(env: ManipEnv):
-    pictures = env.observe().images
-    assert set(pictures) == set(CAMERAS)
-    for picture in pictures.values():
-        assert picture.shape == (128, 128, 3)
-        assert picture.dtype == np.uint8
-        assert picture.std() > 10
-    apart = np.abs(pictures["front"].astype(int) - pictures["wrist"].astype(int))
-    assert apart.mean() > 10
 
 
 @pytest.mark.gl
@@ -147,27 +121,6 @@ def test_another_process_draws_the_same_bytes(env: ManipEnv):
 
 
 @pytest.mark.gl
-def test_the_picture_is_the_mean_of_finer_pixels_the_right_way_up():
-    env = started("panda", "reach", cameras=("front",), image_size=(64, 96))
-    fine = render.pictures(env.scene, env.data, CameraConfig(("front",), 128, 192))["front"]
-    blocks = fine.reshape(64, 2, 96, 2, 3).mean(axis=(1, 3))
-    picture = env.observe().images["front"]
-    assert np.abs(picture - blocks).mean() < 2
-    assert picture[:8].mean(axis=(0, 1))[2] > picture[-8:].mean(axis=(0, 1))[2] + 20  # blue above, wood below
-
-
-@pytest.mark.gl
-@with_every_robot
-def test_pictures_leave_the_physics_alone(env: ManipEnv):
-    blind = started(env.scene.robot.name)
-    for _ in range(5):
-        env.observe()
-        for one in (env, blind):
-            one.advance(still(one, 0.01) + 0.02)
-    assert bits(env) == bits(blind)
-
-
-@pytest.mark.gl
 def test_shadows_darken_and_brightness_brightens():
     def mean(look: Look) -> float:
         return float(started(cameras=("front",), look=look).observe().images["front"].mean())
@@ -176,48 +129,6 @@ def test_shadows_darken_and_brightness_brightens():
     assert mean(Look(shadows=True)) < plain - 0.3
     assert mean(Look(brightness=0.5)) < plain - 20
     assert mean(Look(brightness=1.2)) > plain + 5
-
-
-ONE_CONTEXT = [("panda", Look()), ("fetch", Look()), ("panda", Look(shadows=True)), ("panda", Look())]
-
-
-@pytest.mark.gl
-@pytest.mark.usefixtures("no_context_yet")
-@pytest.mark.parametrize(
-    ("context", "drawn"),
-    [
-        ("mujoco.egl.GLContext", [{"robot": robot, "look": look} for robot, look in ONE_CONTEXT]),
-        ("mujoco.MjrContext", 3 * [{"image_size": (128, 128)}, {"image_size": (240, 320)}]),  # the scene, uploaded
-    ],
-)
-def test_whatever_is_drawn_a_process_makes_one_opengl_context(context: str, drawn: list[dict[str, Any]], monkeypatch):
-    made = []
-    real = pkgutil.resolve_name(context)
-
-    def counted(*arguments: Any) -> Any:
-        made.append(arguments)
-        return real(*arguments)
-
-    monkeypatch.setattr(context, counted)
-    for settings in drawn:
-        started(cameras=CAMERAS, **settings).observe()
-    assert len(made) == 1
-
-
-@pytest.mark.gl
-@pytest.mark.slow
-def test_after_a_fork_the_error_says_to_spawn():
-    env = started("panda", "reach", cameras=("front",))
-    env.observe()
-    with (
-        ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool,
-        pytest.raises(RenderError, match="fork; start processes that make pictures by 'spawn'"),
-    ):
-        pool.submit(_drawn, "panda", "reach", env.data, CameraConfig(("front",))).result()
-
-
-def test_without_a_render_mode_there_is_no_picture():
-    assert started("panda", "reach").render() is None
 
 
 @pytest.mark.usefixtures("no_context_yet")
@@ -230,49 +141,3 @@ def test_without_opengl_the_error_names_debians_packages(monkeypatch):
     with pytest.raises(RenderError, match=r"libEGL\.so\.1.*apt-get install -y libegl1 libegl-mesa0") as caught:
         env.observe()
     assert caught.value.exit_code == 1
-
-
-@pytest.mark.parametrize("chosen", ["glfw", "off", "eglo"])  # on import nobody could answer an error
-def test_the_users_choice_of_backend_stands(chosen: str, monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", chosen)
-    choose_backend()
-    assert os.environ["MUJOCO_GL"] == chosen
-
-
-def test_a_backend_that_mujoco_does_not_know_is_refused(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "eglo")
-    with pytest.raises(RenderError, match="MUJOCO_GL is 'eglo'; expected egl or osmesa"):
-        require_known_backend()
-    monkeypatch.setenv("MUJOCO_GL", "EGL ")
-    require_known_backend()
-
-
-@pytest.mark.parametrize(
-    ("variables", "advice"),
-    [
-        ({"MUJOCO_GL": "glfw"}, "unset MUJOCO_GL=glfw"),
-        ({"MUJOCO_GL": "off"}, "unset MUJOCO_GL=off"),
-        ({"MUJOCO_GL": "EGL"}, f"on Debian: apt-get install -y {PACKAGES}"),
-    ],
-)
-def test_the_remedy_names_the_variable_that_is_in_the_way(variables, advice, monkeypatch):
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: f"lib{name}.so")
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    assert remedy() == advice
-
-
-@pytest.mark.gl
-@pytest.mark.slow
-def test_mujoco_may_be_imported_first():
-    drawn = "from manip_il import make_env\nassert make_env(render_mode='rgb_array').render().std() > 1"
-    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
-    subprocess.run([sys.executable, "-c", f"import mujoco\n{drawn}"], env=environment, check=True)
-
-
-@pytest.mark.parametrize("library", ["libEGL.so", None])
-def test_egl_is_chosen_where_it_is_installed(monkeypatch, library: str | None):
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: library)
-    choose_backend()
-    assert os.environ.get("MUJOCO_GL") == (library and "egl")

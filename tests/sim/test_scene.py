@@ -6,17 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from manip_il.errors import UnknownName
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import DT_SIM
-from manip_il.sim.scene import build_scene, camera_id
+from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import PER_OBJECT, WORLD_SIZE
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.objects import CUBE_HALF
 from manip_il.tasks.table import TASKS
 
 from ..scenes import cube, drive_until, half_height, in_hand, started, still
-from ..tables import SCENES, every_robot, every_scene
+from ..tables import every_robot, every_scene
 
 
 @every_scene
@@ -53,11 +52,6 @@ def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: 
     assert build_scene.__wrapped__(get_robot(robot), TASKS[task]).model_bytes() == scene.model_bytes()
 
 
-def test_no_two_scenes_are_the_same_model():
-    models = {scene_of(robot, task).model_bytes() for robot, task in SCENES}
-    assert len(models) == len(SCENES)
-
-
 @every_scene
 def test_addresses_are_what_their_names_say(robot: str, task: str):
     scene = scene_of(robot, task)
@@ -87,8 +81,3 @@ def test_a_pedestal_stands_on_the_floor_and_reaches_to_the_robot(robot: str):
     geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] and model.geom_contype[i]]
     assert not any(mujoco.mj_geomDistance(model, data, pedestal, i, 0.005, None) < 0 for i in geoms)
     assert any(mujoco.mj_geomDistance(model, data, pedestal, i, 0.05, None) < 0.02 for i in geoms)
-
-
-def test_an_unknown_camera_names_those_there_are():
-    with pytest.raises(UnknownName, match=r"did you mean 'wrist'.*known: front, side, wrist"):
-        camera_id(scene_of("panda", "reach").model, "writs")

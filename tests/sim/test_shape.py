@@ -37,33 +37,6 @@ def test_a_text_means_lengths_along_the_shapes_own_axes(text: str, meant: tuple[
     assert Shape.parse(str(Shape.parse(text))) == Shape.parse(text)
 
 
-@given(st.sampled_from(["box", "cylinder", "sphere"]), lengths, lengths, lengths)
-def test_a_shapes_text_means_the_shape(kind: str, x: float, y: float, z: float):
-    shape = Shape(kind, {"box": (x, y, z), "cylinder": (x, x, z), "sphere": (x, x, x)}[kind])
-    assert Shape.parse(str(shape)) == shape
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("ball", "unknown shape 'ball'"),
-        ("mesh:mug.stl", "mug.stl does not exist; expected a mesh"),
-        ("models/Mug.OBJ", "object is 'models/Mug.OBJ'; expected mesh:FILE or mesh:FILE:LENGTH"),
-        ("sphere:0.01", "a sphere of 0.01 m; expected lengths from 0.02 to 0.12 m"),
-        ("box:nan", "expected lengths from 0.02 to 0.12 m"),
-        ("box:0.03x0.04", "expected box:EDGE or LENGTHxWIDTHxHEIGHT"),
-        ("sphere:0.03x0.04", "expected sphere:DIAMETER"),
-        ("any:0.03x0.04", "expected any:WIDTH"),
-        ("cylinder:wide", "expected cylinder:DIAMETER or DIAMETERxLENGTH"),
-        ("capsule:0.05x0.04", "a capsule 0.04 m long and 0.05 m wide; expected it longer than wide"),
-    ],
-)
-def test_what_is_no_shape_is_refused_in_one_line(text: str, words: str):
-    with pytest.raises(UsageError, match=words) as refused:
-        make_config(object=text)
-    assert "\n" not in str(refused.value)
-
-
 @pytest.mark.parametrize("text", ["box:0.06x0.03x0.04", "cylinder:0.04x0.08", "sphere:0.06", "capsule:0.04x0.1"])
 def test_the_model_has_the_lengths_and_the_mass(text: str):
     shape, scene = Shape.parse(text), scene_of("panda", "pick_place", text)

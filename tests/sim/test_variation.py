@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.errors import ManipError, MismatchError
-from manip_il.sim.conditions import Condition
+from manip_il.errors import MismatchError
 from manip_il.sim.shape import KINDS
 from manip_il.sim.variation import (
     NOTHING_DRAWN,
@@ -20,17 +19,10 @@ from manip_il.sim.variation import (
     Object,
     apply,
     completed,
-    extents,
-    nominal,
-    part,
-    same_physics,
     with_drawn,
 )
 from manip_il.sim.world import World
 from manip_il.tasks.envs import scene_of
-from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS, FRICTION
-
-from ..tables import every_scene_with_a_cube
 
 lengths = st.floats(0.005, 0.1)
 WHERE_IT_WAS_MADE = {"body_pos", "qpos0", "qpos_spring", "cam_poscom0", "light_poscom0"}  # which no start keeps
@@ -57,12 +49,6 @@ def inertia_tensor(model: mujoco.MjModel) -> np.ndarray:
     return axes @ np.diag(model.body_inertia[1]) @ axes.T
 
 
-@every_scene_with_a_cube
-def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
-    objects = [CUBE_HALF] * 3 + [CUBE_MASS, FRICTION]
-    np.testing.assert_array_equal(scene_of(robot, task).nominal, [*objects, *NOTHING_DRAWN])
-
-
 CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
 
 
@@ -82,27 +68,6 @@ def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was(before: list[f
     base = np.array([*before, *NOTHING_DRAWN])
     np.testing.assert_allclose(with_drawn(base, drawn)[: len(after)], after)
     assert base.tolist() == [*before, *NOTHING_DRAWN]
-
-
-EVERYTHING = Condition(
-    "everything",
-    **dict.fromkeys(("joint_damping", "actuator_gain", "brightness"), (0.5, 2.0)),
-    **dict.fromkeys(("size", "posture", "camera_shift", "camera_turn", "light_turn"), (0.03, 0.07)),
-    colour=(0, 1),
-    table=(0, 1),
-)
-
-
-@every_scene_with_a_cube
-def test_what_is_drawn_of_the_world_can_be_read_off_its_variation(robot: str, task: str):
-    drawn = EVERYTHING.draw(3).values
-    varied = with_drawn(scene_of(robot, task).nominal, drawn)
-    assert 2 * varied[:3].max() == pytest.approx(drawn["size"])
-    for name in ("joint_damping", "actuator_gain", "posture", "colour", "table", "brightness", "light_turn"):
-        np.testing.assert_array_equal(part(varied, name), np.ravel(drawn[name]), err_msg=name)
-    for name in ("camera_shift", "camera_turn"):
-        for camera, moved in drawn[name].items():
-            np.testing.assert_array_equal(part(varied, f"{name}.{camera}"), moved)
 
 
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
@@ -126,28 +91,6 @@ def test_a_variation_of_objects_alone_is_one_in_which_nothing_else_is_drawn():
         completed(base[:-1], base)
 
 
-def test_how_the_world_looks_and_began_is_no_physics():
-    base = np.array([*CUBE, *NOTHING_DRAWN])
-    assert same_physics(
-        base, with_drawn(base, {"colour": [1, 0, 0], "table": [0, 1, 0], "posture": 0.1, "brightness": 0.5})
-    )
-    for name in ("size", "mass", "friction", "joint_damping", "actuator_gain"):
-        assert not same_physics(base, with_drawn(base, {name: 0.7})), name
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_extents_are_the_lengths_along_a_things_own_axes(shape: str):
-    size, expected = SHAPES[shape]
-    model, _ = free_body(shape, size)
-    np.testing.assert_allclose(extents(int(model.geom_type[0]), model.geom_size[0]), expected)
-    np.testing.assert_allclose(2 * model.geom_aabb[0, 3:], expected)
-
-
-def test_a_shape_that_nobody_grasps_is_refused():
-    with pytest.raises(ManipError, match="expected a box, cylinder, sphere, capsule or mesh"):
-        extents(int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), np.ones(3))
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 @given(x=lengths, y=lengths, z=lengths, mass=st.floats(0.01, 2))
 def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: float, z: float, mass: float):
@@ -160,23 +103,6 @@ def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: 
     np.testing.assert_allclose(inertia_tensor(changed), inertia_tensor(compiled), rtol=1e-6, atol=1e-12)
     for name in ("body_mass", "body_subtreemass", "geom_rbound", "geom_aabb"):
         np.testing.assert_allclose(getattr(changed, name), getattr(compiled, name), rtol=1e-9, err_msg=name)
-
-
-def test_a_nominal_variation_changes_nothing():
-    plain, objects = free_body("box", "0.02 0.02 0.02")
-    changed = copy.copy(plain)
-    apply(changed, plain, objects, NO_MOTORS, nominal(plain, objects))
-    mujoco.mj_setConst(changed, mujoco.MjData(changed))
-    for name in ("body_mass", "body_inertia", "geom_size", "geom_friction", "geom_priority", "geom_aabb", "bvh_aabb"):
-        np.testing.assert_array_equal(getattr(changed, name), getattr(plain, name), err_msg=name)
-
-
-def test_only_a_drawn_friction_has_priority():
-    plain, objects = free_body("box", "0.02 0.02 0.02")
-    for friction, priority in ((0.5, 1), (float(plain.geom_friction[0, 0]), 0)):
-        changed = copy.copy(plain)
-        apply(changed, plain, objects, NO_MOTORS, with_drawn(nominal(plain, objects), {"friction": friction}))
-        assert changed.geom_priority[0] == priority
 
 
 @pytest.mark.parametrize("lacks", OLDER)

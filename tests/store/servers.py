@@ -273,7 +273,7 @@ def sshd_server(folder: Path) -> Iterator[Sshd]:
     with (folder / "log").open("wb") as log:
         server = subprocess.Popen([SSHD, "-D", "-e", "-f", str(folder / "sshd_config")], stderr=log)
     try:
-        last = time.monotonic() + 60
+        last = time.monotonic() + 600
         while socket.socket().connect_ex(("127.0.0.1", port)):
             assert server.poll() is None, (folder / "log").read_text(errors="replace")
             assert time.monotonic() < last

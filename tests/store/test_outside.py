@@ -28,12 +28,8 @@ def manifest_of(path: Any = "x", size: Any = 7, sha256: Any = SHA, **more: Any) 
 
 
 HOSTILE = (
-    *map(manifest_of, ("../x", "/tmp/x", "a/../../x", "a//x", "", "..\\x", "a\0b", None, 3)),
-    *map(manifest_of, (".git/hooks/x", "a/.bashrc", "x.PT", "a/run.py", "con\n")),
-    *(manifest_of(size=size) for size in (-1, 1.5, None, True, 2**80)),
-    *(manifest_of(sha256=sha) for sha in ("", f"../{SHA}", None, SHA.upper())),
-    *(manifest_of(**more) for more in ({"version": 2}, {"kind": "code"}, {"files": {"a": 1}})),
-    *(b"", b"[]", b"[" * 100_000, b"\x80\x04K\x01."),
+    *map(manifest_of, ("../x", "/tmp/x", "a/../../x", "", None, ".git/hooks/x", "x.PT", "a/run.py")),
+    *(manifest_of(size=-1), manifest_of(sha256=f"../{SHA}"), manifest_of(version=2), b"[]"),
 )
 
 
@@ -78,17 +74,11 @@ def test_a_hub_that_names_a_path_or_a_commit_outside_the_folder(hub: Hub, tmp_pa
     ("url", "code", "says"),
     [
         ("datasets/demos", 2, "the remote is not a URL; expected one such as hf://"),
-        ("s4://bucket/x", 2, "unknown scheme 's4://' (did you mean 's3://'?)"),
-        ("gs://bucket/x", 2, "gs:// needs another package: Please install gcsfs"),
-        ("hf://demos", 2, "expected hf://datasets/USER/NAME"),
-        ("sftp://me:hunter2@host", 2, "expected sftp://[USER@]HOST[:PORT]/FOLDER"),
         ("sftp://me:hun/hunter2@host/x", 2, "in a password write / as %2F"),
         ("file:///no/such/store", 1, "holds nothing that can be pulled; check the address"),
-        ("s3://no-bucket/x", 1, "holds nothing that can be pulled"),
         ("sftp://me:hunter2@127.0.0.1:1/x", 1, "cannot read sftp://me@127.0.0.1:1/x: [Errno None] Unable to connect"),
         ("sftp://OTHER/x", 1, "not found in known_hosts; run `ssh HOST` once"),
         ("sftp://CHANGED/x", 1, "Host key for server '127.0.0.1' does not match"),
-        (DATASET, 1, "holds nothing that can be pulled; check the address (of a dataset on the Hub: hf://datasets/"),
     ],
 )
 def test_a_mistake_is_one_line(url, code, says, hub, bucket, sshd: Sshd, tmp_path, monkeypatch, capsys):

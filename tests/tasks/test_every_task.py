@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -20,11 +19,9 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import EXPERT_PHASE
-from manip_il.errors import UnknownName, UsageError
-from manip_il.evaluation.runner import positions
+from manip_il.errors import UsageError
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import ManipEnv
 from manip_il.sim.events import STANDARD
 from manip_il.sim.task import NO_PHASE, Instructing, phases
 from manip_il.sim.world import GOAL, World
@@ -74,12 +71,6 @@ def test_phases_are_none_and_then_the_rungs_from_the_first_on(task: str):
     assert len(set(names)) == len(names)
     assert list(names[:0:-1]) == [rung.name for rung in TASKS[task].rungs]
     assert all(rung.words for rung in TASKS[task].rungs)
-
-
-@every_scene
-def test_what_a_task_grasps_and_moves_is_in_its_scene(robot: str, task: str):
-    scene = scene_of(robot, task)
-    assert set(TASKS[task].grasped) <= set(TASKS[task].objects) <= set(scene.objects)
 
 
 @every_scene
@@ -156,22 +147,6 @@ def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
             assert 0 <= TASKS[task].progress(env.world) <= 1
 
 
-def way_left(env: ManipEnv) -> float:
-    """Distance of the object, or else the hand, from where it is to go [m]."""
-    found = positions(env.config, env.get_state().to_vector())
-    return math.dist(found.get("object", found["hand"]), found["goal"])
-
-
-@every_scene
-def test_what_is_solved_has_come_to_where_it_was_to_go(robot: str, task: str):
-    env = make_env(robot, task)
-    for seed, driven in zip(SEEDS, driven_by_expert(robot, task), strict=True):
-        env.start(seed)
-        at_first = way_left(env)
-        env.set_state(driven.last)
-        assert way_left(env) < min(0.07, at_first)
-
-
 @every_scene
 def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_not(robot: str, task: str):
     env, fresh = make_env(robot, task), make_env(robot, task)
@@ -205,9 +180,8 @@ CHANGES: dict[str, Callable[[mujoco.MjModel], None]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@every_scene
-def test_the_fingerprint_changes_with_the_model(robot: str, task: str, change: str, monkeypatch):
-    config, scene = make_config(robot, task), scene_of(robot, task)
+def test_the_fingerprint_changes_with_the_model(change: str, monkeypatch):
+    config, scene = make_config(), scene_of("panda", "pick_place")
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
     CHANGES[change](model)
@@ -216,11 +190,10 @@ def test_the_fingerprint_changes_with_the_model(robot: str, task: str, change: s
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 
 
-@every_scene
-def test_the_fingerprint_is_the_scenes_and_the_settings(robot: str, task: str):
-    plain = env_fingerprint(make_config(robot, task))
-    assert env_fingerprint(make_config(robot, task)) == plain
-    longer = env_fingerprint(make_config(robot, task, horizon=99))
+def test_the_fingerprint_is_the_scenes_and_the_settings():
+    plain = env_fingerprint(make_config())
+    assert env_fingerprint(make_config()) == plain
+    longer = env_fingerprint(make_config(horizon=99))
     assert {key for key in plain if plain[key] != longer[key]} == {"config_sha256"}
 
 
@@ -244,8 +217,3 @@ def test_an_episode_is_about_any_text_that_the_task_has_and_about_no_other(task:
         assert env.task_description == env.observe().instruction == text
     with pytest.raises(UsageError, match=f"instruction is 'Boil an egg.'; {task} has '"):
         env.reset(seed=SEEDS[0], options={"instruction": "Boil an egg."})
-
-
-def test_a_task_that_is_none_gets_the_nearest():
-    with pytest.raises(UnknownName, match="did you mean 'pick_place'"):
-        get_task("pick_and_place")

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from manip_il.collect.expert import Expert
-from manip_il.robots.rotations import hand_down
 from manip_il.seeding import stream_seeds
 from manip_il.sim.task import phases
 from manip_il.sim.world import World
 from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.insert import APART
-from manip_il.tasks.peg import HOLE, PEG, azimuth, hand_at, lower_end, upper_axis
-from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.peg import HOLE, PEG, lower_end
 from manip_il.tasks.table import TASKS
 
 from ..tables import every_robot
@@ -43,28 +41,6 @@ def test_the_peg_starts_standing_or_lying_apart_from_the_hole(robot: str):
         corners = peg.position[2] - np.abs(peg.rotation[2]) @ np.array(env.world.extents(PEG)) / 2
         assert corners == pytest.approx(0.0, abs=1e-9)
     assert up == {True, False}
-
-
-@pytest.mark.parametrize("pitch", [-1.0, 0.0, 1.0, math.pi / 2])
-@pytest.mark.parametrize("yaw", [-1.5, 0.0, 0.7])
-def test_a_hand_has_the_azimuth_that_it_was_turned_to_at_any_pitch(yaw: float, pitch: float):
-    hand = hand_at(yaw, pitch)
-    np.testing.assert_allclose(hand @ hand.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(hand) == pytest.approx(1.0)
-    assert azimuth(hand) == pytest.approx(yaw)
-    np.testing.assert_allclose(hand_at(yaw, 0.0), hand_down(yaw), atol=1e-12)
-
-
-def test_either_end_of_the_peg_may_be_the_lower_one():
-    world = World(scene_of("panda", "insert"))
-    for upside_down in (UPRIGHT, np.array([0.0, 1.0, 0.0, 0.0])):
-        world.place(PEG, np.array([0.5, 0.1, 0.05]), upside_down)
-        world.place(HOLE, np.array([0.5, 0.1, 0.0]), UPRIGHT)
-        world.update()
-        np.testing.assert_allclose(lower_end(world), [0.5, 0.1, 0.0], atol=1e-12)
-        np.testing.assert_allclose(upper_axis(world), [0.0, 0.0, 1.0], atol=1e-12)
-        assert TASKS["insert"].error(world) == pytest.approx(0.0, abs=1e-12)
-        assert TASKS["insert"].progress(world) == 1.0
 
 
 @pytest.mark.parametrize("task", PLAYS)

@@ -20,7 +20,6 @@ from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UsageError
-from manip_il.sim.conditions import Condition
 from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, Shape
 from manip_il.sim.world import World
@@ -44,8 +43,9 @@ def text(folder: Path, name: str) -> str:
     return f"mesh:{folder / name}.obj"
 
 
-@pytest.mark.parametrize("robot", ["panda", "so101"])
-@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize(
+    ("name", "robot"), [*((name, "panda") for name in MESHES), ("mug", "so101"), ("angle", "so101")]
+)
 def test_the_expert_brings_it_to_its_goal(name, robot, folder):
     episodes = RolloutJob(make_config(robot, object=text(folder, name)), hold=0).run(range(3_000_000, 3_000_003))
     assert all(episode.success for episode in episodes)
@@ -98,35 +98,6 @@ def test_however_it_falls_it_rests_on_a_known_side_with_grasps(name, folder):
         assert expert.label(env.get_state()).valid
 
 
-@pytest.mark.parametrize("name", MESHES)
-def test_it_starts_as_the_file_has_it_or_on_the_nearest_side(name, folder):
-    env = make_env("panda", object=text(folder, name))
-    env.reset(seed=4)
-    world, before = env.world, env.world.pose(OBJECT).rotation.copy()
-    for _ in range(500):
-        mujoco.mj_step(world.model, world.data)
-    world.update()
-    after = world.pose(OBJECT).rotation
-    assert before[2, 2] > (0.99 if name != "banana" else 0.9)
-    assert before[2] @ after[2] > 0.98  # it does not fall over
-
-
-def test_a_cone_on_its_tip_starts_on_a_side(tmp_path):
-    solid = MESHES["cone"]()
-    solid.apply_scale((1, 1, -1)).export(tmp_path / "cone.stl")
-    downs = scene_of("panda", "pick_place", f"mesh:{tmp_path / 'cone.stl'}").hulls[OBJECT].downs
-    assert abs(downs[0][2]) < 0.7
-
-
-def test_grasps_are_flush_and_around_the_centre_of_mass(folder):
-    rest = scene_of("panda", "pick_place", text(folder, "wedge")).hulls[OBJECT].rest(0)
-    [(width, _)] = rest.sizes
-    assert width == pytest.approx(0.035, abs=1e-3)  # across its upright sides, not down its slope
-    np.testing.assert_allclose(np.abs(rest.across[0]), (0, 1, 0), atol=0.01)
-    np.testing.assert_allclose(rest.centre[0, :2], 0, atol=1e-3)
-    assert scene_of("panda", "pick_place", text(folder, "bottle")).hulls[OBJECT].rest(0).round
-
-
 def test_a_side_that_is_too_wide_has_no_label_and_says_why(tmp_path):
     trimesh.creation.box((0.1, 0.03, 0.09)).export(tmp_path / "board.stl")
     env = make_env("panda", object=f"mesh:{tmp_path / 'board.stl'}")
@@ -156,15 +127,6 @@ def test_labels_are_those_of_another_process_and_order(folder):
     backwards = [other.label(state).action for state in states[::-1]][::-1]
     for state, action in zip(states, backwards, strict=True):
         np.testing.assert_array_equal(one.label(state).action, action)
-
-
-def test_mass_and_friction_vary_and_the_hull_stays(folder):
-    env = make_env("panda", object=text(folder, "star"), conditions=[Condition("heavy", mass=(0.2, 0.2))])
-    env.reset(seed=0)
-    one, plain = env.scene.objects[OBJECT], env.scene.model
-    assert env.world.model.body_mass[one.body] == pytest.approx(0.2)
-    np.testing.assert_array_equal(env.world.model.geom_aabb, plain.geom_aabb)
-    assert env.scene.task.sizes is None
 
 
 def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
@@ -225,16 +187,7 @@ MISTAKES = {
         "own.stl",
         "m wide, and the gripper of panda opens",
     ),
-    "is too low": (trimesh.creation.box((0.06, 0.05, 0.006)).export, "own.stl", "0.006 m high, and fingers need"),
     "is in millimetres": (trimesh.creation.box((50, 40, 30)).export, "own.stl", "is 50 m long; expected 0.02 to 0.2 m"),
-    "is not there": (lambda path: None, "own.obj", "own.obj does not exist; expected a mesh"),
-    "is no mesh": (lambda path: path.write_text("hello\n" * 20), "own.stl", "own.stl is no mesh"),
-    "is no file that is read": (lambda path: path.write_text("ply"), "own.ply", "FILE an STL or OBJ"),
-    "is flat": (
-        lambda path: path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n"),
-        "own.obj",
-        "has a volume of 0; expected a solid",
-    ),
 }
 
 

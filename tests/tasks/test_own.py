@@ -21,7 +21,6 @@ from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
 from manip_il.tasks import own
 from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import make_env
 from manip_il.tasks.table import get_task
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
@@ -109,11 +108,7 @@ def test_a_node_gets_the_file(touch):
 
 MISTAKES = {
     "is not Python": ("def (", "line 1 cannot be run: SyntaxError"),
-    "fails": ("import no_such_module", "cannot be run: ModuleNotFoundError"),
-    "has no task": ("x = 1", "has the tasks none; expected exactly one"),
-    "has two": (f"{TOUCH}\nclass Other(Touch): pass\n", "has the tasks Touch, Other; expected exactly one"),
     "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
-    "has another's name": (TOUCH.replace('name = "touch"', 'name = "lift"'), "called 'lift', as one that ships"),
 }
 
 
@@ -125,19 +120,6 @@ def test_a_file_that_holds_no_task_is_one_line(case, tmp_path, capsys):
     assert main(["eval", "--policy.type=expert", f"--task.type={path}", f"--output_dir={tmp_path / 'e'}"]) == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error
-
-
-def test_a_rung_without_a_target_and_names_that_change_are_said(tmp_path):
-    silent, changing = tmp_path / "silent.py", tmp_path / "changing.py"
-    silent.write_text(TOUCH.replace("    return Target(", "    Target("))
-    with pytest.raises(ManipError, match="rung 'approach' returned a NoneType; expected a Target"):
-        list(RolloutJob(make_config("panda", str(silent)), hold=0).run([0]))
-    names = '{**observe_hand(world), f"cube{world.data.time:.2f}": cube'
-    changing.write_text(TOUCH.replace('{**observe_hand(world), "cube": cube', names))
-    env = make_env("panda", str(changing))
-    env.reset(seed=0)
-    with pytest.raises(ManipError, match=r"observed .* and before .*; expected the same"):
-        env.step(env.action_space.sample())
 
 
 def test_a_package_brings_names(touch, monkeypatch):

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from types import SimpleNamespace
 
-import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.errors import UsageError
-from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for
 from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.task import Start
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.envs import make_env, scene_of
-from manip_il.tasks.pick_place import OBJECT
-from manip_il.tasks.starts import FROM_HAND, FROM_HAND_SHARE, LIFT, LIFT_HEIGHT, draw_until, draw_yaw
+from manip_il.tasks.starts import FROM_HAND, FROM_HAND_SHARE
 from manip_il.tasks.table import TASKS, get_task
 
 from ..scenes import SEED, half_height
-from ..tables import WITH_A_PEG, every_robot, every_scene, every_scene_that_grasps, every_scene_with_cubes
+from ..tables import every_scene, every_scene_that_grasps, every_scene_with_cubes
 
 seeds = st.integers(0, 2**40)
 edges = st.sampled_from([None, 0.03, 0.07])  # of a cube, None for the model's own [m]
@@ -80,14 +75,6 @@ def test_an_object_rests_on_the_table_and_not_under_the_hand(robot: str, task: s
         assert np.hypot(*from_centre) >= min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
 
-@given(st.sampled_from(WITH_A_PEG), seeds)
-def test_a_peg_stands_or_lies(scene: tuple[str, str], seed: int):
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, start(world_of(*scene), seed).poses["peg"][1])
-    across, _, along = np.abs(rotation.reshape(3, 3)[2])
-    assert (along, across) == pytest.approx((1, 0) if along > 0.5 else (0, 1), abs=1e-12)
-
-
 @every_scene_with_cubes
 @given(seed=seeds)
 @settings(max_examples=20)
@@ -125,51 +112,3 @@ def test_a_start_is_the_home_posture_within_its_jitter_and_any_opening(robot: st
     share = (np.array(openings) - gripper.least) / (gripper.most - gripper.least)
     assert -1e-9 <= share.min() < 0.2
     assert 0.8 < share.max() <= 1 + 1e-9
-
-
-@every_robot
-@given(edge=edges, seed=seeds)
-def test_a_goal_of_pick_and_place_is_over_the_table(robot: str, edge: float | None, seed: int):
-    world = world_of(robot, "pick_place", edge)
-    space, goal = world.scene.robot.workspace, position(start(world, seed), GOAL)
-    assert np.abs(goal[:2] - space.centre).max() <= space.half_width
-    resting = (edge or 0.05) / 2
-    assert resting <= goal[2] <= resting + space.height
-
-
-@every_robot
-@given(seed=seeds)
-def test_lifts_goal_is_above_the_object(robot: str, seed: int):
-    world = world_of(robot, "lift")
-    drawn, room = start(world, seed), min(1.0, world.scene.robot.workspace.height / LIFT_HEIGHT)
-    np.testing.assert_array_equal(position(drawn, GOAL)[:2], position(drawn, OBJECT)[:2])
-    assert room * LIFT[0] <= position(drawn, GOAL)[2] - position(drawn, OBJECT)[2] <= room * LIFT[1]
-
-
-@every_robot
-def test_half_the_goals_of_pick_and_place_are_on_the_table(robot: str):
-    world = world_of(robot, "pick_place")
-    on_table = sum(position(start(world, seed), GOAL)[2] == 0.025 for seed in range(400))
-    assert 150 <= on_table <= 250  # five standard deviations of a fair coin
-
-
-@every_scene_that_grasps
-def test_starts_reach_into_every_quarter_of_the_table(robot: str, task: str):
-    world, centre = world_of(robot, task), get_robot(robot).workspace.centre
-    first = get_task(task).objects[0]
-    quarters = {tuple(position(start(world, seed), first)[:2] > centre) for seed in range(100)}
-    assert len(quarters) == 4
-
-
-@given(st.floats(0.01, np.pi), seeds)
-def test_a_drawn_turn_is_about_the_vertical_and_no_wider_than_asked(widest: float, seed: int):
-    quaternion, matrix = draw_yaw(np.random.default_rng(seed), widest), np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    assert matrix[8] == pytest.approx(1)
-    assert abs(np.arctan2(matrix[3], matrix[0])) <= widest + 1e-12
-
-
-def test_where_nothing_fits_the_error_names_task_thing_and_robot():
-    scene = SimpleNamespace(task=SimpleNamespace(name="stack"), robot=SimpleNamespace(name="dwarf"))
-    with pytest.raises(UsageError, match="stack: none of 1000 places drawn for the goal fits within reach of dwarf"):
-        draw_until(lambda: np.zeros(3), lambda at: False, SimpleNamespace(scene=scene), "the goal")

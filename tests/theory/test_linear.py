@@ -17,7 +17,3 @@ def test_clones_drift_with_the_open_loop_and_noise_mends_it():
         else:
             assert abs(drift.growth - pole) < 0.01
             assert end > 1_000 * GUST
-
-
-def test_the_same_numbers_come_out_again():
-    assert [drift.to_json() for drift in drifts()] == [drift.to_json() for drift in drifts()]

@@ -15,9 +15,3 @@ def test_states_of_the_same_kind_are_as_near_as_the_experts_and_others_farther()
     data, fresh = visited(1), visited(2)
     assert relative_distance(visited(0), data, fresh) == pytest.approx(1, abs=0.1)
     assert relative_distance(visited(0, off=3), data, fresh) > 1.5
-
-
-def test_a_column_that_does_not_change_is_no_distance():
-    states = [visited(seed) for seed in range(3)]
-    still = [np.hstack([one, np.ones((len(one), 1))]) for one in states]
-    assert relative_distance(*still) == relative_distance(*states)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +14,7 @@ from manip_il.rewards.paths import cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid, descent, reaches
-from manip_il.tasks.carry.layout import THINGS, Edge, Layout, Part, path_features
+from manip_il.tasks.carry.layout import Edge, Layout, Part, path_features
 from manip_il.tasks.carry.reward import FEATURES, TASTES, Reward
 
 from ...tables import every_robot
@@ -113,62 +112,6 @@ def test_the_descent_leads_on_from_beside_any_node(seed: int):
     assert node == grid().goal or np.linalg.norm(heading - position) > 0.005
 
 
-def test_free_nodes_and_edges_keep_their_room():
-    assert LAYOUT.room(grid().points[grid().free]).min() >= 0
-    ends = grid().points[grid().problem.edges[::97]]
-    assert LAYOUT.room(ends.mean(axis=1)).min() >= 0
-    over = np.array([[0.50, -0.10, z] for z in (0.04, 0.06, 0.10)])  # the laptop is flat: there is a way over it
-    alone = replace(LAYOUT, places=LAYOUT.places[1:2])
-    assert (alone.room(over) >= 0).tolist() == [False, False, True]
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_a_straight_line_becomes_a_path_no_longer_than_the_grids_shortest(seed: int):
-    empty = Grid(replace(LAYOUT, places=(), edge=None), ROBOT)
-    rng = np.random.default_rng(seed)
-    start = np.array([0.45, 0.0, 0.17]) + rng.uniform(-1, 1, 3) * [0.15, 0.15, 0.1]
-    line = np.linspace(start, LAYOUT.goal, 15) + rng.normal(0, 5e-4, (15, 3))
-    path = empty.snap(line)
-    shortest = empty.costs_to_go(weights_with())[path[0]]
-    assert path[-1] == empty.goal
-    assert empty.problem.sums(path)[0] <= shortest * 1.06
-
-
-def test_a_path_that_is_snapped_costs_about_what_it_does():
-    down = descent(LAYOUT, CAREFUL, ROBOT)
-    weights = down.weights
-    for start in STARTS:
-        position, path = start, [start]
-        while (heading := down.look(position)[1]) is not None and math.dist(position, LAYOUT.goal) > 0.004:
-            way = heading - position
-            position = position + way * min(1.0, 0.02 / np.linalg.norm(way))
-            path.append(position)
-        snapped = grid().snap(np.array(path))
-        cost, planned = grid().problem.sums(snapped) @ weights, down.costs[snapped[0]]
-        assert planned <= cost * (1 + 1e-9)
-        assert cost < 1.15 * planned
-        assert abs(cost - path_features(LAYOUT, np.array(path)) @ weights) < 0.15 * cost
-
-
-def test_where_no_free_path_is_there_is_nowhere_to_head_for():
-    shut = replace(LAYOUT, places=(("vase", LAYOUT.goal[:2]),))
-    down = descent(shut, CAREFUL, ROBOT)
-    assert np.isinf(np.delete(down.costs, down.grid.goal)).all()
-    assert down.look(STARTS[0]) == (np.inf, None)
-    assert not down.leads(STARTS[0])
-
-
-def test_a_path_has_no_features_of_things_that_are_not_there_and_its_parts_add_up():
-    bare = replace(LAYOUT, places=(), edge=None)
-    path = np.cumsum(np.vstack([STARTS[0], np.random.default_rng(0).normal(0, 0.02, (20, 3))]), axis=0)
-    whole = path_features(bare, path)
-    assert (whole[2:] == 0).all()
-    assert whole[0] == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    parts = path_features(LAYOUT, path[:9]) + path_features(LAYOUT, path[8:])
-    np.testing.assert_allclose(parts, path_features(LAYOUT, path), rtol=1e-3, atol=1e-5)
-    assert (path_features(LAYOUT, path[:1]) == 0).all()
-
-
 @every_robot
 def test_the_grid_takes_the_map_of_where_the_hand_gets_to(robot: str):
     arm, reach = get_robot(robot), reach_of(get_robot(robot))
@@ -179,8 +122,3 @@ def test_the_grid_takes_the_map_of_where_the_hand_gets_to(robot: str):
     ]
     assert reaches(arm, points).tolist() == [reach.has(point) for point in points]
     assert 0 < reaches(arm, points).sum() < len(points)
-
-
-def test_things_that_stand_in_one_another_are_seen():
-    assert not LAYOUT.meeting
-    assert replace(LAYOUT, places=tuple((name, (0.4, 0.0)) for name in THINGS)).meeting

@@ -26,41 +26,6 @@ def test_a_reward_is_read_back_exactly_from_its_numbers(weights: list[float]):
     assert Reward.parse(reward.numbers) == reward
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("carful", "unknown reward 'carful' .did you mean 'careful'.*expected careful, low, hasty, reward.json"),
-        ("length=1,near_vose=2", "unknown feature 'near_vose' .did you mean 'near_vase'"),
-        ("height=1", "weight of length is 0; expected more than 0"),
-        ("length=1,height=-2", "weight of height is -2; expected a finite number from 0"),
-        ("length=1,height=nan", "weight of height is nan; expected a finite number"),
-        ("length=1,height=much", "weight of height is 'much'; expected a number"),
-        ("/nowhere/reward.json", "cannot read /nowhere/reward.json"),
-    ],
-)
-def test_what_is_no_reward_is_refused_in_one_line(text: str, message: str):
-    with pytest.raises(UsageError, match=message) as caught:
-        Reward.parse(text)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ('{"names": ["length", "neer_vase"], "weights": [1, 2]}', "unknown feature 'neer_vase'"),
-        ('{"names": ["length"]}', "weights is None"),
-        ('{"names": ["length"], "weights": ["1"]}', "weight of length is '1'"),
-        ("{", "not valid JSON"),
-    ],
-)
-def test_a_broken_file_is_refused_in_one_line_that_names_it(tmp_path: Path, content: str, message: str):
-    (tmp_path / "a.json").write_text(content)
-    with pytest.raises(UsageError, match=message) as caught:
-        Reward.parse(str(tmp_path / "a.json"))
-    assert str(tmp_path / "a.json") in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_an_environment_keeps_what_is_in_a_file_and_not_where_it_is(tmp_path: Path):
     content = {"names": ["height", "length"], "weights": [3.0, 1], "method": "any"}
     for name in ("one.json", "two.json"):

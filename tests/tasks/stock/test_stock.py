@@ -6,18 +6,15 @@ import gymnasium
 import numpy as np
 import pytest
 
-from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver, RandomDriver
+from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver
 from manip_il.collect.environments import env_actions, env_spec
 from manip_il.collect.job import RolloutJob
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import MismatchError
 from manip_il.evaluation.runner import positions
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CameraConfig
-from manip_il.sim.events import STANDARD
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.stock.environment import StockEnv
 from manip_il.tasks.stock.expert import StockExpert
@@ -112,36 +109,6 @@ def test_positions_are_those_of_the_observation(task: str):
     assert found.keys() == names.keys()
     for name, observed in names.items():
         assert found[name] == pytest.approx([row[f"{observed}.{axis}"] for axis in "xyz"], abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"control_hz": 20}, "control_hz is 20; fetch_stock is unmodified, expected 25"),
-        ({"horizon": 100}, "horizon is 100; fetch_stock is unmodified, expected 50"),
-        ({"object": "sphere:0.04"}, "object is sphere:0.04; fetch_stock is unmodified"),
-        ({"task": "pick_place"}, "unknown task of fetch_stock 'pick_place'"),
-    ],
-)
-def test_other_settings_are_refused(settings: dict, words: str):
-    with pytest.raises(UsageError, match=words):
-        make_config(**{"robot": ROBOT, "task": "FetchReach-v4", "control_hz": CONTROL_HZ} | settings)
-
-
-def test_cameras_and_disturbances_are_refused():
-    own = config("FetchReach-v4")
-    with pytest.raises(UsageError, match="no cameras"):
-        next(RolloutJob(own, cameras=CameraConfig(("front",))).run([0]))
-    with pytest.raises(UsageError, match="takes no standard"):
-        next(RolloutJob(own, conditions=(STANDARD,)).run([0]))
-    assert next(RolloutJob(own, conditions=(Condition(),)).run([0])).success
-
-
-def test_a_drawn_action_is_within_the_bounds():
-    [episode] = RolloutJob(config("FetchReach-v4"), RandomDriver()).run([3])
-    executed = episode.columns["executed_action"]
-    assert np.abs(executed).max() <= 1
-    assert executed.std() > 0.4
 
 
 NOISE = tuple(map(tuple, 0.01 * np.eye(4)))
