@@ -8,7 +8,7 @@ an assumption.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -51,11 +51,11 @@ class ServoConfig:
 
     def varied(self, rng: np.random.Generator) -> ServoConfig:
         """Draw servos that differ from these within `VARIED`."""
-        drawn = {name: rng.uniform(*VARIED[name]) for name in VARIED}
-        own = {one.name: getattr(self, one.name) for one in fields(self)}
-        return replace(
-            self, **{name: own[name] + drawn[name] if name in _ADDED else own[name] * drawn[name] for name in VARIED}
-        )
+        drawn: dict[str, float] = {}
+        for name, ends in VARIED.items():
+            own, change = getattr(self, name), rng.uniform(*ends)
+            drawn[name] = own + change if name in _ADDED else own * change
+        return replace(self, **drawn)
 
 
 @dataclass(frozen=True)

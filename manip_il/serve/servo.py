@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.serve.bus import CENTRE, STEPS, Bus
+from manip_il.mdp import F64
+from manip_il.serve.bus import STEP, Bus
 from manip_il.serve.config import ServoConfig
 from manip_il.sim.world import World
 
-F64 = NDArray[np.float64]
-STEP = 2 * math.pi / STEPS  # of the encoder [rad]
 _FACTORY_GAIN = 32  # P_Coefficient of a new servo, for which `stiffness` is said
 _HAND = 100.0  # stiffness of a hand that holds an arm whose torque is off [N m/rad]
 
@@ -25,14 +22,13 @@ class Follower:
     Gravity pulls at the arm. A servo whose torque is off keeps its place, as if a hand held it.
     """
 
-    def __init__(self, world: World, bus: Bus, config: ServoConfig, step: float):
+    def __init__(self, world: World, bus: Bus, step: float):
         scene, model = world.scene, world.scene.model
-        self._world, self._bus, self.config, self._step = world, bus, config, step
+        self._world, self._bus, self._step = world, bus, step
         self.q = np.array([*scene.arm_q, *scene.gripper.q])
         self._ctrl = np.array([*scene.arm_ctrl, *scene.gripper.ctrl])
         self._dof = model.jnt_dofadr[[int(np.flatnonzero(model.jnt_qposadr == q)[0]) for q in self.q]]
         self._at, self._on, self._coming = np.zeros(len(self.q)), np.zeros(len(self.q), bool), deque[F64]()
-        self.reset(config)
 
     def reset(self, config: ServoConfig) -> None:
         """Take these servos, standing where the joints are."""
@@ -43,43 +39,33 @@ class Follower:
             model.dof_frictionloss[self._dof] = config.friction
         self._at = self._world.data.qpos[self.q]
         self._coming = deque([self._at] * round(config.delay / self._step))
-        _place(self._bus, self.encoder())
-
-    def _registers(self, name: str) -> F64:
-        with self._bus.lock:
-            return np.array([servo[name] for servo in self._bus.servos], float)
+        self._bus.show(self._at + self.offset, settled=True)
 
     @property
     def offset(self) -> float:
         """Angle by which the encoders read beyond the joints [rad]."""
         return math.radians(self.config.offset)
 
-    @property
-    def gain(self) -> F64:
+    def _gain(self) -> F64:
         """Stiffness of every servo at the gain that it was given [N m/rad], (n,)."""
-        return self.config.stiffness * np.maximum(1, self._registers("P_Coefficient")) / _FACTORY_GAIN
-
-    def encoder(self) -> list[int]:
-        """Return what the encoders read."""
-        return encoder_steps(self._world.data.qpos[self.q] + self.offset)
+        return self.config.stiffness * np.maximum(1, self._bus["P_Coefficient"]) / _FACTORY_GAIN
 
     def sag(self) -> F64:
         """Return how far the joints are from their goals under gravity, at rest [rad], (n,)."""
-        return self._world.data.qfrc_bias[self._dof] / self.gain
+        return self._world.data.qfrc_bias[self._dof] / self._gain()
 
     def goal(self) -> F64:
         """Return the joints that the servos were told last to go to [rad], (n,)."""
-        with self._bus.lock:
-            return _joints([one.goal for one in self._bus.servos]) - self.offset
+        return self._bus.goals() - self.offset
 
     def command(self) -> None:
         """Give the motors what the registers say: once every `step` seconds."""
-        data, model = self._world.data, self._world.model
+        data, model, bus = self._world.data, self._world.model, self._bus
         q = data.qpos[self.q]
-        with self._bus.lock:
-            on, gain, goal = self._registers("Torque_Enable") > 0, self.gain, self.goal()
-            dead = STEP * self._registers("CW_Dead_Zone")
-            limit = np.minimum(self._registers("Max_Torque_Limit"), self._registers("Torque_Limit")) / 1000
+        with bus.lock:
+            on, gain, goal = bus["Torque_Enable"] > 0, self._gain(), self.goal()
+            dead = STEP * bus["CW_Dead_Zone"]
+            limit = np.minimum(bus["Max_Torque_Limit"], bus["Torque_Limit"]) / 1000
         self._coming.append(goal)
         goal = self._coming.popleft()
         play = math.radians(self.config.play) / 2
@@ -96,50 +82,5 @@ class Follower:
     def show(self) -> None:
         """Write what the servos measure into their registers."""
         data = self._world.data
-        velocity = data.qvel[self._dof] / STEP
         load = data.actuator_force[self._ctrl] / self.config.torque
-        with self._bus.lock:
-            for servo, *measured in zip(self._bus.servos, self.encoder(), velocity, load, strict=True):
-                servo.show(*measured)
-
-
-class Leader:
-    """An arm of servos without a world: its joints go, as fast as servos turn, where somebody moves them.
-
-    With torque on they go to what is written to them, as when a program hands over.
-    """
-
-    def __init__(self, bus: Bus, q: F64):
-        self._bus = bus
-        self.place(q)
-
-    def place(self, q: F64) -> None:
-        """Put the joints there at once [rad], (n,)."""
-        self.q = np.array(q)
-        _place(self._bus, encoder_steps(self.q))
-
-    def move(self, q: F64, most: float) -> None:
-        """Move the joints towards `q` by at most so much each [rad]; those with torque on, to their goals."""
-        with self._bus.lock:
-            goals = _joints([one.goal for one in self._bus.servos])
-            wanted = np.where([one["Torque_Enable"] > 0 for one in self._bus.servos], goals, q)
-            self.q = self.q + np.clip(wanted - self.q, -most, most)
-            for servo, encoder in zip(self._bus.servos, encoder_steps(self.q), strict=True):
-                servo.show(encoder)
-
-
-def encoder_steps(q: F64) -> list[int]:
-    """Return what encoders read of joints that stand at `q` [rad], (n,)."""
-    return [int(one) for one in np.rint(CENTRE + np.asarray(q) / STEP)]
-
-
-def _joints(encoder: Sequence[int]) -> F64:
-    return (np.array(encoder) - CENTRE) * STEP
-
-
-def _place(bus: Bus, encoder: Sequence[int]) -> None:
-    """Let servos stand, and be told to stand, there."""
-    with bus.lock:
-        for servo, at in zip(bus.servos, encoder, strict=True):
-            servo.show(at)
-            servo.aim(at)
+        self._bus.show(data.qpos[self.q] + self.offset, data.qvel[self._dof], load)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import select
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from manip_il.errors import ManipError
-from manip_il.seeding import BLOCK, stream_seeds
-from manip_il.serve.cameras import Cameras
+from manip_il.mdp import Actor
+from manip_il.serve.cameras import RATE, Cameras
 from manip_il.serve.config import SessionConfig
-from manip_il.serve.log import SessionLog
-from manip_il.serve.operator import HELD, URGENT, Operator, weigh_session
+from manip_il.serve.episodes import Episodes
+from manip_il.serve.operator import INTERRUPT, Operator, weigh_session
 from manip_il.serve.station import Station
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
@@ -41,49 +40,43 @@ def serve(
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.setswitchinterval(5e-4)  # [s]: the threads of the buses get their turn within it
-    with contextlib.suppress(OSError):  # a servo answers within milliseconds, whatever else runs
-        os.nice(-URGENT)
     weigh_session()
     with contextlib.ExitStack() as stack:
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
-        for bus in station.buses.values():
-            bus.on_refusal = warn
-        log = SessionLog(config.log, station, env) if config.log is not None else None
-        there = set(log.seeds if log is not None else [])
-        seeds = (seed for seed in stream_seeds("demonstrations", BLOCK, config.seed) if seed not in there)
-        station.reset(next(seeds))
+        episodes = Episodes(station, env, config.log, config.seed)
         gc.collect()
         gc.freeze()  # a collection of all that LeRobot and torch have imported takes longer than a client waits
         stack.callback(gc.unfreeze)
         if cameras is not None:
             shown = Cameras(station, cameras, config.camera_port)
-            stack.callback(shown.close, warn)
+            stack.callback(shown.close)
+            if shown.rate < RATE:
+                warn(f"pictures are drawn {shown.rate:.0f} times a second here; {RATE} need smaller or fewer ones")
         for line in described(station, config, cameras):
             say(line)
         if command:
-            operator = Operator(command, station, seeds, log, config.intervene)
+            operator = Operator(command, station, episodes, config.intervene)
             stack.callback(operator.kill)
             try:
                 station.run(operator.each_step)
             except KeyboardInterrupt:
-                operator.stop()
+                operator.press(INTERRUPT)
                 station.run(operator.each_step)
             say(f"{command[0]} ended; episodes solved {operator.solved}, not solved {operator.failed}")
             if operator.status:
                 raise ManipError(f"{command[0]} failed with exit code {operator.status}")
         else:
-            _stand(station, config, seeds, log, say)
+            _stand(station, episodes, config.reset == "solved", say)
 
 
 def described(station: Station, config: SessionConfig, cameras: CameraConfig | None) -> list[str]:
     """Return where everything is, and a line to copy."""
-    root = config.output_dir
+    root, port = config.output_dir, config.camera_port
+    size = f"width: {cameras.width}, height: {cameras.height}, fps: {RATE}" if cameras else ""
     shown = ", ".join(
-        f"{name}: {{type: zmq, server_address: 127.0.0.1, port: {config.camera_port}, camera_name: {name}, "
-        f"width: {cameras.width}, height: {cameras.height}, fps: 30}}"
+        f"{name}: {{type: zmq, server_address: 127.0.0.1, port: {port}, camera_name: {name}, {size}}}"
         for name in (cameras.names if cameras else ())
-        if cameras
     )
     seen = f' --robot.cameras="{{{shown}}}"' if shown else ""
     return [
@@ -96,21 +89,17 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
     ]
 
 
-def _stand(station: Station, config: SessionConfig, seeds: Iterator[int], log: SessionLog | None, say: Say) -> None:
-    """Serve whoever connects, until Ctrl-C."""
-    station.mover = station.expert
-    if log is not None:
-        log.begin()
-        station.on_read = log.frame
+def _stand(station: Station, episodes: Episodes, renews: bool, say: Say) -> None:
+    """Serve whoever connects, until Ctrl-C; a new world on Enter, and if it `renews` also once the task is solved."""
+    station.on_read = episodes.frame
+    episodes.begin(Actor.EXPERT)
 
     def each_step() -> bool:
         pressed = sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline()
-        if pressed or (config.reset == "solved" and station.solved_for >= HELD):
-            say(f"seed {station.seed}: {'solved' if station.env.solved else 'left'}; a new world")
-            if log is not None:
-                log.end(keep=True)
-                log.begin()
-            station.reset(next(seeds))
+        if pressed or (renews and station.is_solved):
+            say(f"seed {station.seed}: {'solved' if station.is_solved else 'left'}; a new world")
+            episodes.renew()
+            episodes.begin(Actor.EXPERT)
         return True
 
     with contextlib.suppress(KeyboardInterrupt):

@@ -7,26 +7,24 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.collect.expert import Expert
 from manip_il.data.atomic import write_file
 from manip_il.errors import UsageError
-from manip_il.mdp import State
+from manip_il.mdp import F64, State
 from manip_il.seeding import rng_for
-from manip_il.serve.bus import STEPS, Bus
+from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
 from manip_il.serve.config import SessionConfig
-from manip_il.serve.servo import Follower, Leader, encoder_steps
+from manip_il.serve.servo import Follower
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import World
 
-F64 = NDArray[np.float64]
 FEETECH = "so_follower"  # `robot_type` of the arms whose servos these are, in LeRobot
+HELD = 1.0  # how long the task is solved before it counts [s]
 _SLICES = 4  # times in a control step, at most, that commands reach the motors and registers are written
 _LATE = 0.25  # behind the wall clock by more, time is given up [s]
 _FULL_TURN = "wrist_roll"  # LeRobot's calibration gives it a whole turn
@@ -48,10 +46,10 @@ class Read(NamedTuple):
 class Station:
     """Two ports, `follower` and `leader` in a folder, and what is behind them.
 
-    `NAME.json` beside each is a calibration that LeRobot reads; `NAME.eeprom` is what the servos keep. on_read: called,
-    from another thread, whenever a client reads where the follower is. mover: who moves the leader: returns its joints
-    [rad], (n,), or None to leave them. hand: joints at which a hand holds both arms, and nothing moves. Raises
-    `UsageError` for a robot without Feetech servos.
+    `NAME.json` beside each is a calibration that LeRobot reads, and what the servos keep without power. on_read:
+    called, from another thread, whenever a client reads where the follower is. mover: who moves the leader, which has
+    no weight: returns its joints [rad], (n,), or None to leave them. hand: joints at which a hand holds both arms, and
+    nothing moves. Raises `UsageError` for a robot without Feetech servos.
     """
 
     def __init__(self, env: ManipEnv, config: SessionConfig):
@@ -71,16 +69,32 @@ class Station:
         self.slice = 1 / (env.config.control_hz * self._slices)
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
         self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])  # of the servos' joints [rad], (n, 2)
-        names = ("follower", "leader")
-        self.buses = {name: self._bus(config.output_dir, name) for name in names}
-        self.follower = Follower(env.world, self.buses["follower"], self._servos, self.slice)
-        self.leader = Leader(self.buses["leader"], env.data.qpos[self.follower.q])
+        self.buses = {name: self._open(name) for name in ("follower", "leader")}
+        self.follower = Follower(env.world, self.buses["follower"], self.slice)
         self.mover: Callable[[], F64 | None] = lambda: None
         self.hand: F64 | None = None
-        self.seed, self._solved = 0, 0
         self.on_read: Callable[[Read], None] = lambda read: None
-        self._show()
-        self.buses["follower"].on_read = self._was_read
+        self.reset(0)
+        self.buses["follower"].on_read = lambda: self.on_read(self.look())
+
+    def _open(self, name: str) -> Bus:
+        """Open a port: its link and its calibration lie in the folder."""
+        link = self._config.output_dir / name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        kept: Calibration = {}
+        for number, (joint, limits) in enumerate(zip(self.names, self.limits, strict=True), 1):
+            low, high = (0, STEPS - 1) if joint == _FULL_TURN else encoder_steps(limits)
+            kept[joint] = {"id": number, "homing_offset": 0, "range_min": low, "range_max": high}
+        file = link.with_suffix(".json")
+        bus = Bus(json.loads(file.read_text()) if file.exists() else kept)
+        self._keep(name, bus)
+        link.unlink(missing_ok=True)
+        link.symlink_to(bus.path)
+        return bus
+
+    def _keep(self, name: str, bus: Bus) -> None:
+        content = json.dumps(bus.calibration, indent=4)
+        write_file(self._config.output_dir / f"{name}.json", content.encode())
 
     def look(self) -> Read:
         """Return what a client sees now."""
@@ -88,53 +102,24 @@ class Station:
             return Read(self._shown, self.follower.goal(), self._sag, self.buses["follower"].commands)
 
     @property
-    def solved_for(self) -> float:
-        """Time for which the task has been solved [s]."""
-        return self._solved / self.env.config.control_hz
-
-    def _was_read(self) -> None:
-        self.on_read(self.look())
-
-    def _bus(self, folder: Path, name: str) -> Bus:
-        folder.mkdir(parents=True, exist_ok=True)
-        ranges = [(low, high) for low, high in zip(*map(encoder_steps, self.limits.T), strict=True)]
-        ranges = [(0, STEPS - 1) if one == _FULL_TURN else own for one, own in zip(self.names, ranges, strict=True)]
-        bus = Bus(ranges, folder / f"{name}.eeprom")
-        link = folder / name
-        if link.exists() and not link.is_symlink():
-            raise UsageError(f"{link} is no link; expected a folder for this command's own, give --output_dir=")
-        link.unlink(missing_ok=True)
-        link.symlink_to(bus.path)
-        if not (file := folder / f"{name}.json").exists():
-            write_file(file, json.dumps(self._calibration(bus), indent=4).encode())
-        return bus
-
-    def _calibration(self, bus: Bus) -> dict[str, dict[str, int]]:
-        """What LeRobot's calibration file of these servos holds."""
-        held = {"id": "ID", "homing_offset": "Homing_Offset", "range_min": "Min_Position_Limit"}
-        held |= {"range_max": "Max_Position_Limit"}
-        servos = zip(self.names, bus.servos, strict=True)
-        return {
-            name: {"drive_mode": 0} | {key: servo[register] for key, register in held.items()} for name, servo in servos
-        }
-
-    def wanted(self) -> F64 | None:
-        """Return where the expert would tell the follower to go [rad], beyond by what it sags, (n,); None: no label."""
-        label = self._expert.label(self.env.get_state(), self.env.world)
-        return self.to_joints(label.action) + self.follower.sag() if label.valid else None
+    def is_solved(self) -> bool:
+        """Whether the task has been solved for a while."""
+        return self._solved >= HELD * self.env.config.control_hz
 
     def expert(self) -> F64 | None:
-        """Return where a leader must be for that [rad], (n,), who sees by how much the follower's servos are off."""
-        wanted = self.wanted()
-        return None if wanted is None else wanted + self.follower.offset
+        """Return where the expert would have the leader [rad], (n,); None without a label.
+
+        It is beyond the label by what the follower sags, and by how much its servos are off.
+        """
+        label = self._expert.label(self.env.get_state(), self.env.world)
+        return self.to_joints(label.action) + self.follower.sag() + self.follower.offset if label.valid else None
 
     def reset(self, seed: int) -> None:
         """Draw the world of a seed, the arm at its start, the leader with it."""
         self.env.start(seed)
         self.seed, self._solved = seed, 0
-        servos = self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos
-        self.follower.reset(servos)
-        self.leader.place(self.env.data.qpos[self.follower.q])
+        self.follower.reset(self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos)
+        self._place_leader(self.env.data.qpos[self.follower.q])
         self._show()
 
     def run(self, each_step: Callable[[], bool]) -> None:
@@ -147,8 +132,6 @@ class Station:
                     self.env.begin_step()
                 if not each_step():
                     return
-                for bus in self.buses.values():
-                    bus.keep()
             self._advance(slices % self._slices == self._slices - 1)
             slices += 1
 
@@ -160,15 +143,14 @@ class Station:
 
     def _advance(self, ends_step: bool) -> None:
         """One slice of time."""
-        env, most = self.env, self._servos.speed * self.slice
+        env = self.env
         if self.hand is not None:
             env.data.qpos[self.follower.q] = self.hand
             env.data.qvel[:] = 0.0
             mujoco.mj_forward(env.world.model, env.data)
-            self.leader.place(self.hand)
+            self._place_leader(self.hand)
         else:
-            wanted = self.mover()
-            self.leader.move(self.leader.q if wanted is None else wanted, most)
+            self._move_leader(self.mover())
             self.follower.command()
             mujoco.mj_step(env.world.model, env.data, env.config.physics_steps // self._slices)
             env.world.update()
@@ -176,6 +158,17 @@ class Station:
                 env.count_step()
                 self._solved = self._solved + 1 if env.solved else 0
         self._show()
+
+    def _place_leader(self, q: F64) -> None:
+        self._leader = q.copy()
+        self.buses["leader"].show(q, settled=True)
+
+    def _move_leader(self, q: F64 | None) -> None:
+        """Move its joints towards `q` as fast as servos turn; those with torque on, to where they are told to go."""
+        bus, most = self.buses["leader"], self._servos.speed * self.slice
+        wanted = np.where(bus["Torque_Enable"] > 0, bus.goals(), self._leader if q is None else q)
+        self._leader = self._leader + np.clip(wanted - self._leader, -most, most)
+        bus.show(self._leader)
 
     def _show(self) -> None:
         """Let clients and cameras see the world as it is."""
@@ -196,7 +189,8 @@ class Station:
         return scene.actions.join(joints[:arm], scene.gripper.commanded(joints[arm:], joints[arm:]))
 
     def close(self) -> None:
-        """End the ports, and remove their links."""
+        """Keep what the servos keep, end the ports, and remove their links."""
         for name, bus in self.buses.items():
+            self._keep(name, bus)
             (self._config.output_dir / name).unlink(missing_ok=True)
             bus.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
+from numpy.typing import NDArray
 
 from manip_il.cli.main import main
 from manip_il.data.journal import list_episodes, read_journal
@@ -67,6 +69,23 @@ def test_teleoperate_follows_the_expert_from_world_to_world(run: Run):
     assert len(logged) >= 2
     assert logged[0].success
     assert {*np.concatenate([one.columns["actor"] for one in logged]).ravel()} == {Actor.EXPERT}
+
+
+def ends(folder: Path) -> NDArray[np.int64]:
+    """The ends of every joint of a calibrated follower, in steps of its encoder, (n, 2)."""
+    kept = json.loads((folder / "arm" / "follower.json").read_text())
+    return np.array(
+        [[one["range_min"], one["range_max"]] + one["homing_offset"] * np.ones(2, int) for one in kept.values()]
+    )
+
+
+def test_motors_are_set_up_one_by_one_and_calibrated(run: Run, tmp_path: Path):
+    """The calibration that is found is the model's, to within two steps; the servos keep it."""
+    run("lerobot-setup-motors", arms="follower")
+    model = ends(tmp_path)
+    run("lerobot-calibrate", arms="follower")
+    assert "Calibration saved" in (tmp_path / "said").read_text()
+    assert np.abs(ends(tmp_path) - model).max() <= 2
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What a client of the virtual arm cannot see, kept beside what it records: states, labels of all of them, who drove.
+"""Worlds of a session, one after another, and what a client did in each that it cannot see: states, labels, who drove.
 
 A frame is logged when the client asks where the follower is, so that the frames are those of its own dataset.
 """
@@ -10,38 +10,49 @@ from pathlib import Path
 
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
-from manip_il.data.build import Recording
 from manip_il.data.episodes import to_episode
 from manip_il.data.journal import Journal, list_seeds
 from manip_il.mdp import Actor, Transition
+from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.station import Read, Station
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import env_of
 
 
-class SessionLog:
-    """Journals of a session, one an episode, in a folder that `manip-il data build` makes a dataset of.
+class Episodes:
+    """Episodes of a station: those that are kept are journals in a folder, for `manip-il data build`.
 
-    driver: who moves the follower at the moment.
+    folder: None for no journals. seed: shifts the worlds; those that have a journal are not drawn again. driver: who
+    moves the follower at the moment.
     """
 
-    def __init__(self, folder: Path, station: Station, config: EnvConfig):
-        self._journal = Journal(folder, env_spec(config), env_fingerprint(config))
-        self._journal.prepare()
-        Recording(f"local/{folder.name}", provenance={"driver": "lerobot"}).write(folder)
+    def __init__(self, station: Station, config: EnvConfig, folder: Path | None = None, seed: int = 0):
         self._station, self._env = station, env_of(config)
         self._expert, self.driver = Expert(self._env.scene), Actor.EXPERT
         self._reads: list[tuple[Read, Actor]] = []
         self._running = False
+        self._journal = Journal(folder, env_spec(config), env_fingerprint(config)) if folder is not None else None
+        if self._journal is not None:
+            self._journal.prepare()
+        there = set(list_seeds(folder)) if folder is not None else set[int]()
+        self._seeds = (one for one in stream_seeds("demonstrations", BLOCK, seed) if one not in there)
+        self.renew()
 
-    @property
-    def seeds(self) -> list[int]:
-        """Seeds of the episodes that are there."""
-        return list_seeds(self._journal.folder)
+    def renew(self, *, keep: bool = True) -> None:
+        """End the episode, and draw the next world, in which nobody moves yet."""
+        self.end(keep=keep)
+        self._station.mover = lambda: None
+        self._station.reset(next(self._seeds))
 
-    def begin(self) -> None:
+    def begin(self, driver: Actor) -> None:
         """Begin an episode in the world as it is."""
-        self._reads, self._running = [], True
+        self._reads, self._running = [], self._journal is not None
+        self.drive(driver)
+
+    def drive(self, driver: Actor) -> None:
+        """Let somebody move the follower from now on: the expert by the leader, or a policy."""
+        self.driver = driver
+        self._station.mover = self._station.expert if driver is Actor.EXPERT else lambda: None
 
     def frame(self, read: Read) -> None:
         """Log a moment at which the client has read where the follower is."""
@@ -54,7 +65,7 @@ class SessionLog:
     def end(self, *, keep: bool) -> None:
         """End the episode; its journal is written at once if it is to be kept."""
         reads, self._reads, self._running = [*self._reads, (self._station.look(), self.driver)], [], False
-        if keep and len(reads) > 1:
+        if self._journal is not None and keep and len(reads) > 1:
             frames = [self._transition(step, reads) for step in range(len(reads) - 1)]
             self._journal.write(to_episode(frames))
 
