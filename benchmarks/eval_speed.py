@@ -31,7 +31,6 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
@@ -72,7 +71,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
     config = make_config(robot, TASK)
     demos = RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count))
     write_dataset(demos, folder / "dataset", env_spec(config), repo_id="local/demos", fingerprint={})
-    return Trainer(Sources((Dataset.open(folder / "dataset"),)), FitConfig(steps=steps), folder).fit()
+    return Trainer((Dataset.open(folder / "dataset"),), FitConfig(steps=steps), folder).fit()
 
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:

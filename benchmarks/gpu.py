@@ -38,7 +38,6 @@ import datasets
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
@@ -72,7 +71,7 @@ def main() -> int:
             config = FitConfig(
                 {**options, "device": "cuda"}, observation="images", steps=10**6, batch_size=BATCH, log_freq=10**9
             )
-            trainer = Trainer(Sources((Dataset.open(roots[size]),)), config, Path(folder) / name)
+            trainer = Trainer((Dataset.open(roots[size]),), config, Path(folder) / name)
             steps = trainer.run(), lerobots_steps(roots[size], trainer)
             pairs = [tuple(BATCH * per_s(partial(next, step)) for step in steps) for _ in range(REPEATS)]
             trainer.save()

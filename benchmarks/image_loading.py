@@ -28,10 +28,11 @@ from _machine import describe_machine
 from lerobot.datasets import LeRobotDataset
 
 import datasets
+from manip_il.data.camera import decode
 from manip_il.data.dataset import Dataset
 from manip_il.learn.batches import Augment, pictures_to_float
 from manip_il.learn.network import threads
-from manip_il.learn.samples import Pictures, Samples, Windows
+from manip_il.learn.samples import Samples, Windows
 
 BATCH = 64
 SECONDS = 2.0  # of ours, each time
@@ -102,7 +103,7 @@ def our_samples(root: Path) -> Samples:
     dataset = Dataset.open(root)
     table = {key: values for key, values in dataset.columns().items() if values.dtype != object}
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
-    pictures = {camera: Pictures.decode([dataset], camera) for camera in dataset.cameras}
+    pictures = {camera: decode([dataset.camera(camera)]) for camera in dataset.cameras}
     return Samples(Windows(table["episode_index"], {}), columns, pictures, np.array([*dataset.tasks.values()], object))
 
 

@@ -25,7 +25,6 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, 
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.network import threads
-from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 
 BATCH = 512
@@ -69,7 +68,7 @@ def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callabl
 def our_path(root: Path, folder: Path) -> tuple[Callable[[], object], Callable[[], object]]:
     """A batch from the tables in memory, as LeRobot's processors give it; and the same update with it."""
     config = FitConfig(steps=10**9, batch_size=BATCH, log_freq=10**9)
-    trainer = Trainer(Sources((Dataset.open(root),)), config, folder)
+    trainer = Trainer((Dataset.open(root),), config, folder)
     updates, counter = trainer.run(), iter(range(10**9))
     return lambda: trainer.preprocessor(trainer.batch(next(counter))), lambda: next(updates)
 

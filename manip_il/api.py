@@ -27,7 +27,6 @@ from manip_il.evaluation.runner import HOLD, episode_hold
 from manip_il.evaluation.runner import evaluate as run_episodes
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.sources import Sources
 from manip_il.seeding import stream_base, stream_seeds
 from manip_il.tasks.config import EnvConfig, make_config
 
@@ -88,7 +87,7 @@ def train(
 
     opened = (datasets,) if isinstance(datasets, Dataset) else tuple(datasets)
     config = FitConfig(seed=stream_base("training", seed), **options)
-    return Checkpoint.open(Trainer(Sources(opened), config, output_dir).fit(on_log))
+    return Checkpoint.open(Trainer(opened, config, output_dir).fit(on_log))
 
 
 def dagger(

@@ -20,14 +20,12 @@ from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data.dataset import Dataset
 from manip_il.errors import UsageError
-from manip_il.learn.checkpoint import Origin
+from manip_il.learn.checkpoint import Origin, in_one_line
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork, threads
-from manip_il.learn.ppo import Learner, lent_generators
-from manip_il.learn.start import save_policy, start_conversion, start_policy
+from manip_il.learn.ppo import Learner, lent_generators, save_policy, start_conversion, start_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL, TRAINING_STATE, new_checkpoint, read_step, write_own_files
 from manip_il.learn.transitions import Transitions, read_demonstrations
-from manip_il.learn.trust import in_one_line
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 

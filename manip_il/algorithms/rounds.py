@@ -168,11 +168,10 @@ def fit_round(
 
     member: of the ensemble. on_log: sees the metrics, {} at a step without.
     """
-    from manip_il.learn.sources import Sources
     from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
 
     into = folder / (f"{POLICY}_{member}" if member else POLICY)
-    return Trainer(Sources(tuple(map(Dataset.open, roots))), fit, into, resume=True).fit(on_log)
+    return Trainer([*map(Dataset.open, roots)], fit, into, resume=True).fit(on_log)
 
 
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from manip_il import checks
-from manip_il.cli.common_options import OF_POLICY, EngineOptions, PolicyGroup, Trusting
+from manip_il.cli.common_options import EngineOptions, env_config
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile, Replacing
 from manip_il.cli.progress import progress, say
@@ -109,35 +109,27 @@ class RobotCheckOptions:
 
 
 @dataclass(frozen=True)
-class CertifyOptions(Seeded, Trusting):
-    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json and a report.
+class CertifyOptions(Seeded):
+    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json and a report."""
 
-    With --policy.path it also takes over from that policy.
-    """
-
-    example: ClassVar[str] = "manip-il robot certify --policy.path=runs/dagger --output_dir=runs/certificate"
-    first: ClassVar[str] = "policy.path robot.type task.type cases output_dir"
-    policy: PolicyGroup = field(default_factory=PolicyGroup)
-    env: Given = given(EnvConfig, **OF_POLICY)
+    example: ClassVar[str] = "manip-il robot certify --task.type=stack --output_dir=runs/certificate"
+    first: ClassVar[str] = "robot.type task.type cases output_dir"
+    env: Given = given(EnvConfig)
     cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: Output = group(Output(Path("runs/certificate")), prefix="")
 
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
-        from manip_il.cli.inputs import open_driver
         from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
-        from manip_il.evaluation.policy_folder import find_policy
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
 
-        env, *_ = open_driver(self.policy.path, "expert", self.env, trust=self.trust)
-        policy = find_policy(self.policy.path) if self.policy.path else None
-        count = count_episodes(env, self.cases, policy)
+        env = env_config(self.env)
         with self.output.open(self) as folder:
+            count = count_episodes(env, self.cases)
             with progress(count, f"certify {env.robot} {env.task}") as bar, self.engine.open() as engine:
-                last = (self.seed, policy, lambda _: bar.step())
-                certificate = certify(engine, env, self.cases, *last, trust=self.trust)
+                certificate = certify(engine, env, self.cases, self.seed, lambda _: bar.step())
             write_json(folder / FILE_NAME, certificate.to_json(), indent=None)
             certificate.report(command_line("robot certify", self), to_plain(self)).write(folder / REPORT_FILE)
         print_table(certificate.table(), empty="-")

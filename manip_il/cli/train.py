@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.option import Seeded, option
 
 if TYPE_CHECKING:  # the learner takes a second to import
-    from manip_il.learn.sources import Sources
+    from manip_il.data.dataset import Dataset
 
 RANK = "RANK"  # the variable by which processes that were started together know their place
 
@@ -27,6 +28,12 @@ class SourceGroup(Demonstrations):
     """`--dataset.*` of what is learnt from."""
 
     weights: list[float] = option(list, "share of the samples drawn from each of several; by default by its frames")
+
+    def __post_init__(self) -> None:
+        wrong = not all(0 < weight < math.inf for weight in self.weights)
+        if self.weights and (wrong or len(self.weights) != len(self.root)):
+            found = f"{self.weights} for {len(self.root)} datasets"
+            raise UsageError(f"--dataset.weights is {found}; expected a number above 0 for each")
 
 
 @dataclass(frozen=True)
@@ -60,19 +67,26 @@ class TrainOptions(Seeded, Trusting):
             set_quiet(True)
         config, folder = self.config(), self.output.output_dir
         options, _ = lerobot_options(config)  # refuses what LeRobot would, before anything is written
-        sources = self._sources(config)
-        first, weights = sources.datasets[0], None
+        datasets, weights = self._datasets(config), None
         if self.weights is not None:
+            first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
             weights = rabc_weights(
                 self.weights, episodes, getattr(options.policy, "chunk_size", None) or int(first.fps)
             )
             say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         with self.output.open(self) if writes else contextlib.nullcontext():
-            pictures = sum(len(one) * len(one.cameras) for one in sources.datasets) if config.takes_images else 0
+            pictures = sum(len(one) * len(one.cameras) for one in datasets) if config.takes_images else 0
             with progress(pictures, "decode pictures, once") as bar:
-                resume = self.output.resume
-                trainer = Trainer(sources, config, folder, resume=resume, on_frames=bar.step, weights=weights)
+                trainer = Trainer(
+                    datasets,
+                    config,
+                    folder,
+                    shares=self.dataset.weights,
+                    weights=weights,
+                    resume=self.output.resume,
+                    on_frames=bar.step,
+                )
             with Stages(f"every finished checkpoint in {folder} (one every {options.save_freq:,} steps)") as stages:
                 stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
                 path = trainer.fit(stages.log)
@@ -88,19 +102,19 @@ class TrainOptions(Seeded, Trusting):
         policy, seed = start_policy(self.fit.get("policy", {})), stream_base("training", self.seed)
         return FitConfig(**dict(self.fit, policy=policy, seed=seed, trust=self.trust))
 
-    def _sources(self, config: FitConfig) -> Sources:
+    def _datasets(self, config: FitConfig) -> list[Dataset]:
         """Return the datasets, which must agree with the first and have what the policy looks at."""
         from manip_il.cli.inputs import dataset_differences
         from manip_il.data.dataset import Dataset
         from manip_il.learn.names import PLAIN
-        from manip_il.learn.sources import Sources, check_same_sources, input_columns
+        from manip_il.learn.sources import check_same_sources, input_columns
 
-        sources = Sources(tuple(map(Dataset.open, self.dataset.root)), tuple(self.dataset.weights))
-        specs, language = [one.spec for one in sources.datasets], config.kind not in PLAIN
-        check_same_sources(sources.roots, specs, pictures=config.takes_images, language=language)
-        for one in sources.datasets:
+        datasets = [*map(Dataset.open, self.dataset.root)]
+        specs, language = [one.spec for one in datasets], config.kind not in PLAIN
+        check_same_sources(self.dataset.root, specs, pictures=config.takes_images, language=language)
+        for one in datasets:
             seen = input_columns(config, one.root, one.info)
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
             odd = [key for key in one.cameras if config.takes_images and key not in seen]
             warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
-        return sources
+        return datasets

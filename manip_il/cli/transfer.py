@@ -109,9 +109,8 @@ class ExportOptions:
 
     def run(self) -> None:
         """Export, compare, write."""
-        from manip_il.learn.checkpoint import policy_sha256
+        from manip_il.learn.checkpoint import policy_sha256, read_config
         from manip_il.learn.export import export_onnx
-        from manip_il.learn.trust import read_config
 
         self.file.check()
         path = find_policy(self.policy)

@@ -101,29 +101,6 @@ class Camera:
         found = [self._read(self.parts[which[at[0]]], wanted[at]) for at in np.split(np.arange(len(wanted)), cuts)]
         return np.concatenate(found)[places.reshape(-1)] if len(rows) else np.empty((0, *self.size, 3), np.uint8)
 
-    def decode(self, on_frames: Callable[[int], None] | None = None) -> NDArray[np.uint8]:
-        """Return all pictures, decoded by a thread a core, channels before pixels: (N, 3, height, width).
-
-        They are in a nameless file of the temporary folder, mapped into memory, and go with the array. on_frames: is
-        called with the number of frames decoded since the last call. Raises `ManipError` if there is no room.
-        """
-        shape = self.frames, 3, *self.size
-        with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
-            os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # else a full disk ends the process
-            decoded = np.memmap(file, np.uint8, "r+", shape=shape)
-
-        def fill(rows: I64) -> int:
-            decoded[rows[0] : rows[-1] + 1] = self.rows(rows).transpose(0, 3, 1, 2)
-            return len(rows)
-
-        step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
-        pieces = np.split(np.arange(self.frames), range(step, self.frames, step))
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
-            for count in threads.map(fill, pieces):
-                if on_frames is not None:
-                    on_frames(count)
-        return decoded
-
     def _read(self, part: Part, rows: I64) -> Pictures:
         """Consecutive rows of one part."""
         path, first = self.root / part.path, part.first + int(rows[0]) - part.row
@@ -139,6 +116,33 @@ class Camera:
             what, found = f"shape of {self.key}", pictures.shape[1:]
             raise MismatchError(what, f"frame {rows[0]}", found, f"info.json of {self.root}", (*self.size, 3))
         return pictures
+
+
+def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None) -> NDArray[np.uint8]:
+    """Return all pictures of cameras, decoded by a thread a core, channels before pixels: (N, 3, height, width).
+
+    They are in a nameless file of the temporary folder, mapped into memory, and go with the array. on_frames: is called
+    with the number of frames decoded since the last call. Raises `ManipError` if there is no room.
+    """
+    shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
+    with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
+        os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # else a full disk ends the process
+        decoded = np.memmap(file, np.uint8, "r+", shape=shape)
+
+    def fill(camera: Camera, start: int, rows: I64) -> int:
+        decoded[start + rows[0] : start + rows[-1] + 1] = camera.rows(rows).transpose(0, 3, 1, 2)
+        return len(rows)
+
+    step, start, pieces = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:])), 0, list[tuple[Camera, int, I64]]()
+    for camera in cameras:
+        rows = np.split(np.arange(camera.frames), range(step, camera.frames, step))
+        pieces += [(camera, start, piece) for piece in rows]
+        start += camera.frames
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+        for count in threads.map(fill, *zip(*pieces, strict=True)):
+            if on_frames is not None:
+                on_frames(count)
+    return decoded
 
 
 def decode_picture(content: bytes | None) -> Pictures:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +25,12 @@ class JoinedDatasets:
     features: LeRobot's table of the columns and cameras that all have in one shape, without depth. stats: of all their
     frames, each counted once; the cameras' are ImageNet's, as `lerobot-train` takes them. tasks: each text once.
 
-    Raises `ManipError` for a folder that is no dataset, `MismatchError` for several of different rates or columns to
-    learn from.
+    Raises `MismatchError` for several of different rates or columns to learn from.
     """
 
-    def __init__(self, roots: Sequence[Path]):
-        self.datasets = tuple(Dataset.open(root) for root in roots)
-        self.roots, first = tuple(roots), self.datasets[0]
+    def __init__(self, datasets: Sequence[Dataset]):
+        self.datasets, first = tuple(datasets), datasets[0]
+        self.roots = tuple(one.root for one in datasets)
         for other in self.datasets[1:]:  # the rate, and the columns that are learnt from, are the same
             pairs = {"rate": (first.fps, other.fps)}
             pairs |= {f"column {key}": (_shape(first, key) or "none", _shape(other, key) or "none") for key in LEARNT}

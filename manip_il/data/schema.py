@@ -38,6 +38,7 @@ LEROBOT_TYPES = {"so_follower": "so101"}  # robots of another name here, by thei
 VERSION = 2  # of these columns and what they mean: 2 has progress, whole states and named phases
 MOST_FPS = 10_000  # control steps a second
 _LARGEST_SIZE = 1_000_000  # of a state [numbers] or a side of a picture [pixels]
+MUST_AGREE = ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning")
 _MAY_LACK = ("object", "robot_type", "video", "keypoints")  # of a spec as JSON
 
 
@@ -154,14 +155,13 @@ def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
     return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
 
 
-def check_same_spec(
-    left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec, also: Sequence[str] = ()
-) -> None:
+def check_same_spec(left_name: str, left: Any, right_name: str, right: RobotTaskSpec, also: Sequence[str] = ()) -> None:
     """Raise `MismatchError` unless actions and observations mean the same on both sides.
 
-    The task may differ: a policy may be tried on another one. also: other fields that must agree.
+    The task may differ: a policy may be tried on another one. left: a spec, or what has its fields. also: other fields
+    that must agree.
     """
-    for what in ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning", *also):
+    for what in (*MUST_AGREE, *also):
         ours, theirs = getattr(left, what), getattr(right, what)
         if ours != theirs:
             none = OWN_OBJECT if what == "object" else "none"

@@ -15,23 +15,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_fingerprint
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.query import Query
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.errors import ManipError
 from manip_il.evaluation.figures import Bar, rates_figure
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, EXPERT, INTERVAL, Table
-from manip_il.mdp import Actor, Episode
+from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, INTERVAL, Table
+from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import Perturbation, kinds_for
@@ -40,8 +37,8 @@ from manip_il.tasks.table import get_task
 
 FILE_NAME = "certificate.json"
 NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
-Group = Literal["start", "state", "action", "learner"]
-_COLOURS: dict[Group, str] = {"start": EXPERT, "state": DAGGER, "action": CLONING, "learner": BASELINE}
+Group = Literal["start", "state", "action"]
+_COLOURS: dict[Group, str] = {"start": EXPERT, "state": DAGGER, "action": CLONING}
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +59,7 @@ class Case:
 class Row:
     """The cases of one kind. kind, words: short and in full; horizon: [control steps].
 
-    left_out: episodes that give no case, as the perturbation found no place or changed nothing, or the task was solved
-    before its moment.
+    left_out: episodes that give no case, as the perturbation found no place or changed nothing.
     """
 
     group: Group
@@ -102,13 +98,11 @@ class Row:
 class Certificate:
     """Recoverability of the expert on one robot and task, one row a kind.
 
-    policy: from whose visited states the expert went on, too; None for none. settings: cases of each kind, seed,
-    horizon [control steps], control_hz, tolerance [m] and success_steps of the runs.
+    settings: cases of each kind, and seed, horizon [control steps], rate, tolerance [m] and success_steps of the runs.
     """
 
     robot: str
     task: str
-    policy: str | None
     fingerprint: Mapping[str, Any]
     settings: Mapping[str, Any]
     rows: tuple[Row, ...]
@@ -130,14 +124,14 @@ class Certificate:
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `certificate.json`."""
-        content = {"robot": self.robot, "task": self.task, "policy": self.policy, "fingerprint": dict(self.fingerprint)}
+        content = {"robot": self.robot, "task": self.task, "fingerprint": dict(self.fingerprint)}
         content |= {"settings": dict(self.settings), "confidence": CONFIDENCE, "mu": self.mu}
         return content | {"rows": [row.to_json() for row in self._with_pooled]}
 
     @property
     def _with_pooled(self) -> tuple[Row, ...]:
         states, actions = self.pooled("state", "all changed states"), self.pooled("action", "all wrong actions")
-        return (*self.of("start"), *self.of("state"), states, *self.of("action"), actions, *self.of("learner"))
+        return (*self.of("start"), *self.of("state"), states, *self.of("action"), actions)
 
     def table(self) -> Table:
         """Return a row a kind: how often and how fast the expert recovers, and what a wrong action costs."""
@@ -145,28 +139,17 @@ class Certificate:
         for row in self._with_pooled:
             steps = "" if row.mean_steps is None else f"{row.mean_steps:.1f}"
             gaps = row.gaps if row.group == "action" else []
-            # a percentile that was seen, the one above if it falls between two
-            p95 = np.percentile(gaps, 95, method="higher") if gaps else None
-            costs = ("", "", "") if p95 is None else (f"{np.mean(gaps):.1f}", f"{p95:.0f}", str(max(gaps)))
+            costs = (f"{np.mean(gaps):.1f}", str(max(gaps))) if gaps else ("", "")
             rows.append((row.words, str(row.success or ""), steps, *costs, str(len(row.cases)), str(row.left_out)))
-        head = ("the expert continues from", f"solved {INTERVAL}", "mean steps", "mean cost", "95 % cost at most")
+        head = ("the expert continues from", f"solved {INTERVAL}", "mean steps", "mean cost", "largest cost")
         colours = tuple(_COLOURS[row.group] for row in self._with_pooled)
-        return Table((*head, "largest cost", "cases", "left out"), tuple(rows), colours)
+        return Table((*head, "cases", "left out"), tuple(rows), colours)
 
     def facts(self) -> list[str]:
-        """Return sentences on the largest cost, and on the learner's states."""
-        lines: list[str] = []
-        if self.mu is not None:
-            # exact for independent draws, none of which cost more
-            above = 1 - (1 - CONFIDENCE) ** (1 / len(self.pooled("action").gaps))
-            lines.append(
-                f"mu (the u of Ross et al. 2011) is at least {self._in_seconds(self.mu)}; with {CONFIDENCE:.0%} "
-                f"confidence, at most {above:.1%} of such actions cost more."
-            )
-        for row in self.of("learner"):
-            count = row.left_out + len(row.cases)
-            lines.append(f"The policy had solved {row.left_out} of {count} before the expert's turn.")
-        return lines
+        """Return a sentence on the largest cost, if there is one."""
+        if self.mu is None:
+            return []
+        return [f"mu (the u of Ross et al. 2011) is at least {self._in_seconds(self.mu)}."]
 
     def report(self, command: str, config: Mapping[str, Any]) -> Report:
         """Return the page."""
@@ -193,9 +176,9 @@ class Certificate:
         return f"{steps} steps ({steps / self.settings['control_hz']:.3g} s)"
 
 
-def count_episodes(env: EnvConfig, cases: int, policy: Path | None = None) -> int:
+def count_episodes(env: EnvConfig, cases: int) -> int:
     """Return how many episodes `certify` runs at most."""
-    return cases * (2 + len(kinds_for(get_task(env.task))) + (policy is not None))
+    return cases * (2 + len(kinds_for(get_task(env.task))))
 
 
 def certify(
@@ -203,16 +186,12 @@ def certify(
     env: EnvConfig,
     cases: int,
     seed: int = 0,
-    policy: Path | None = None,
     on_episode: Callable[[Episode], object] = lambda _: None,
-    *,
-    trust: bool = False,
 ) -> Certificate:
     """Measure the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
 
     A perturbation happens at a step drawn evenly from those that the undisturbed run takes until the task is solved;
-    the expert then has a whole horizon. policy: the expert goes on from states that this one visits, too, at a drawn
-    step of a horizon; trust: see `LearnedPolicy.load`. on_episode: sees every episode as it ends.
+    the expert then has a whole horizon. on_episode: sees every episode as it ends.
     """
     seeds = stream_seeds("certificate", cases, seed)
 
@@ -247,16 +226,9 @@ def certify(
     job = RolloutJob(env, hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
     noisy = [_case(episode, 0, env.horizon) for episode in rollouts(job)]
     rows.append(row("start", "noise", f"{NOISE:.0%} noise on every action", noisy))
-    if policy is not None:
-        driver = PolicyDriver((policy,), trust=trust)
-        job = RolloutJob(env, driver, hold=0, label="takeover", query=Query("one"))
-        taken = ((one, np.flatnonzero(one.columns[schema.ACTOR].ravel() == Actor.EXPERT)) for one in rollouts(job))
-        # else the learner solved it before
-        found = [_case(episode, int(steps[0]), env.horizon) for episode, steps in taken if steps.size]
-        rows.append(row("learner", "learner", "states that the policy visited", found))
     settings = {"cases": cases, "seed": seed}
     settings |= {name: getattr(env, name) for name in ("horizon", "control_hz", "tolerance", "success_steps")}
-    return Certificate(env.robot, env.task, policy and str(policy), env_fingerprint(env), settings, tuple(rows))
+    return Certificate(env.robot, env.task, env_fingerprint(env), settings, tuple(rows))
 
 
 def draw_moment(seed: int, kind: str, steps: int) -> int:

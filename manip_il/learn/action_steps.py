@@ -23,8 +23,8 @@ from lerobot.processor import (
 from manip_il.data.schema import STATE
 from manip_il.errors import ManipError
 from manip_il.learn.action_spaces import Conversion
+from manip_il.learn.checkpoint import DECODER, MEASURED
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET, OWN_SPACE
-from manip_il.learn.trust import DECODER, MEASURED
 
 Pipeline = PolicyProcessorPipeline[Any, Any]
 _NORMALISER = "normalizer_processor"

@@ -1,34 +1,37 @@
-"""A `pretrained_model` folder, opened once and checked before anything in it is loaded."""
+"""A `pretrained_model` folder, which is data from anywhere: opened once and checked before anything in it is loaded.
+
+LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
+`trust_remote_code`, which runs Python from the named repository. Policies that are built from their own configuration
+and weights alone are listed in `PLAIN`, the steps of their processors in `_STEPS`; all others need `--trust=true`.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, OWN_OBJECT, STATE, RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE
-from manip_il.learn.trust import CONFIG, DECODER, LARGEST_JSON, processor_steps, read_config, require_trust
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, RobotTaskSpec, check_same_spec
+from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 from manip_il.sim.config import CameraConfig, Look
 
-META_FILE = "manip_il.json"
+CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
+MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that carry an action space
+LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
+_STEPS = (  # of LeRobot's default processors, and ours: they load nothing
+    *("rename_observations_processor", "to_batch_processor", "device_processor"),
+    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
+)
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 _PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
 _MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled")
-_MUST_AGREE = {
-    "robot": "robot",
-    "fps": "control rate [1/s]",
-    "joint_names": "joint names",
-    "object": "object",
-    "environment_state_names": "environment state",
-    "action_meaning": "meaning of the action",
-}
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Origin:
         """Return the origin of a policy trained on data of `spec`. more: `datasets` and `action_space`."""
         pictured = observation != "state"
         return cls(
-            **{name: getattr(spec, name) for name in ("task", *_MUST_AGREE)},
+            **{name: getattr(spec, name) for name in ("task", *MUST_AGREE)},
             fingerprint=dict(fingerprint or {}),
             options=dict(options or {}),
             observation=observation,
@@ -91,16 +94,10 @@ class Origin:
 
     def check_fits(self, spec: RobotTaskSpec) -> None:
         """Raise `MismatchError` naming both sides unless the policy's numbers mean what `spec`'s do."""
-        for name, what in _MUST_AGREE.items():
-            if name == "environment_state_names" and self.observation == "images":
-                continue  # it does not look at it
-            ours, theirs = getattr(self, name), getattr(spec, name)
-            if name == "object":
-                ours, theirs = ours or OWN_OBJECT, theirs or OWN_OBJECT
-            if name == "environment_state_names" and ours != theirs and self.task != spec.task:
-                raise MismatchError("task", "the policy", self.task, "the environment", spec.task)
-            if ours != theirs:
-                raise MismatchError(what, "the policy", ours, f"{spec.robot}/{spec.task}", theirs)
+        names, seen = spec.environment_state_names, self.observation != "images"
+        other_task = seen and self.environment_state_names != names and self.task != spec.task
+        ours = self if seen and not other_task else replace(self, environment_state_names=names)
+        check_same_spec("the policy", ours, f"{spec.robot}/{spec.task}", spec, ("task",) if other_task else ())
 
 
 def read_origin(path: Path) -> Origin | None:
@@ -124,7 +121,7 @@ class Checkpoint:
 
     numbers: column -> how many; pictures: camera -> (height, width) [pixels]; action: how many numbers. space: the
     action space it has learnt in; robot: whose hand moves, for `ee_delta` alone. origin: None if another program
-    wrote it. processors: steps by file, each `registry_name`, `config` and perhaps `state_file`.
+    wrote it. processors: steps by file, each `registry_name` and `config`.
     """
 
     path: Path
@@ -141,7 +138,7 @@ class Checkpoint:
     def open(cls, path: Path) -> Checkpoint:
         """Read and check a folder's files, but for its weights.
 
-        Raises `ManipError` for a folder that is not whole, holds a pickle, or asks to import code by its path.
+        Raises `ManipError` for a folder that is not whole or asks to import code by its path.
         """
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
@@ -226,19 +223,16 @@ def policy_sha256(policy: Path) -> str:
 def policy_cameras(policy: Path) -> CameraConfig | None:
     """Return cameras, size and light of the pictures that a checkpoint was trained with; None for one without.
 
-    The light is the default if the checkpoint does not say. Raises `ManipError` for cameras that environments do not
-    have, and for a folder or a size that cannot be.
+    The light is the default if the checkpoint does not say. Raises `UsageError` for cameras that environments do not
+    have, and for a size that cannot be.
     """
     checkpoint = Checkpoint.open(policy)
     pictures, origin = checkpoint.pictures, checkpoint.origin
     if not pictures:
         return None
     in_order = origin.cameras if origin is not None and set(origin.cameras) == set(pictures) else tuple(pictures)
-    try:
-        size = next(iter(pictures.values()))
-        return CameraConfig(in_order, *size, Look(**(origin.look or {}) if origin else {}))
-    except (UsageError, TypeError) as error:
-        raise ManipError(f"{policy}: its pictures cannot be rendered ({error}); see its {META_FILE}") from error
+    look = origin.look if origin is not None else None
+    return CameraConfig(in_order, *next(iter(pictures.values())), Look(**(look or {})))
 
 
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -254,3 +248,65 @@ def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tup
     if space not in ACTION_SPACES:
         raise UnknownName("action space", checks.shorten(space), ACTION_SPACES)
     return space, str(options.get("robot", ""))
+
+
+@contextmanager
+def in_one_line(what: str) -> Iterator[None]:
+    """Turn errors of every kind, which others' code raises for files from anywhere, into `ManipError`: `what: ...`."""
+    try:
+        yield
+    except ManipError:
+        raise
+    except Exception as error:
+        raise ManipError(f"{what}: {type(error).__name__}: {checks.one_line(error)}") from error
+
+
+def require_trust(
+    settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
+) -> None:
+    """Raise `ManipError` unless a policy loads nothing by name, or `trust` is given; names what may be loaded.
+
+    settings: its options with `type`, as `config.json` has them. source: of them, for the message. steps: of its
+    processors.
+    """
+    kind, named = settings["type"], list[Any]()
+    if kind not in PLAIN or settings.get("vision_encoder_name"):
+        named += [value for name, value in settings.items() if "name" in name or "path" in name]
+    for step in steps:
+        if step["registry_name"] not in _STEPS:
+            named += [step["registry_name"], *step["config"].values()]
+    texts = sorted({value for value in named if isinstance(value, str)})
+    if (kind not in PLAIN or texts) and not trust:
+        raise ManipError(
+            f"{source} is a policy of type {kind!r} that would load what it names ({checks.shorten(texts)}): this "
+            "fetches files and may run code that comes with them; if you trust its source, add --trust=true"
+        )
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Return the `config.json` of a folder that is whole; else raise `ManipError`."""
+    if not (path / CONFIG).is_file():
+        raise ManipError(f"no {CONFIG} in {path}; expected LeRobot's pretrained_model folder")
+    if not (path / WEIGHTS).is_file():
+        raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
+    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json", LARGEST_JSON)
+    if not isinstance(config.get("type"), str):
+        raise ManipError(f"{path / CONFIG} is not a LeRobot policy's: it names no type")
+    return config
+
+
+def processor_steps(path: Path) -> list[dict[str, Any]]:
+    """Return the steps that a processor's file names, each `registry_name` and `config`.
+
+    Refuses a step by import path, as LeRobot would import and call whatever a downloaded file names.
+    """
+    values = checks.read_json(path, "a processor of LeRobot's", LARGEST_JSON)
+    try:
+        if odd := next((step for step in values["steps"] if "registry_name" not in step), None):
+            raise ManipError(f"it asks to run {checks.shorten(odd.get('class'))}; only registered steps are loaded")
+        return [
+            {"registry_name": str(step["registry_name"]), "config": checks.mapping("config", step.get("config", {}))}
+            for step in values["steps"]
+        ]
+    except (ManipError, KeyError, TypeError, AttributeError) as error:
+        raise ManipError(f"{path} cannot be read: {checks.one_line(error)}") from error

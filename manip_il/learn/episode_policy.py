@@ -24,7 +24,7 @@ from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
 
-from manip_il.learn.trust import in_one_line
+from manip_il.learn.checkpoint import in_one_line
 
 Batch = dict[str, Any]
 ROWS = 25  # of the episodes that run in lockstep, whose numbers follow each other: each has a row to itself

@@ -24,10 +24,10 @@ from manip_il.checks import mapping, shorten
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
+from manip_il.learn.checkpoint import CONFIG
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.trust import CONFIG
 
 TOLERANCE = 1e-5  # [rad] or [m], between the file's actions and the checkpoint's
 _OPSET = 17

@@ -22,10 +22,9 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from manip_il.data.schema import ACTION, JOINT_TARGETS, OPENINGS
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.checkpoint import Checkpoint, require_trust
 from manip_il.learn.fit_config import FitConfig, check_convertible
 from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
-from manip_il.learn.trust import require_trust
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
 # Where a policy's configuration is kept with what was meant for one machine or one command.

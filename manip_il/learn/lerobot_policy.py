@@ -18,11 +18,10 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from manip_il.data.schema import IMAGES
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.action_steps import add_steps  # known here, they are known to what is loaded
-from manip_il.learn.checkpoint import PROCESSORS, Checkpoint
+from manip_il.learn.checkpoint import MEASURED, PROCESSORS, Checkpoint, in_one_line
 from manip_il.learn.lerobot_config import policy_class
 from manip_il.learn.names import MLP
 from manip_il.learn.network import warm_start
-from manip_il.learn.trust import MEASURED, in_one_line
 
 _DEVICE_STEP = "device_processor"
 _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all of the data is noise, not scale

@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import ARM, GRIPPER
+from manip_il.learn.checkpoint import WEIGHTS
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
-from manip_il.learn.trust import WEIGHTS
 from manip_il.option import check_bounds, option
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always

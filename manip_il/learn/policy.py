@@ -15,10 +15,9 @@ from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
-from manip_il.learn.trust import CONFIG
 from manip_il.mdp import F32, F64, Images
 
 if TYPE_CHECKING:  # it imports LeRobot, which takes seconds

@@ -1,5 +1,7 @@
 """Proximal policy optimisation of the `mlp` policy's network, with a critic of its own, by stable-baselines3's `PPO`.
 
+The actor is new, or a clone's network with a spread of its own.
+
 Schulman et al., Proximal policy optimization algorithms, 2017. An iteration is one rollout of whole episodes that all
 begin and end together, so that what is between two iterations is weights and the optimiser's state alone, and these
 are saved as safetensors and JSON.
@@ -18,6 +20,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
+from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import CallbackList
@@ -27,13 +30,22 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from manip_il.errors import NotFiniteError, UsageError
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE, RobotTaskSpec, features
+from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.action_spaces import Conversion, conversion_for
+from manip_il.learn.action_steps import add_steps, is_in_processors
 from manip_il.learn.adversarial_config import PPOConfig
+from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import MIN_LOG_STD, GaussianHead, floored_log_std
-from manip_il.learn.network import MLPNetwork
+from manip_il.learn.mlp import MLPConfig, MLPPolicy
+from manip_il.learn.names import EE_DELTA, MLP
+from manip_il.learn.network import MLPNetwork, fit_statistics, read_weights
 from manip_il.learn.transitions import F32, Transitions
 
 EXTRA = 2  # numbers of an observation behind the policy's inputs: flag of the absorbing state, share of time gone
+_GAUSSIAN = "gaussian"
+_CENTRED = ("mse", "l1", _GAUSSIAN)  # losses whose outputs are the mean of an action
 LAST_LR = 0.05  # share of the first learning rate that is left at the end
 _METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/explained_variance": "explained_variance"}
 
@@ -178,10 +190,7 @@ class Learner:
         """Take an iteration's gradient steps on what `collect` ran; rewards: (N,) in its order. Returns metrics.
 
         actor: whether it moves, beside the critic. remaining: share of the run, with which the learning rate falls.
-        Raises `NotFiniteError` for a reward that is not finite.
         """
-        if not np.isfinite(rewards).all():
-            raise NotFiniteError(f"a reward is {rewards[~np.isfinite(rewards)][0]}; expected finite numbers")
         buffer = self.ppo.rollout_buffer
         buffer.rewards[:] = rewards.reshape(buffer.rewards.shape)
         ends = np.ones(buffer.n_envs, dtype=bool)
@@ -243,3 +252,56 @@ def lent_generators(seed: int) -> Generator[None]:
             yield
         finally:
             np.random.set_state(before)  # noqa: NPY002
+
+
+def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec) -> Conversion:
+    """Return the way to the actor's actions: in the clone's space, else in `space`, by default that of the hand.
+
+    Raises `UsageError` for a `start` that cannot be gone on from, `MismatchError` for one for other data, and what
+    `conversion_for` raises.
+    """
+    if start is None:
+        return conversion_for(space or EE_DELTA, spec)
+    checkpoint = Checkpoint.open(start)
+    if checkpoint.kind != MLP:
+        raise UsageError(
+            f"{start} is a policy of type {checkpoint.kind!r}; expected an mlp, whose actions have a density"
+        )
+    if (loss := checkpoint.config["loss"]) not in _CENTRED:
+        raise UsageError(f"{start} was trained with loss {loss!r}; expected one of {', '.join(_CENTRED)}")
+    checkpoint.check_fits(spec)
+    if space not in (None, checkpoint.space):
+        raise MismatchError("action space", str(start), checkpoint.space, "--action_space", space)
+    return conversion_for(checkpoint.space, spec)
+
+
+def start_policy(start: Path | None, space: str, spec: RobotTaskSpec, rows: tuple[F32, F32] | None) -> MLPPolicy:
+    """Return an mlp with a Gaussian's loss. rows: raw inputs (N, d) and targets (N, n), which give a new one its units.
+
+    A clone keeps its own units, and acts as it did. Weights are drawn from torch's global generator.
+    """
+    options = (None if start is None else Checkpoint.open(start).mlp_options) or {}
+    options |= {"loss": _GAUSSIAN, "action_space": space}
+    config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
+    inputs = [STATE, *([ENVIRONMENT_STATE] if spec.environment_state_names else [])]
+    config.input_features, config.output_features = policy_features(features(spec), inputs)
+    policy = MLPPolicy(config)
+    if start is not None:
+        policy.model.load_state_dict({**policy.model.state_dict(), **read_weights(start)})
+    elif rows is not None:
+        inputs = policy.model.expanded(torch.from_numpy(rows[0])).numpy()
+        policy.model.set_statistics(fit_statistics(inputs, rows[1], _GAUSSIAN))
+    else:
+        raise UsageError("no demonstrations and no policy to begin with; give --dataset.root=DIR or --init=RUN")
+    return policy
+
+
+def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:
+    """Write configuration, weights and processors of an mlp to a new folder, as LeRobot has them."""
+    folder.mkdir()
+    policy.save_pretrained(folder)
+    processors = make_pre_post_processors(policy.config)
+    if is_in_processors(policy.config.type, conversion):
+        add_steps(*processors, conversion)
+    for processor in processors:
+        processor.save_pretrained(folder)

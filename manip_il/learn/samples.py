@@ -17,13 +17,14 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
-from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.camera import decode
+from manip_il.data.dataset import joined_columns
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP
 from manip_il.data.schema import ACTION, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.trust import in_one_line
+from manip_il.learn.checkpoint import in_one_line
 from manip_il.mdp import require_finite
 
 I64 = NDArray[np.int64]
@@ -85,32 +86,6 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
     return Windows(episodes, {key: np.asarray(one, np.int64) for key, one in wanted.items() if one is not None})
 
 
-class Pictures:
-    """The decoded pictures of several datasets as one array (N, 3, H, W) of which rows are read."""
-
-    def __init__(self, pieces: Sequence[NDArray[np.uint8]]):
-        self._pieces = pieces
-        self._ends = np.cumsum([len(piece) for piece in pieces])
-
-    @classmethod
-    def decode(
-        cls, datasets: Sequence[Dataset], camera: str, on_frames: Callable[[int], None] | None = None
-    ) -> Pictures:
-        """Decode one camera of datasets. on_frames: sees how many frames more have been decoded."""
-        return cls([dataset.camera(camera).decode(on_frames) for dataset in datasets])
-
-    def __getitem__(self, rows: torch.Tensor) -> torch.Tensor:
-        if len(self._pieces) == 1:
-            return torch.from_numpy(self._pieces[0][rows.numpy()])
-        flat = rows.numpy().reshape(-1)
-        read = np.empty((len(flat), *self._pieces[0].shape[1:]), np.uint8)
-        which = np.searchsorted(self._ends, flat, side="right")
-        for number in np.unique(which):
-            start = self._ends[number - 1] if number else 0
-            read[which == number] = self._pieces[number][flat[which == number] - start]
-        return torch.from_numpy(read.reshape(*rows.shape, *read.shape[1:]))
-
-
 @dataclass(frozen=True)
 class Samples:
     """A batch is one gather a column.
@@ -121,15 +96,16 @@ class Samples:
 
     windows: Windows
     columns: dict[str, torch.Tensor]
-    pictures: dict[str, Pictures]
+    pictures: dict[str, NDArray[np.uint8]]
     tasks: NDArray[np.object_]
 
     def batch(self, samples: I64) -> Batch:
         """Return the batch of these samples, (B,); pictures are uint8."""
         batch: Batch = {}
-        for key, values in (self.columns | self.pictures).items():
+        for key in (*self.columns, *self.pictures):
             rows, padded = self.windows.rows(samples, key)
-            batch[key] = values[torch.from_numpy(rows)]
+            pictured = key in self.pictures
+            batch[key] = torch.from_numpy(self.pictures[key][rows]) if pictured else self.columns[key][rows]
             batch |= padded
         batch[TASK] = self.tasks[batch[TASK_INDEX].numpy()].tolist()
         return batch
@@ -179,7 +155,7 @@ def load_data(
     return TrainingData(
         windows,
         {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)},
-        {key: Pictures.decode(meta.datasets, key, on_frames) for key in cameras},
+        {key: decode([one.camera(key) for one in meta.datasets], on_frames) for key in cameras},
         np.array(meta.tasks, object),
         train=usable[train],
         held_out=usable[held_out],

@@ -6,10 +6,7 @@ weights are then free to change without changing the units in which a policy see
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,65 +16,25 @@ from numpy.typing import NDArray
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.info import Info
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec, check_same_spec
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import CNN
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Datasets in the order in which their frames are numbered.
+def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64) -> F64:
+    """Return how often each of the rows (S,) that are drawn from is drawn, relative to the others, (S,).
 
-    weights: the share of the samples drawn from each, relative to the others; none if every frame is drawn alike.
-    Raises `UsageError` for a dataset that is given twice, and for weights that do not fit them.
+    shares: of the samples drawn from each dataset, relative to the others. rows: numbers of frames through all
+    datasets. Raises `ManipError` for a dataset without any row.
     """
-
-    datasets: tuple[Dataset, ...]
-    weights: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        count, roots = len(self.weights), len(self.roots)
-        if not roots or len({root.resolve() for root in self.roots}) < roots:
-            raise UsageError("--dataset.root names no dataset, or one twice; expected folders, and --dataset.weights")
-        if self.weights and count != roots:
-            raise UsageError(f"--dataset.weights has {count} numbers, --dataset.root {roots} datasets")
-        if not all(0 < weight < math.inf for weight in self.weights):
-            raise UsageError(f"--dataset.weights is {list(self.weights)}; expected more than 0 for each")
-
-    @cached_property
-    def roots(self) -> tuple[Path, ...]:
-        """The datasets' folders."""
-        return tuple(dataset.root for dataset in self.datasets)
-
-    @property
-    def spec(self) -> RobotTaskSpec:
-        """The first dataset's spec, with which the others agree."""
-        return self.datasets[0].spec
-
-    def row_weights(self, rows: I64) -> F64 | None:
-        """Return how often each of the rows (S,) that are drawn from is drawn, relative to the others, (S,).
-
-        rows: numbers of frames through all datasets. None if all are alike. Raises `ManipError` for a dataset
-        without any row.
-        """
-        if not self.weights:
-            return None
-        which = np.searchsorted(np.cumsum([*map(len, self.datasets)]), rows, side="right")
-        counts = np.bincount(which, minlength=len(self.datasets))
-        if (counts == 0).any():
-            empty = self.roots[int(np.argmin(counts))]
-            raise ManipError(f"{empty} has no sample to learn from, but a weight; leave it out, or hold out less of it")
-        return (np.asarray(self.weights) / counts)[which]
-
-    def to_json(self) -> list[dict[str, Any]]:
-        """Return name, frames and weight (None: by frames) of every dataset."""
-        weights = self.weights or (None,) * len(self.datasets)
-        return [
-            {"name": one.root.resolve().name, "frames": len(one), "weight": weight}
-            for one, weight in zip(self.datasets, weights, strict=True)
-        ]
+    which = np.searchsorted(np.cumsum([*map(len, datasets)]), rows, side="right")
+    counts = np.bincount(which, minlength=len(datasets))
+    if (counts == 0).any():
+        empty = datasets[int(np.argmin(counts))].root
+        raise ManipError(f"{empty} has no sample to learn from, but a weight; leave it out, or hold out less of it")
+    return (np.asarray(shares) / counts)[which]
 
 
 def check_same_sources(

@@ -10,7 +10,7 @@ import copy
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,24 +23,26 @@ from accelerate.utils import DistributedDataParallelKwargs
 from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
+from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.scripts.lerobot_train import update_policy
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
+from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
-from manip_il.errors import NotFiniteError, UsageError
+from manip_il.errors import NotFiniteError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Augment, Order, generator_of, pictures_to_float
-from manip_il.learn.checkpoint import Checkpoint, Origin
+from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
 from manip_il.learn.names import OWN_SPACE
 from manip_il.learn.network import threads
 from manip_il.learn.samples import I64, Batch, load_data
-from manip_il.learn.sources import Sources, input_columns, recorded_look
+from manip_il.learn.sources import input_columns, recorded_look, row_weights
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
     Writer,
@@ -50,7 +52,6 @@ from manip_il.learn.training_state import (
     read_step,
     write_own_files,
 )
-from manip_il.learn.trust import in_one_line
 
 _METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # that LeRobot's update fills in
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
@@ -59,10 +60,10 @@ _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 class Trainer:
     """Policy, processors, optimiser and data of one run that clones the labels of datasets.
 
-    weights: how often each frame is drawn, relative to the others, (N,); by default each once an epoch, or as `sources`
-    has it. on_frames: sees how many pictures more have been decoded. On one CPU the same data, config and threads give
-    the same bits, resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size`
-    samples a step.
+    shares: of the samples drawn from each dataset. weights: how often each frame is drawn, relative to the others,
+    (N,); without either, each once an epoch. on_frames: sees how many pictures more have been decoded. On one CPU the
+    same data, config and threads give the same bits, resumed or not. Started by `accelerate launch` or `torchrun`,
+    every process takes `batch_size` samples a step.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data that is not
     finite, and what the policy refuses as `ManipError`.
@@ -70,15 +71,16 @@ class Trainer:
 
     def __init__(
         self,
-        sources: Sources,
+        datasets: Sequence[Dataset],
         config: FitConfig,
         output_dir: Path,
         *,
+        shares: Sequence[float] = (),
         resume: bool = False,
         on_frames: Callable[[int], None] | None = None,
         weights: NDArray[np.float64] | None = None,
     ):
-        first, spec = sources.datasets[0], sources.spec
+        first, spec = datasets[0], datasets[0].spec
         self.config, self.output_dir = config, output_dir
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
         assert self.pipeline.policy is not None
@@ -88,7 +90,7 @@ class Trainer:
         self.accelerator = _accelerator(policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
         checkpoint = last_checkpoint(output_dir, resume=resume)
-        self.meta: Any = JoinedDatasets(sources.roots)
+        self.meta: Any = JoinedDatasets(datasets)
         set_features(policy, self.meta.features, input_columns(config, first.root, first.info), config.observes)
         self.data = load_data(
             policy,
@@ -99,7 +101,8 @@ class Trainer:
             on_frames=on_frames,
         )
         self.meta.table = self.data.table
-        drawn = weights[self.data.train] if weights is not None else sources.row_weights(self.data.train)
+        drawn = row_weights(datasets, shares, self.data.train) if shares else None
+        drawn = drawn if weights is None else weights[self.data.train]
         self._augment = Augment() if config.augments else None
         options = {"eval_split": config.eval_split, "augment": asdict(self._augment) if self._augment else None}
         self.origin = Origin.of(
@@ -108,10 +111,13 @@ class Trainer:
             options,
             config.observes,
             recorded_look(first.provenance, first.fingerprint),
-            datasets=sources.to_json(),
+            datasets=[
+                {"name": one.root.resolve().name, "frames": len(one), "weight": share}
+                for one, share in zip(datasets, shares or [None] * len(datasets), strict=True)
+            ],
             action_space=space,
         )
-        self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(sources.roots[-1])))
+        self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(datasets[-1].root)))
         self.pipeline.output_dir = output_dir
         self.steps, self.batch_size, self.step = self.pipeline.steps, self.pipeline.batch_size, 0
         with threads(config.threads):
@@ -123,12 +129,7 @@ class Trainer:
         set_seed(self.config.seed)
         before = checkpoint / PRETRAINED_MODEL if checkpoint is not None else None
         policy = build_policy(config, self.meta, before)
-        preset, schedule = self.pipeline.optimizer, self.pipeline.scheduler
-        assert preset is not None
-        optimizer = preset.build(policy.get_optim_params())
-        if not isinstance(optimizer, torch.optim.Optimizer):
-            raise UsageError(f"--policy.type={config.type} needs several optimisers; train it with lerobot-train")
-        scheduler = schedule.build(optimizer, self.steps) if schedule is not None else None
+        optimizer, scheduler = make_optimizer_and_scheduler(self.pipeline, policy)
         if before is None or checkpoint is None:
             self.preprocessor, self.postprocessor = build_processors(config, self.meta, self._conversion)
         else:

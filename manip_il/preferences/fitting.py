@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.evaluation.intervals import Proportion
-from manip_il.learn.reward import RewardShape
-from manip_il.learn.reward_fit import Compared, Fit, fit_reward
+from manip_il.learn.reward import Compared, Fit, RewardShape, fit_reward
 from manip_il.preferences.answers import Answers
 from manip_il.preferences.pairs import Clips
 

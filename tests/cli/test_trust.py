@@ -21,7 +21,7 @@ from manip_il.learn.lerobot_config import lerobot_options
 from ..damage import edit_json
 from .made_runs import make_eval, make_policy, make_run
 
-COMMANDS = ("train", "dagger", "eval", "compare", "robot certify")
+COMMANDS = ("train", "dagger", "eval", "compare")
 SAMPLE = Path(__file__).resolve().parents[2] / "datasets" / "sample"
 STEP = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}}
 REQUIRED = {
@@ -56,7 +56,6 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, pol
     words = ["--env.horizon=8", "--workers=1", out]
     for command in (
         ["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words],
-        ["robot", "certify", f"--policy.path={hostile}", "--cases=1", *words],
         ["compare", str(policy), str(hostile), "--eval.n_episodes=1", *words],
         ["eval", str(file), "--replay=4000000", f"--policy.path={hostile}"],
         ["dagger", f"--policy.path={named}", out],

@@ -15,10 +15,9 @@ def clone(env: EnvConfig, episodes: int, folder: Path, *, steps: int, width: int
     from manip_il.data.dataset import Dataset
     from manip_il.data.lerobot_write import write_dataset
     from manip_il.learn.fit_config import FitConfig
-    from manip_il.learn.sources import Sources
     from manip_il.learn.train import Trainer
 
     runs = RolloutJob(env, hold=3).run(stream_seeds("demonstrations", episodes))
     write_dataset(runs, folder / "dataset", env_spec(env), repo_id="local/clone", fingerprint={})
     config = FitConfig({"width": width}, steps=steps, batch_size=batch_size)
-    return Trainer(Sources((Dataset.open(folder / "dataset"),)), config, folder).fit()
+    return Trainer((Dataset.open(folder / "dataset"),), config, folder).fit()

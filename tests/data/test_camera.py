@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
+from manip_il.data.camera import decode
 from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
 from manip_il.mdp import Episode
@@ -73,7 +74,9 @@ def test_what_is_decoded_at_once_or_when_it_is_read_is_bit_equal_to_what_lerobot
 
     root, counts = roots[name], list[int]()
     cameras = {key: Dataset.open(root).camera(key) for key in Dataset.open(root).cameras}
-    frames = {key: camera.decode(counts.append) for key, camera in cameras.items()}
+    frames = {key: decode([camera], counts.append) for key, camera in cameras.items()}
+    twice = decode([cameras[FRONT]] * 2)
+    np.testing.assert_array_equal(twice, np.concatenate([frames[FRONT]] * 2))
     plain: Any = LeRobotDataset("a/b", root=root)
     assert list(frames) == [FRONT, WRIST]
     assert sum(counts) == 2 * len(plain) == 2 * len(frames[FRONT]) > 40

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.environments import env_fingerprint
 from manip_il.collect.expert import Expert
-from manip_il.collect.query import drawn_step
 from manip_il.collect.workers import Engine
 from manip_il.evaluation.certify import Case, Certificate, Row, certify, count_episodes, draw_moment
 from manip_il.evaluation.intervals import wilson_interval
-from manip_il.learn.checkpoint import Origin
-from manip_il.mdp import Episode
 from manip_il.sim.events import Perturbation
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env, scene_of
 
-from ..collect.clones import clone
-from ..learn.tiny_policies import write_checkpoint
 from .page import page_of
 
 HORIZON = 50
@@ -35,7 +29,7 @@ def row(group: str, cases: tuple[Case, ...], name: str = "a", left_out: int = 0)
 
 def certificate(*rows: Row) -> Certificate:
     start, state = row("start", (Case(1, 0, 12),), "start"), row("state", (Case(1, 2, 9),), "state", 3)
-    return Certificate("panda", "pick_place", None, {"mujoco": "3"}, SETTINGS, (start, state, *rows))
+    return Certificate("panda", "pick_place", {"mujoco": "3"}, SETTINGS, (start, state, *rows))
 
 
 @pytest.fixture(scope="module")
@@ -50,30 +44,29 @@ def test_a_gap_is_the_cost_to_go_after_the_action_less_that_without_it():
 
 
 def test_the_file_holds_every_case_and_what_follows_from_them():
-    made = certificate(row("action", ACTIONS, left_out=2), row("learner", (), "learner", left_out=4))
+    made = certificate(row("action", ACTIONS, left_out=2), row("state", (), "b", left_out=4))
     data = json.loads(json.dumps(made.to_json(), allow_nan=False))
-    assert set(data) == {"robot", "task", "policy", "fingerprint", "settings", "confidence", "mu", "rows"}
+    assert set(data) == {"robot", "task", "fingerprint", "settings", "confidence", "mu", "rows"}
     assert data["mu"] == HORIZON
     assert [(one["group"], one["kind"]) for one in data["rows"]] == [
-        *(("start", "start"), ("state", "state"), ("state", "all")),
-        *(("action", "a"), ("action", "all"), ("learner", "learner")),
+        *(("start", "start"), ("state", "state"), ("state", "b"), ("state", "all")),
+        *(("action", "a"), ("action", "all")),
     ]
-    action, learner = data["rows"][3], data["rows"][5]
+    action, empty = data["rows"][4], data["rows"][2]
     assert action["cases"] == [[1, 3, 10, 9], [2, 0, 30, 10], [3, 9, None, 7], [4, 2, 8, 9]]
     assert (action["n"], action["left_out"], action["success_rate"], action["mean_steps"]) == (4, 2, 0.75, 16)
     assert action["interval"] == list(wilson_interval(3, 4))
-    assert (learner["n"], learner["left_out"], learner["success_rate"], learner["interval"]) == (0, 4, None, None)
+    assert (empty["n"], empty["left_out"], empty["success_rate"], empty["interval"]) == (0, 4, None, None)
 
 
 def test_the_table_and_the_page_show_the_numbers():
     many = row("action", tuple(Case(i, 0, i + 2, 1) for i in range(40)))  # gaps of 1 to 40
-    made = certificate(row("action", ACTIONS), row("learner", ACTIONS[:3], "learner", left_out=1))
-    assert certificate(many).table().rows[3][3:6] == ("20.5", "39", "40")
-    assert made.table().rows[3][1:] == ("75.0 % [30.1, 95.4]", "16.0", "17.5", "50", "50", "4", "0")
+    made = certificate(row("action", ACTIONS))
+    assert certificate(many).table().rows[3][3:5] == ("20.5", "40")
+    assert made.table().rows[3][1:] == ("75.0 % [30.1, 95.4]", "16.0", "17.5", "50", "4", "0")
     page = page_of(made.report("manip-il robot certify", {}))
     assert "75.0 % [30.1, 95.4]" in page.text
-    assert "at least 50 steps (2.5 s); with 95% confidence, at most 52.7%" in page.text
-    assert "The policy had solved 1 of 4 before" in page.text
+    assert "at least 50 steps (2.5 s)." in page.text
     assert len(page.figures) == 1
 
 
@@ -113,28 +106,6 @@ def test_every_kind_has_its_row_and_every_case_its_moment_on_the_experts_way(mea
     assert count_episodes(make_config(), 3) == 3 * len(measured.rows)
 
 
-@pytest.fixture(scope="module")
-def policy(tmp_path_factory) -> Path:
-    """An untrained one, which solves nothing."""
-    env = make_config("fetch", "reach", horizon=60)
-    meta = Origin.of(env_spec(env), env_fingerprint(env))
-    return write_checkpoint(tmp_path_factory.mktemp("policy"), "act", env_spec(env), origin=meta)
-
-
-def test_the_expert_goes_on_from_where_a_learner_left_it(policy: Path):
-    env, episodes = make_config("fetch", "reach", horizon=60), list[Episode]()
-    made = certify(Engine(), env, 4, policy=policy, on_episode=episodes.append)
-    [learner] = made.of("learner")
-    assert (len(learner.cases), learner.left_out) == (4, 0)
-    assert [case.moment for case in learner.cases] == [drawn_step(case.seed, env.horizon) for case in learner.cases]
-    assert learner.success.rate == 1
-    assert len(episodes) == count_episodes(env, 4, policy)
-    taken_over = {episode.seed: episode for episode in episodes[-4:]}
-    for case in learner.cases:
-        assert len(taken_over[case.seed]) - case.moment == case.steps
-    assert made.policy == str(policy)
-
-
 @pytest.mark.slow
 def test_two_processes_give_the_same_certificate(measured: Certificate):
     with Engine(2) as engine:
@@ -144,24 +115,22 @@ def test_two_processes_give_the_same_certificate(measured: Certificate):
 
 
 # What 500 cases a kind gave, panda and fetch: start 100 and 100 %, changed states 99.7 and 99.8 %, wrong actions 100
-# and 99.7 %, a poor clone's states (panda) 99.4 %. By the binomial, an expert as good as that falls under a floor in
+# and 99.7 %. By the binomial, an expert as good as that falls under a floor in
 # one or two of a thousand draws of CASES seeds, and one that fails in 5 % of the changed states in 19 of 20.
 CASES = 40
-FLOORS = {"start": 0.96, "state": 0.98, "action": 0.98, "learner": 0.94}
+FLOORS = {"start": 0.96, "state": 0.98, "action": 0.98}
 MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: measured 4.5 and 4.0; 23 and 19, with 1 % above 35
 
 
 @pytest.fixture(scope="module", params=["panda", "fetch"])
-def certified(request, tmp_path_factory) -> Certificate:
-    """Beside perturbed states, those that a poor clone of the expert visits."""
-    env = make_config(request.param)
-    return certify(Engine(), env, CASES, policy=clone(env, 10, tmp_path_factory.mktemp("clone"), steps=300, width=64))
+def certified(request) -> Certificate:
+    return certify(Engine(), make_config(request.param), CASES)
 
 
 @pytest.mark.slow
 def test_the_certificate_of_pick_and_place_does_not_fall(certified: Certificate):
-    [learner], actions = certified.of("learner"), certified.pooled("action")
-    rows = {one.group: one for one in (certified.of("start")[0], certified.pooled("state"), actions, learner)}
+    actions = certified.pooled("action")
+    rows = {one.group: one for one in (certified.of("start")[0], certified.pooled("state"), actions)}
     rates = {group: row.success.rate for group, row in rows.items()}
     assert {group: rate for group, rate in rates.items() if rate < FLOORS[group]} == {}
     assert min(len(row.cases) for row in rows.values()) >= CASES // 2

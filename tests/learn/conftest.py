@@ -14,7 +14,6 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec, features
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.network import threads
-from manip_il.learn.sources import Sources
 from manip_il.mdp import Episode
 
 N, K, EPISODES, LENGTH = 4, 6, 12, 20
@@ -75,7 +74,7 @@ def gapped(table) -> Table:
     return table
 
 
-def write_table(table: Mapping[str, np.ndarray], root: Path, spec: RobotTaskSpec) -> Sources:
+def write_table(table: Mapping[str, np.ndarray], root: Path, spec: RobotTaskSpec) -> tuple[Dataset, ...]:
     """A dataset on disk, what the table lacks being zeros, pictures noise."""
     rng = np.random.default_rng(0)
     episodes = []
@@ -91,7 +90,7 @@ def write_table(table: Mapping[str, np.ndarray], root: Path, spec: RobotTaskSpec
                 columns[key] = values.reshape(shape).astype(feature["dtype"])
         episodes.append(Episode(int(number), columns, success=True, success_at_end=True))
     write_dataset(episodes, root, spec, repo_id=f"local/{root.name}", fingerprint={"mujoco": "3.11"})
-    return Sources((Dataset.open(root),))
+    return (Dataset.open(root),)
 
 
 @pytest.fixture
@@ -101,7 +100,7 @@ def write(tmp_path, spec):
 
 
 @pytest.fixture(scope="session")
-def dataset(spec, tmp_path_factory) -> Sources:
+def dataset(spec, tmp_path_factory) -> tuple[Dataset, ...]:
     """The table with a tenth of its labels invalid, on disk."""
     table = make_table()
     table["label_valid"][::10] = 0

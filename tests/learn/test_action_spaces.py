@@ -13,6 +13,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 
+from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
@@ -22,7 +23,6 @@ from manip_il.learn.export import export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
@@ -73,11 +73,11 @@ def table() -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def sources(panda, table, tmp_path_factory) -> Sources:
+def sources(panda, table, tmp_path_factory) -> tuple[Dataset, ...]:
     return write_table(table, tmp_path_factory.mktemp("spaces") / "dataset", panda)
 
 
-def trainer_of(sources: Sources, folder: Path, settings: Any, space: str | None, **more: Any) -> Trainer:
+def trainer_of(sources: tuple[Dataset, ...], folder: Path, settings: Any, space: str | None, **more: Any) -> Trainer:
     config = FitConfig(settings, action_space=space, eval_split=0.0, **SMALL, **more)
     return Trainer(sources, config, folder, resume=folder.is_dir())
 
@@ -199,7 +199,7 @@ def test_a_checkpoint_from_before_there_was_a_choice_acts_as_it_did(table, sourc
 
 
 def test_lerobots_own_training_has_no_kinematics(table, sources):
-    meta: Any = JoinedDatasets(sources.roots)
+    meta: Any = JoinedDatasets(sources)
     with pytest.raises(ManipError, match="train with manip-il train"):
         make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
     policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)

@@ -15,8 +15,7 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 from manip_il.data.schema import features
 from manip_il.errors import UsageError
 from manip_il.learn import mlp
-from manip_il.learn.cnn import CNNConfig, CNNPolicy
-from manip_il.learn.keypoints import KeypointEncoder
+from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
 
@@ -39,7 +38,7 @@ def table(gapped):
 def meta(dataset, spec):
     """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid; it has no videos."""
     pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
-    return SimpleNamespace(features=features(pictured), root=dataset.roots[0], stats={})
+    return SimpleNamespace(features=features(pictured), root=dataset[0].root, stats={})
 
 
 def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:

@@ -26,7 +26,6 @@ from manip_il.learn.export import TOLERANCE, export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import Sources
 from manip_il.learn.train import Trainer
 
 from .tiny_policies import write_checkpoint
@@ -46,7 +45,7 @@ def sample() -> tuple[RobotTaskSpec, dict[str, NDArray[Any]]]:
 def mlp(request, tmp_path) -> Path:
     """A few steps of training, so that units, ranges and weights are those of real data."""
     config = FitConfig({"loss": request.param, "width": 64}, steps=20, batch_size=32)
-    return Trainer(Sources((Dataset.open(SAMPLE),)), config, tmp_path / "run").fit()
+    return Trainer((Dataset.open(SAMPLE),), config, tmp_path / "run").fit()
 
 
 def write_cnn(folder: Path, spec: RobotTaskSpec, observation: str = "images", **options: Any) -> Path:

@@ -14,7 +14,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 
 from manip_il.errors import MismatchError, UsageError
-from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.checkpoint import CONFIG, Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
 from manip_il.learn.losses import LOSSES
@@ -22,7 +22,6 @@ from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.network import threads
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
-from manip_il.learn.trust import CONFIG
 
 from ..damage import edit_json
 from .tiny_policies import observations

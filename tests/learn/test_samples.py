@@ -17,8 +17,7 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from manip_il.data.joined import JoinedDatasets
 from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.samples import Pictures, Windows, windows_of
-from manip_il.learn.sources import Sources
+from manip_il.learn.samples import Windows, windows_of
 from manip_il.learn.train import Trainer
 
 from .conftest import make_table, write_table
@@ -62,14 +61,6 @@ def test_the_windows_are_those_that_the_policy_asks_for() -> None:
     assert diffusion.deltas["action"].tolist() == list(range(-1, 7))
 
 
-@pytest.mark.parametrize("shape", [(7,), (3, 4)])
-def test_joined_frames_are_those_of_the_concatenation(shape):
-    rng = np.random.default_rng(0)
-    pieces = [rng.integers(0, 255, (count, 3, 2, 2), dtype=np.uint8) for count in (4, 1, 6)]
-    rows = rng.integers(0, 11, shape)
-    np.testing.assert_array_equal(Pictures(pieces)[torch.from_numpy(rows)], np.concatenate(pieces)[rows])
-
-
 @pytest.mark.parametrize(
     ("settings", "observation"),
     [(ACT, "state"), (DIFFUSION, "state"), (ACT, "images"), (ACT, "both")],
@@ -79,9 +70,9 @@ def test_a_batch_is_that_of_lerobots_loader(settings, observation, write, table,
     sources = write(table, spec=pictured)
     config = FitConfig({**settings, "pretrained_backbone_weights": None}, observation=observation, batch_size=8)
     samples = Trainer(sources, config, tmp_path / "run").data
-    meta = JoinedDatasets(sources.roots)
+    meta = JoinedDatasets(sources)
     ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in samples.windows.deltas.items()}
-    lerobots: Any = LeRobotDataset(meta.repo_id, root=sources.roots[0], delta_timestamps=ahead or None)
+    lerobots: Any = LeRobotDataset(meta.repo_id, root=sources[0].root, delta_timestamps=ahead or None)
     for rows in (np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])):
         theirs = torch.utils.data.default_collate([lerobots[int(row)] for row in rows])
         for key, value in samples.batch(rows).items():
@@ -95,8 +86,8 @@ def test_a_batch_is_that_of_lerobots_loader(settings, observation, write, table,
 
 def test_tasks_of_several_datasets_are_numbered_together(spec, tmp_path):
     texts = [replace(spec, instruction=text) for text in ("reach", "touch")]
-    made = [write_table(make_table(), tmp_path / one.instruction, one).datasets[0] for one in texts]
-    samples = Trainer(Sources(tuple(made)), FitConfig(ACT, batch_size=8), tmp_path / "run").data
+    made = [write_table(make_table(), tmp_path / one.instruction, one)[0] for one in texts]
+    samples = Trainer(made, FitConfig(ACT, batch_size=8), tmp_path / "run").data
     batch = samples.batch(np.array([0, 239, 240, 479]))
     assert batch["task"] == ["reach", "reach", "touch", "touch"]
     assert batch["index"].tolist() == [0, 239, 240, 479]

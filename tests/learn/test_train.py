@@ -20,7 +20,7 @@ from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import Sources, check_same_sources, recorded_look
+from manip_il.learn.sources import check_same_sources, recorded_look, row_weights
 from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import METRICS_FILE
 
@@ -43,7 +43,7 @@ def config(settings: Any = MLP, **changes: Any) -> FitConfig:
 def fit(dataset, tmp_path):
     """Fits a tiny policy to a dataset in a folder of the test's."""
 
-    def run(settings: Any = MLP, name: str = "run", data: Sources = dataset, stop_after: int = 0, **more: Any) -> Path:
+    def run(settings: Any = MLP, name: str = "run", data: Any = dataset, stop_after: int = 0, **more: Any) -> Path:
         given = {key: more.pop(key) for key in ("resume", "weights") if key in more}
         done = 0
 
@@ -175,7 +175,7 @@ def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(fit):
 @pytest.mark.parametrize("key", ["observation.state", "observation.environment_state", "action"])
 def test_nan_is_refused_with_column_and_frame(key, table, write, fit):
     data = write(table)
-    [file] = data.datasets[0].data_files
+    [file] = data[0].data_files
     columns = pq.read_table(file).to_pydict()
     columns[key][47][1] = math.nan
     stored = pq.read_table(file)
@@ -226,7 +226,7 @@ def test_a_checkpoint_has_lerobots_layout_and_no_place_of_this_machine(fit, spec
         assert {"policy_preprocessor.json", "policy_postprocessor.json"} <= made
         for file in path.glob("*.json"):
             assert str(tmp_path) not in file.read_text(), file
-            assert str(dataset.roots[0].parent) not in file.read_text(), file
+            assert str(dataset[0].root.parent) not in file.read_text(), file
         origin = Checkpoint.open(path).origin
         assert origin is not None
         space = "joint_delta" if settings is MLP else "joint_target"
@@ -240,33 +240,33 @@ def test_several_datasets_are_one_in_the_units_of_all_and_the_shares_asked_for(s
     tables = make_table(0), make_table(1)
     for key in ("observation.state", "action"):
         tables[1][key] = tables[1][key] + np.float32(3.0)
-    roots = [write_table(table, tmp_path / name, spec).datasets[0] for table, name in zip(tables, "ab", strict=True)]
+    roots = [write_table(table, tmp_path / name, spec)[0] for table, name in zip(tables, "ab", strict=True)]
     inputs = np.concatenate(
         [np.hstack([one["observation.state"], one["observation.environment_state"]]) for one in tables]
     )
     for weights in ((), (3.0, 1.0)):
-        trainer = Trainer(Sources(tuple(roots), weights), config(eval_split=0.0), tmp_path / f"run{len(weights)}")
+        trainer = Trainer(roots, config(eval_split=0.0), tmp_path / f"run{len(weights)}", shares=weights)
         np.testing.assert_allclose(trainer.policy.model.input_mean, inputs.mean(0), rtol=1e-5)
         drawn = np.concatenate([trainer.batch(step)["index"].numpy() for step in range(1000)])
         assert (drawn < 240).mean() == pytest.approx(0.75 if weights else 0.5, abs=0.02)
         assert trainer.fit().is_dir()
-    chunks = Trainer(Sources(tuple(roots)), config(ACT, eval_split=0.0), tmp_path / "act")
+    chunks = Trainer(roots, config(ACT, eval_split=0.0), tmp_path / "act")
     assert chunks.data.batch(np.array([239]))["action_is_pad"][0].tolist() == [False, True, True, True]
-    trainer = Trainer(Sources(tuple(roots)), config(), tmp_path / "few", weights=(np.arange(480) < 20).astype(float))
+    trainer = Trainer(roots, config(), tmp_path / "few", weights=(np.arange(480) < 20).astype(float))
     assert max(int(trainer.batch(step)["index"].max()) for step in range(50)) < 20
     with pytest.raises(ManipError, match="b has no sample to learn from"):
-        Sources(tuple(roots), (1.0, 1.0)).row_weights(np.arange(100))
+        row_weights(roots, (1.0, 1.0), np.arange(100))
 
 
 def test_datasets_that_mean_other_things_are_refused_with_both_named(spec, write, table):
-    one = write(table, "one").datasets[0]
+    one = write(table, "one")[0]
     for change, words in (
         ({"robot": "leg"}, r"robot differs: .*one has arm, .*other has leg"),
         ({"fps": 30}, r"fps differs: .*one has 25, .*other has 30"),
         ({"task": "lift"}, r"task differs: .*one has reach, .*other has lift"),
         ({"cameras": ("front",), "image_size": (32, 32), "video": False}, r"cameras differs"),
     ):
-        other = write(table, f"{next(iter(change))}/other", replace(spec, **change)).datasets[0]
+        other = write(table, f"{next(iter(change))}/other", replace(spec, **change))[0]
         both = (one.root, other.root), (one.spec, other.spec)
         with pytest.raises(MismatchError, match=words):
             check_same_sources(*both, pictures=True, language=False)
@@ -295,7 +295,7 @@ sys.exit(max(elastic_launch(config, main)(sys.argv[1:]).values()))
 @pytest.mark.slow
 def test_two_processes_learn_what_one_learns_from_both_shares(warm_lerobot, dataset, tmp_path, weights):
     """Every process takes its share of the batch; the gradients are averaged."""
-    words = ["train", f"--dataset.root={dataset.roots[0]}", "--steps=3", "--save_freq=3"]
+    words = ["train", f"--dataset.root={dataset[0].root}", "--steps=3", "--save_freq=3"]
     words += ["--optimizer.type=sgd", "--optimizer.lr=0.001"]
     words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in ACT.items()]
     # One action a chunk: ACT's mean over all that is no padding is then the mean of the shares' means.

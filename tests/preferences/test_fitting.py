@@ -11,8 +11,18 @@ import torch
 
 from manip_il.data.dataset import Dataset
 from manip_il.errors import MismatchError
-from manip_il.learn.reward import LearnedReward, RewardNetwork, RewardShape, joints_of, shape_for, ways_of, write_reward
-from manip_il.learn.reward_fit import Compared, deal, fit_reward
+from manip_il.learn.reward import (
+    Compared,
+    LearnedReward,
+    RewardNetwork,
+    RewardShape,
+    deal,
+    fit_reward,
+    joints_of,
+    shape_for,
+    ways_of,
+    write_reward,
+)
 from manip_il.preferences.answers import Teacher, answer_pairs, join_answers
 from manip_il.preferences.fitting import fit_answers
 
@@ -61,7 +71,7 @@ def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, an
     said = []
     for better in (answers.better, turned):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("manip_il.learn.reward_fit._EPOCHS", 1)
+            patch.setattr("manip_il.learn.reward._EPOCHS", 1)
             said.append(
                 fit_reward(clips.inputs, Compared(rows[:, 0], rows[:, 1], better, answers.pair), SHAPE, 0).logits
             )
