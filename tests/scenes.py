@@ -10,7 +10,7 @@ from manip_il.collect.expert import Expert
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
-from manip_il.sim.world import World
+from manip_il.sim.world import GOAL, World
 from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.table import TASKS
 
@@ -36,6 +36,11 @@ def world_at_home(robot: str, task: str = "pick_place") -> World:
     world.data.qpos[world.scene.arm_q] = world.scene.robot.home
     world.update()
     return world
+
+
+def has_goal(world: World) -> bool:
+    """Whether the task shows where things are to go."""
+    return any(world.model.body(number).name == GOAL for number in range(world.model.nbody))
 
 
 def still(env: ManipEnv, opening: float | None = None) -> np.ndarray:

@@ -64,7 +64,7 @@ def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, tas
     plain.start(8)
     restored = State.from_vector(vector)
     assert path_of(plain, restored, 4) == path_of(env, State.from_vector(vector), 4)
-    np.testing.assert_array_equal(plain.get_state().variation, with_drawn(plain.scene.nominal, env.drawn.values))
+    np.testing.assert_array_equal(plain.get_state().variation, with_drawn(plain.scene.nominal, env.drawn))
 
 
 @pytest.mark.gl

@@ -138,9 +138,7 @@ def _run(name: str, words: list[str]) -> None:
     options = parse(load(name), words, command=name)
     check_paths(options)
     from manip_il.errors import silence_ffmpeg_warning
-    from manip_il.sim.gl import require_known_backend
 
-    require_known_backend()
     silence_ffmpeg_warning()
     options.run()
 

@@ -24,9 +24,9 @@ PAGE = "check.html"
 class RobotNewOptions(Replacing):
     """Write a first YAML for an arm's MJCF: hand, fingers and workspace as they look on the model.
 
-    Every line says what it means. What is found beyond that (joints, home, gains, the hand's frame) stands below as
-    comments, to be said otherwise. Then checks the robot, as `robot check --episodes=0` does, and says what to change.
-    Exits with 1 if it can do no task yet.
+    Every line says what it means. What it leaves out (joints, home, gains, the hand's frame) is found on the model, and
+    can be said in it. Then checks the robot, as `robot check --episodes=0` does, and says what to change. Exits with 1
+    if it can do no task yet.
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"

@@ -75,7 +75,7 @@ class RolloutJob:
         branch_env = make_env(self.env, self.cameras) if self.label == "branch" else None
         steps = run_steps(self, envs, seeds)
         for frames in group_rollouts(map(_without_pictures, steps) if self.cameras is None and cameras else steps):
-            drawn = draw(self.conditions, frames[0].seed, self.env.object).values
+            drawn = draw(self.conditions, frames[0].seed, self.env.object)
             yield replace(self._to_episode(frames, branch_env), drawn=drawn)
 
     def _lockstep(self) -> int:

@@ -103,7 +103,7 @@ class SceneDrawer:
         if not isinstance(self._env, ManipEnv):  # which looks one way
             return state
         conditions, shape = self._scenes.conditions, self._shape
-        drawn = draw(conditions, number, shape).values if conditions else {}
+        drawn = draw(conditions, number, shape) if conditions else {}
         variation = completed(state.variation, self._env.scene.nominal)
         return replace(state, variation=with_drawn(variation, {key: drawn[key] for key in PICTURED if key in drawn}))
 

@@ -118,7 +118,7 @@ class EvalSettings:
         """Return the inverse of `to_json`; raises as `EpisodeResult.from_json`. Other keys are ignored."""
         known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
         named = [dict(one) for one in known.pop("conditions", [NOMINAL.to_json()])]
-        return cls(**known, conditions=tuple(Condition.from_mapping(one.pop("name"), one) for one in named))
+        return cls(**known, conditions=tuple(Condition(**one) for one in named))
 
 
 @dataclass(frozen=True)

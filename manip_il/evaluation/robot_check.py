@@ -20,13 +20,13 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.evaluation.tables import CLONING, EXPERT, Table
+from manip_il.robots.geometry import Pair, meeting_at
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import FILM
-from manip_il.sim.posture import Pair, meeting_at
 from manip_il.sim.render import Overview, framed_picture
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.world import World

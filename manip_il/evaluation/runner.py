@@ -24,7 +24,7 @@ from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, Ev
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.checkpoint import policy_cameras, policy_sha256
 from manip_il.mdp import F64, Episode, State
-from manip_il.sim.conditions import NOMINAL, Condition, draw
+from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
 from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.task import objects_in
 from manip_il.sim.world import World
@@ -115,7 +115,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     first = int(np.argmax(solved)) + 1 if solved.any() else None
     states = episode.columns[schema.SIM_STATE]
     start, end = (positions(job.env, states[row]) for row in (0, -1))
-    drawn = draw(job.conditions or (NOMINAL,), episode.seed, job.env.object)
+    drawn = draw(job.conditions, episode.seed, job.env.object)
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
     if phase == 0 and episode.success_at_end:  # nobody asks the expert about a state in which the task is solved
         phase = -1
@@ -128,8 +128,8 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         phase_at_end=env_spec(job.env).phases[phase],
         detail={
             "steps_to_success": first,
-            "condition": drawn.condition,
-            "drawn": dict(drawn.values),
+            "condition": turn_of(job.conditions, episode.seed).name,
+            "drawn": drawn,
             "goal": start.pop("goal", None),
             "start": start,
             "end": {name: at for name, at in end.items() if name != "goal"},

@@ -70,7 +70,7 @@ def read_condition(name: str) -> Condition:
     tree = checks.read_yaml(path, "a YAML of ranges")
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
-    return Condition.from_mapping(path.stem, tree or {})
+    return Condition(path.stem, **{str(key): value for key, value in (tree or {}).items()})
 
 
 def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:

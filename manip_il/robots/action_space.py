@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.errors import MismatchError, NotFiniteError
 
 F64 = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class ActionSpace:
     low, high: what commands are clipped to, infinite where a joint turns freely. scale: the longest step of a joint
     target from the measured joint [rad], the whole opening of the gripper [m]. relative: whether a learner's target is
     measured from where the joint is; the gripper's is not. units: of a robot with servos: all of these, every action
-    and measured state are then in degrees and, the gripper's, from 0 to 100. Raises `ManipError` where lengths differ.
+    and measured state are then in degrees and, the gripper's, from 0 to 100.
     """
 
     names: tuple[str, ...]
@@ -50,11 +50,6 @@ class ActionSpace:
     scale: F64
     relative: NDArray[np.bool_]
     units: ServoUnits | None = None
-
-    def __post_init__(self) -> None:
-        lengths = {name: len(getattr(self, name)) for name in ("names", "low", "high", "scale", "relative")}
-        if len(set(lengths.values())) != 1:
-            raise ManipError(f"an action space whose parts have different lengths: {lengths}")
 
     def __len__(self) -> int:
         return len(self.names)

@@ -219,7 +219,7 @@ def _half_turned(ee: EndEffector) -> EndEffector:
 def _best(robot: Robot, height: float) -> tuple[float, Robot]:
     """The best posture of one way round of the hand, and how good it is; minus infinity for none."""
     soft = robot.leans
-    middle = replace(robot, home=tuple(_middles(robot)))
+    middle = replace(robot, home=tuple(_counted(ArmIK(robot).limits).mean(axis=1)))
     ik, body = ArmIK(middle), Body(middle)
     limits = _counted(ik.limits)
     rng = np.random.default_rng(0)
@@ -229,14 +229,10 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
     for _ in range(_STARTS):
         q, miss = _descend(ik, rng.uniform(*limits.T), target, rotation, soft)
         if miss < _ARRIVED:
-            worth = _worth(ik, q, limits) - body.meeting(q)
+            worth = _worth(ik, q, limits) - len(body.meeting(q))
             if worth > best[0]:
                 best = worth, replace(robot, home=tuple(round(float(value), _DIGITS) for value in q))
     return best
-
-
-def _middles(robot: Robot) -> F64:
-    return _counted(ArmIK(robot).limits).mean(axis=1)
 
 
 def _counted(limits: F64) -> F64:

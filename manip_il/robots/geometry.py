@@ -1,4 +1,4 @@
-"""Outlines of geoms, distances between them, and whether a robot meets itself."""
+"""Outlines of geoms, distances between them, and whether a robot meets itself or what stands around it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.robots.robot import Robot
+from manip_il.errors import UsageError
+from manip_il.robots.robot import GRIPPER, Robot
 from manip_il.robots.spec import arm_spec
 
 F64 = NDArray[np.float64]
 _AT_TIP = 0.025  # of a fingertip: what is farther from it is no pad [m]
 _FAR = 1.0  # longest distance that is measured [m]
 _NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # [m]
+_DEEP = 1e-3  # parts that overlap by less touch at most [m]
+_BEYOND = 1e-6  # a limit, in rounding [rad]
 CLEARANCE = 0.02  # parts that are nearer than that meet [m]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+Pair = tuple[str, str]
 
 
 def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
@@ -73,20 +77,73 @@ class Body:
         self._q = np.array([self._model.joint(name).qposadr[0] for name in robot.joints])
         gripper = [self._model.joint(name).qposadr[0] for name in robot.gripper.joints]
         self._data.qpos[gripper] = robot.gripper.open
-        self._at_home = frozenset[frozenset[int]]()
-        self._at_home = self._meeting(np.asarray(robot.home))
+        self._at_home = self.meeting(np.asarray(robot.home))
 
     def meets_itself(self, q: F64) -> bool:
         """Return whether parts meet at joints (arm,) [rad] that are apart at home."""
-        return not self._meeting(q) <= self._at_home
+        return not self.meeting(q) <= self._at_home
 
-    def meeting(self, q: F64) -> int:
-        """Return how many pairs of parts meet at joints (arm,) [rad]."""
-        return len(self._meeting(q))
-
-    def _meeting(self, q: F64) -> frozenset[frozenset[int]]:
+    def meeting(self, q: F64) -> frozenset[frozenset[int]]:
+        """Return the pairs of parts, as bodies, that meet at joints (arm,) [rad]."""
         self._data.qpos[self._q] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)
         bodies = self._model.geom_bodyid
         return frozenset(frozenset((int(bodies[c.geom1]), int(bodies[c.geom2]))) for c in self._data.contact)
+
+
+def meeting_at(robot: Robot, model: mujoco.MjModel, prefix: str, posture: F64) -> dict[Pair, float]:
+    """Return the pairs of bodies that overlap in a posture of the arm (arm,) [rad], the gripper open, and how deep [m].
+
+    Pairs of the robot's own, and of it and what stands fixed in the world, which goes by the name of its geom.
+    prefix: of the robot's names in a scene's model.
+    """
+    data, gripper = mujoco.MjData(model), robot.gripper
+    for names, values in ((robot.joints, posture), (gripper.joints, gripper.open)):
+        for name, value in zip(names, values, strict=True):
+            data.joint(prefix + name).qpos[0] = value
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_collision(model, data)
+    found: dict[Pair, float] = {}
+    for contact in data.contact:
+        bodies = [int(model.geom_bodyid[geom]) for geom in (contact.geom1, contact.geom2)]
+        ours = [model.body(body).name.startswith(prefix) for body in bodies]
+        if contact.dist < -_DEEP and any(ours) and all(our or not body for our, body in zip(ours, bodies, strict=True)):
+            geoms = (contact.geom1, contact.geom2)
+            names = [_name(model, int(geom), prefix) for geom in geoms]
+            pair = (min(names), max(names))
+            found[pair] = max(found.get(pair, 0.0), -float(contact.dist))
+    return found
+
+
+def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
+    """Raise `UsageError` for a `home` beyond a joint's limits, or in which parts overlap.
+
+    Two of the robot's own may overlap where they do so at zero, too: many models have such neighbours.
+    """
+    for name, value in zip(robot.joints, robot.home, strict=True):
+        joint = model.joint(prefix + name)
+        low, high = joint.range
+        if joint.limited[0] and not low - _BEYOND <= value <= high + _BEYOND:
+            raise UsageError(
+                f"robot {robot.name}: home has {value:g} for joint {name!r}, whose limits are {low:.4g} to {high:.4g}; "
+                "choose another home, or leave it out, then it is found"
+            )
+    meeting = meeting_at(robot, model, prefix, np.asarray(robot.home))
+    if not meeting:
+        return
+    bodies = {model.body(body).name.removeprefix(prefix) for body in range(1, model.nbody)}
+    always = {pair for pair in meeting_at(robot, model, prefix, np.zeros(len(robot.joints))) if bodies.issuperset(pair)}
+    for (one, other), depth in sorted(meeting.items(), key=lambda item: -item[1]):
+        if (one, other) not in always:
+            mounted = one.startswith(GRIPPER) != other.startswith(GRIPPER)
+            mount = ", gripper.position or gripper.quaternion" if mounted else ""
+            raise UsageError(
+                f"robot {robot.name}: at home {one!r} and {other!r} overlap by {1000 * depth:.0f} mm; choose another "
+                f"home, or leave it out, then it is found; or mend base or workspace.centre{mount}"
+            )
+
+
+def _name(model: mujoco.MjModel, geom: int, prefix: str) -> str:
+    body = int(model.geom_bodyid[geom])
+    return model.body(body).name.removeprefix(prefix) if body else model.geom(geom).name

@@ -28,7 +28,6 @@ _SETTLE = 250  # physics steps at each
 _STEP = 0.002  # [s]
 _PAD = 0.004  # what is this much farther from the other finger than the nearest at the tip is no pad [m]
 _LOPSIDED = 0.004  # the middle of the pads moves by more where only one of two fingers moves [m]
-_STILL = 1e-4  # a finger that moves by less is not driven [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
@@ -119,9 +118,6 @@ def sweep(robot: Robot) -> Sweep:
     Raises `UsageError` where they do not come apart.
     """
     model, data, fingers, shares, poses = _at_rest(robot)
-    geoms = [geom for finger in fingers for geom in finger]
-    places = [_at(model, data, pose)[1].geom_xpos[geoms] for pose in (poses[0], poses[-1])]
-    _require_moved(robot, *places)
     jaws = _apart(*_at(model, data, poses[-1]), fingers)
     if not all(jaws):
         raise UsageError(
@@ -138,7 +134,7 @@ def sweep(robot: Robot) -> Sweep:
     if openings[-1] - openings[0] < _LEAST_TRAVEL or (np.diff(openings) <= 0).any() or (np.diff(shares) <= 0).any():
         raise UsageError(
             f"robot {robot.name}: the fingers stand {openings[0]:.3f} m apart closed and {openings[-1]:.3f} m open; "
-            "expected them to come apart all the way: look at gripper.closed, gripper.open and gripper.fingers"
+            "expected them to come apart all the way: look at gripper.joints, closed, open and fingers"
         )
     if np.ptp(middles) < _LOPSIDED:
         middles = np.zeros(len(middles))
@@ -180,16 +176,6 @@ def _at(model: mujoco.MjModel, data: mujoco.MjData, pose: F64) -> tuple[mujoco.M
     data.qpos[:] = pose
     mujoco.mj_kinematics(model, data)
     return model, data
-
-
-def _require_moved(robot: Robot, before: F64, after: F64) -> None:
-    """Raise `UsageError` where no finger is moved by the driven joints."""
-    if np.abs(after - before).max() < _STILL:
-        joints, fingers = (", ".join(map(repr, names)) for names in (robot.gripper.joints, robot.gripper.fingers))
-        raise UsageError(
-            f"robot {robot.name}: gripper.joints ({joints}) from gripper.closed to gripper.open move none of "
-            f"gripper.fingers ({fingers}); name the joints that drive the fingers"
-        )
 
 
 def _apart(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[list[int]]:

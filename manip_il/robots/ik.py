@@ -129,41 +129,24 @@ class ArmIK:
         motions: of its position [m] and rotation vectors [rad] in the world's axes, (B, 6). The first step is
         `displacement`, which resolves what a pose leaves open (the elbow of an arm of seven joints) as for the expert;
         the corrections after it are the shortest that the linearised kinematics has (damped least squares). A pose that
-        is out of reach is approached. A row's result does not depend on the rows beside it, bit for bit.
+        is out of reach is approached.
         """
-        reached, positions, rotations = self._first_steps(q, motions)
-        rows = np.arange(len(q))
+        return np.array([self._moved(*row) for row in zip(q, motions, strict=True)]).reshape(q.shape)
+
+    def _moved(self, q: F64, motion: F64) -> F64:
+        position, rotation = self.ee_pose(q)
+        position, rotation = position + motion[:3], rotation_matrix(motion[3:]) @ rotation
+        dq = self.displacement(position, rotation, _LARGEST)
+        q = self._within(q if dq is None else q + dq)
         for _ in range(_CORRECTIONS):
-            errors, jacobians = self._linearised(reached[rows], positions[rows], rotations[rows])
-            far = np.abs(errors).max(axis=1) >= _EXACT
-            if not far.any():
+            at, turned = self._at(q)
+            error = np.append(position - at, rotation_vector(rotation @ turned.T))
+            if np.abs(error).max() < _EXACT:
                 break
-            rows, errors, jacobians = rows[far], errors[far], jacobians[far]
-            back = jacobians.transpose(0, 2, 1)
-            dq = (back @ np.linalg.solve(jacobians @ back + _LEVENBERG * np.eye(6), errors[..., None]))[..., 0]
-            longest = np.maximum(np.abs(dq).max(axis=1, keepdims=True), _LARGEST)
-            reached[rows] = self._within(reached[rows] + dq * np.minimum(1.0, _LARGEST / longest))
-        return reached
-
-    def _first_steps(self, q: F64, motions: F64) -> tuple[F64, F64, F64]:
-        """Joints (B, arm) after one step of the expert's kind, and the poses that it is towards, (B, 3), (B, 3, 3)."""
-        reached, positions, rotations = q.copy(), np.empty((len(q), 3)), np.empty((len(q), 3, 3))
-        for row, motion in enumerate(motions):
-            position, rotation = self._at(q[row])
-            positions[row], rotations[row] = position + motion[:3], rotation_matrix(motion[3:]) @ rotation
-            dq = self.displacement(positions[row], rotations[row], _LARGEST)
-            if dq is not None:
-                reached[row] += dq
-        return self._within(reached), positions, rotations
-
-    def _linearised(self, q: F64, positions: F64, rotations: F64) -> tuple[F64, F64]:
-        """Pose errors (B, 6) [m, rad] and Jacobians (B, 6, arm) of `ee` at joints (B, arm)."""
-        at, turned, jacobians = np.empty((len(q), 3)), np.empty((len(q), 3, 3)), np.empty((len(q), 6, q.shape[1]))
-        for row, joints in enumerate(q):
-            at[row], turned[row] = self._at(joints)
-            jacobians[row] = self._site_jacobian()
-        angles = [rotation_vector(rotation) for rotation in rotations @ turned.transpose(0, 2, 1)]
-        return np.hstack([positions - at, angles]), jacobians
+            jacobian = np.ascontiguousarray(self._site_jacobian())
+            dq = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _LEVENBERG * np.eye(6), error)
+            q = self._within(q + dq * (_LARGEST / max(np.abs(dq).max(), _LARGEST)))
+        return q
 
     def _within(self, q: F64) -> F64:
         return np.minimum(np.maximum(q, self.limits[:, 0]), self.limits[:, 1])

@@ -124,21 +124,17 @@ class Reach:
 
 @cache
 def reach_of(robot: Robot) -> Reach:
-    """Return a robot's map: read where it is kept, else computed (some seconds) and kept."""
-    kept = kept_reach(robot)
-    if kept is not None:
-        return kept
-    reach = _solve(robot)
-    keep_reach(robot, reach)
-    return reach
-
-
-def kept_reach(robot: Robot) -> Reach | None:
-    """Return a robot's map from where it is kept; None where it is not."""
+    """Return a robot's map: read where it is kept, else computed (some seconds) and kept, where that can be."""
     path = _place(robot)
     with contextlib.suppress(Exception), np.load(path) as kept:  # numpy raises many kinds for a file that is no map
         return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
-    return None
+    reach, partial = _solve(robot), path.with_suffix(f".{os.getpid()}")
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "wb", opener=without_link) as file:
+            np.savez_compressed(file, origin=reach.origin, errors=reach.errors.astype(np.float32))
+        partial.replace(path)
+    return reach
 
 
 def _place(robot: Robot) -> Path:
@@ -147,17 +143,6 @@ def _place(robot: Robot) -> Path:
         return HERE / f"{robot.name}.reach.npz"
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return cache / "manip_il" / f"{robot.name}.reach.{_key(robot)}.npz"
-
-
-def keep_reach(robot: Robot, reach: Reach) -> None:
-    """Write a robot's map to where it is kept; one that cannot be kept is computed again."""
-    path = _place(robot)
-    partial = path.with_suffix(f".{os.getpid()}")
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "wb", opener=without_link) as file:
-            np.savez_compressed(file, origin=reach.origin, errors=reach.errors.astype(np.float32))
-        partial.replace(path)
 
 
 def _key(robot: Robot) -> str:

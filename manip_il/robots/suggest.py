@@ -5,8 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,57 +37,36 @@ _NOTES = {
 }
 
 
-@dataclass(frozen=True)
-class Suggestion:
-    """Words of a robot's YAML as they look on the model; names are those of the gripper's model.
-
-    closed, open: of the driven joints [m] or [rad]. centre, half_width, height: of the workspace [m].
-    """
-
-    hand: str
-    joints: tuple[str, ...]
-    closed: tuple[float, ...]
-    open: tuple[float, ...]
-    fingers: tuple[str, ...]
-    centre: tuple[float, float]
-    half_width: float
-    height: float
-
-
-def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
-    """Look at an MJCF, and at its gripper's where that has one of its own.
+def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
+    """Look at an MJCF, and at its gripper's where that has one of its own; return a YAML's words but for the paths.
 
     Raises `UsageError` where MuJoCo cannot read or compile them, or no hand or no fingers are found.
     """
-    try:
-        return _suggest(model, gripper)
-    except ValueError as error:
-        raise UsageError(f"MuJoCo cannot compile {gripper or model}: {' '.join(str(error).split())}") from None
-
-
-def _suggest(model: Path, gripper: Path | None) -> Suggestion:
     files = [ModelFiles(path.absolute()) for path in (model, gripper) if path is not None]
     spec, with_jaws = load(files[0], model.stem), load(files[-1], model.stem)
-    if gripper is None:
-        palm, jaws = _palm(with_jaws, model)
-        hand = palm
-    else:
-        hand, (palm, jaws) = _flange(spec.worldbody), _palm(with_jaws, gripper)
-    driven = _driven(with_jaws, jaws, gripper or model)
-    closed, opened, fingers = _ends(with_jaws, palm, jaws, driven)
+    palm, jaws = _palm(with_jaws, gripper or model)
+    hand, driven = palm if gripper is None else _flange(spec.worldbody), _driven(with_jaws, jaws, gripper or model)
+    try:
+        closed, opened, fingers = _ends(with_jaws, palm, jaws, driven)
+        length, base = _length(spec, hand.name)
+    except ValueError as error:
+        raise UsageError(f"MuJoCo cannot compile {gripper or model}: {' '.join(str(error).split())}") from None
     if not all((hand.name, palm.name, *fingers)):
         raise UsageError(f"{gripper or model}: its hand or a finger is a body without a name; name it in the model")
-    length, base = _length(spec, hand.name)
-    return Suggestion(
-        hand.name,
-        tuple(joint.name for joint in driven),
-        closed,
-        opened,
-        fingers,
-        (_rounded(base[0] + _REACHES * length), _rounded(base[1])),
-        _rounded(min(_WIDEST, _HALF * length)),
-        _rounded(min(_HIGHEST, 3 * _HALF * length)),
-    )
+    return {
+        "hand": hand.name,
+        "gripper": {
+            "joints": [joint.name for joint in driven],
+            "closed": closed,
+            "open": opened,
+            "fingers": list(fingers),
+        },
+        "workspace": {
+            "centre": [_rounded(base[0] + _REACHES * length), _rounded(base[1])],
+            "half_width": _rounded(min(_WIDEST, _HALF * length)),
+            "height": _rounded(min(_HIGHEST, 3 * _HALF * length)),
+        },
+    }
 
 
 def _moves(body: Any) -> bool:
@@ -151,7 +129,7 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
 
 def _ends(
     spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
+) -> tuple[list[float], list[float], Sequence[str]]:
     """Find where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet."""
     moving = [
         jaw.name
@@ -180,8 +158,9 @@ def _ends(
         opened[place], closed[place] = ends if gaps[0] > gaps[1] else ends[::-1]
     gap(closed)
     pads = nearest(model, data, fingers)[0]
-    touching = tuple(model.body(model.geom_bodyid[pad]).name for pad in pads)
-    return tuple(closed), tuple(opened), touching if len(moving) > 1 else tuple(bodies)
+    touching = [model.body(model.geom_bodyid[pad]).name for pad in pads]
+    closed, opened = ([float(f"{one:.5g}") + 0.0 for one in ends] for ends in (closed, opened))  # no -0
+    return closed, opened, touching if len(moving) > 1 else bodies
 
 
 def _length(spec: mujoco.MjSpec, hand: str) -> tuple[float, tuple[float, float]]:
@@ -202,16 +181,10 @@ def _rounded(length: float) -> float:
     return round(round(length / _ROUND) * _ROUND, 3)
 
 
-def yaml_of(found: Suggestion, model: str, gripper: str = "") -> str:
+def yaml_of(found: Mapping[str, Any], model: str, gripper: str = "") -> str:
     """Return the YAML of a suggestion, each line with what it means. model, gripper: paths as the YAML has them."""
-    ends = {name: [float(f"{one:.5g}") + 0.0 for one in getattr(found, name)] for name in ("closed", "open")}  # no -0
     own = {"model": gripper} if gripper else {}
-    tree = {
-        "model": model,
-        "hand": found.hand,
-        "gripper": own | {"joints": list(found.joints), **ends, "fingers": list(found.fingers)},
-        "workspace": {"centre": list(found.centre), "half_width": found.half_width, "height": found.height},
-    }
+    tree = {"model": model, **found, "gripper": own | found["gripper"]}
     text = yaml.safe_dump(tree, default_flow_style=None, width=math.inf, sort_keys=False)
     for key, note in _NOTES.items():
         text = re.sub(rf"(?m)^( *{key}:.*)$", lambda line, note=note: f"{line[1]} # {note}", text, count=1)

@@ -55,9 +55,7 @@ def read_robot(path: Path) -> Robot:
             said = complete(said)
         return Robot(**said)
     except ValueError as error:  # MuJoCo's, of a model that it reads and does not compile
-        why = " ".join(str(error).split())
-        what = "a name is not UTF-8 in" if isinstance(error, UnicodeDecodeError) else "MuJoCo cannot compile"
-        raise UsageError(f"{path}: {what} {said['files'].model}: {why}") from None
+        raise UsageError(f"{path}: MuJoCo cannot compile {said['files'].model}: {checks.one_line(error)}") from None
     except ManipError as error:
         named = str(path) in str(error) or f"robot {path.stem}" in str(error)
         raise UsageError(str(error) if named else f"{path}: {error}") from None

@@ -73,17 +73,15 @@ class Condition:
     lamps about the vertical [deg]. clutter: things that lie around the workspace and touch nothing. picture_delay:
     control steps by which pictures, and they alone, are late.
 
-    Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds.
+    Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds, `ManipError` for a name
+    that is no file's.
     """
 
     name: str
     ranges: Mapping[str, Any] = field(hash=False)
 
     def __init__(self, name: str = "nominal", **ranges: Any):
-        try:
-            checks.name("a condition's name", name)
-        except ManipError as error:
-            raise UsageError(str(error)) from None
+        checks.name("a condition's name", name)
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
         ranges = {one: _range(name, one, range_) for one, range_ in ranges.items()}
@@ -110,42 +108,21 @@ class Condition:
         """Return whether the object or the arm is another one than the compiled model's."""
         return not self.ranges.keys().isdisjoint(_MODEL)
 
-    def draw(self, seed: int) -> Drawn:
-        """Return what the episode of a seed draws; each value has a random stream of its own.
+    def draw(self, seed: int) -> dict[str, Any]:
+        """Return what the episode of a seed draws, by the names of the ranges and in their units.
 
-        So another range leaves the other values as they were.
+        Each value has a random stream of its own, so that another range leaves the other values as they were.
+        camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own frame.
         """
-        streams = ((name, range_, rng_for(seed, f"condition {name}")) for name, range_ in self.ranges.items())
-        return Drawn(self.name, {name: _draw(name, range_, rng) for name, range_, rng in streams})
+        return {name: _draw(name, range_, rng_for(seed, f"condition {name}")) for name, range_ in self.ranges.items()}
 
     def to_json(self) -> dict[str, Any]:
         """Return name and ranges as plain JSON values."""
         return {"name": self.name} | {name: list(range_) for name, range_ in self.ranges.items()}
 
-    @classmethod
-    def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
-        """Make a condition of ranges as YAML or JSON has them; else `UsageError`."""
-        return cls(name, **{str(key): value for key, value in tree.items()})
-
     def __str__(self) -> str:
         said = ", ".join(f"{name} {words(range_)}" for name, range_ in self.ranges.items())
         return f"{self.name} ({said})" if said else self.name
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """Values of one episode by the name of their range, and the condition they were drawn from.
-
-    See `Condition` for units. camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own
-    frame [m], [deg].
-    """
-
-    condition: str
-    values: Mapping[str, Any]
-
-    def number(self, name: str, default: float = 0.0) -> float:
-        """Return a drawn number, or the nominal one."""
-        return float(self.values.get(name, default))
 
 
 def merged(conditions: Sequence[Condition]) -> Condition:
@@ -154,18 +131,21 @@ def merged(conditions: Sequence[Condition]) -> Condition:
     return Condition("_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges)
 
 
-def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> Drawn:
-    """Return what the episode of a seed draws; conditions take turns by seed, and without any it is nominal.
+def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
+    """Return the condition of a seed's episode; conditions take turns, and without any it is nominal."""
+    return conditions[seed % len(conditions)] if conditions else NOMINAL
+
+
+def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> dict[str, Any]:
+    """Return what the episode of a seed draws from the condition whose turn it is.
 
     shape: of the object, as `EnvConfig.object`; where it is any, all shapes are drawn from unless the condition says
     which, and else none is.
     """
-    drawn = (conditions[seed % len(conditions)] if conditions else NOMINAL).draw(seed)
-    if draws_shape(shape) and "shape" not in drawn.values:
-        return Drawn(drawn.condition, {**_ANY_SHAPE.draw(seed).values, **drawn.values})
-    if not draws_shape(shape) and "shape" in drawn.values:
-        return Drawn(drawn.condition, {name: value for name, value in drawn.values.items() if name != "shape"})
-    return drawn
+    drawn = turn_of(conditions, seed).draw(seed)
+    if draws_shape(shape):
+        return _ANY_SHAPE.draw(seed) | drawn
+    return {name: value for name, value in drawn.items() if name != "shape"}
 
 
 def words(range_: Sequence[Any]) -> str:
@@ -230,5 +210,4 @@ def _overlap(name: str, asked: Range, sizes: Range) -> Range:
 
 
 NOMINAL = Condition()
-NOMINAL_VALUES = NOMINAL.draw(0)
 _ANY_SHAPE = Condition("any", shape=KINDS)

@@ -16,11 +16,10 @@ from manip_il.errors import ManipError, UnknownName
 from manip_il.mdp import Observation, State
 from manip_il.robots.robot import Robot
 from manip_il.seeding import rng_for
-from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
+from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CAMERAS, CameraConfig, Episodes, Look, require_cameras
-from manip_il.sim.events import Events
+from manip_il.sim.events import Events, draw_posture
 from manip_il.sim.points import points_in
-from manip_il.sim.posture import draw_posture
 from manip_il.sim.render import Picture, pictures, projections
 from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.shape import ANY
@@ -64,7 +63,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.world = World(build_scene(robot, task, config.physics_step))
         self._task = task
         self._conditions = tuple(conditions)
-        self._begin(0, NOMINAL_VALUES)
+        self._begin(0, {})
         require_cameras(cameras, CAMERAS)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UnknownName("render_mode", render_mode, self.metadata["render_modes"])
@@ -115,7 +114,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """Start the episode of a seed: `reset` without making an observation."""
         world, scene, rng = self.world, self.scene, rng_for(seed, "reset")
         self._begin(seed, draw(self._conditions, seed, ANY if self.scene.draws_shape else ""))
-        world.vary(with_drawn(scene.nominal, self.drawn.values))
+        world.vary(with_drawn(scene.nominal, self.drawn))
         data, robot = world.data, scene.robot
         mujoco.mj_resetData(world.model, data)
         for name, pose in self._task.draw(rng, world).poses.items():
@@ -124,19 +123,19 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
         opening = rng.uniform(scene.gripper.least, scene.gripper.most)
         data.qpos[scene.gripper.q] = data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
-        if largest := self.drawn.number("posture"):
+        if largest := self.drawn.get("posture"):
             draw_posture(world, rng_for(seed, "posture"), largest)
         world.update()
         mujoco.mj_forward(world.model, data)
 
-    def _begin(self, seed: int, drawn: Drawn) -> None:
+    def _begin(self, seed: int, drawn: dict[str, Any]) -> None:
         """Make ready for an episode with these values."""
         self.drawn, self._step, self._streak, self._ever = drawn, 0, 0, False
-        self._events = Events.of(self.world, drawn, seed)
+        self._events = Events(self.world, drawn, seed)
         self._noise = rng_for(seed, "observation noise")
-        self._observed: deque[Observation] = deque(maxlen=int(drawn.number("delay")) + 1)
+        self._observed: deque[Observation] = deque(maxlen=drawn.get("delay", 0) + 1)
         self._pictured: deque[tuple[dict[str, Picture], dict[str, F32]]] = deque(
-            maxlen=int(drawn.number("picture_delay")) + 1
+            maxlen=drawn.get("picture_delay", 0) + 1
         )
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -152,7 +151,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
         After a perturbation the steps within the tolerance count from the beginning.
         """
-        if self._events is not None and self._events.before(self._step):
+        if self._events.before(self._step):
             self._streak = 0
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
@@ -161,7 +160,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         Raises `NotFiniteError`, `MismatchError`.
         """
         world, scene = self.world, self.scene
-        executed = action if self._events is None else self._events.action(action, self._step)
+        executed = self._events.action(action, self._step)
         action = scene.actions.clip(executed, self._step)
         data = world.data
         data.ctrl[scene.arm_ctrl], opening = scene.actions.split(action)
@@ -218,9 +217,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def _measured(self) -> World:
         """The world with noise on joints and object positions, and on all that follows from them."""
-        if not self.drawn.values:
-            return self.world
-        joints, position = self.drawn.number("joint_noise"), self.drawn.number("position_noise")
+        joints, position = (self.drawn.get(name, 0.0) for name in ("joint_noise", "position_noise"))
         if not joints and not position:
             return self.world
         scene, world = self.scene, self._sensed

@@ -13,9 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import UnknownName, UsageError
 from manip_il.seeding import rng_for
-from manip_il.sim.conditions import Condition, Drawn
+from manip_il.sim.conditions import Condition
 from manip_il.sim.task import Task
 from manip_il.sim.world import World
 
@@ -67,16 +66,15 @@ def wrong_gripper(action: F64, world: World, rng: np.random.Generator) -> F64:
     return np.where(world.scene.actions.relative, action, _opposite_end(action, world))
 
 
-def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> bool:
+def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
     """Move the first of the task's objects sideways by a drawn distance [m], at rest, to where the arm reaches it.
 
     height: how far up it is moved [m]; above 0 it is turned at random, too, and falls. Draws in which it would stand
-    inside something else are drawn again; returns whether there was an object and such a place.
+    inside something else are drawn again; without an object, or such a place, nothing is moved.
     """
-    objects = world.scene.task.objects
-    if not objects:
-        return False
-    name = objects[0]
+    if not world.scene.task.objects:
+        return
+    name = world.scene.task.objects[0]
     one = world.scene.objects[name]
     start, half = world.data.qpos[one.q : one.q + 7].copy(), world.extents(name)[2] / 2
     for _ in range(_MAX_DRAWS):
@@ -88,29 +86,48 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
             turn = rng.normal(size=4)
             pose[3:] = turn / np.linalg.norm(turn)
         if world.reach.has([*pose[:2], half]) and _is_on_table(world, pose) and _place(world, name, pose):
-            return True
+            return
     _place(world, name, start)
-    return False
 
 
-def jolt_joints(world: World, rng: np.random.Generator, largest: float) -> bool:
-    """Turn every arm joint by up to `largest` [rad]; an object between the fingers moves with the hand.
+def jolt_joints(world: World, rng: np.random.Generator, largest: float) -> None:
+    """Turn every arm joint by up to `largest` [rad], so that nothing stands inside something else.
 
-    Draws in which something would stand inside something else are drawn again; returns whether one was found.
+    An object between the fingers moves with the hand.
+    """
+    before = world.data.qpos.copy()
+
+    def put(q: F64) -> None:
+        _move_arm(world, before, q)
+        world.data.qvel[:] = 0.0
+        _settle(world)
+
+    _turn_arm(world, rng, largest, put, lambda: all(contact.dist > _OVERLAP for contact in world.data.contact))
+
+
+def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None:
+    """Turn every arm joint, and what it is commanded, by up to `largest` [rad] from where it stands.
+
+    The arm then touches nothing that it did not touch before, and the hand is where it gets to pointing down.
     """
     scene, data = world.scene, world.data
-    low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
-    before = data.qpos.copy()
-    for _ in range(_MAX_DRAWS):
-        q = before[scene.arm_q] + rng.uniform(-largest, largest, len(scene.arm_q))
-        _move_arm(world, before, np.clip(q, low, high))
-        data.qvel[:] = 0.0
-        _settle(world)
-        if all(contact.dist > _OVERLAP for contact in data.contact):
-            return True
-    data.qpos[:] = before
-    _settle(world)
-    return False
+
+    def put(q: F64) -> None:
+        data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = q
+        world.update()
+        mujoco.mj_collision(world.model, data)
+
+    put(data.qpos[scene.arm_q].copy())
+    touching = arm_contacts(world)
+    _turn_arm(world, rng, largest, put, lambda: arm_contacts(world) <= touching and world.reach.has(world.ee.position))
+
+
+def arm_contacts(world: World) -> set[tuple[int, int]]:
+    """Return the pairs of geoms in contact of which at least one is the robot's."""
+    model = world.scene.model
+    robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
+    roots = model.body_rootid[model.geom_bodyid]
+    return {(int(a), int(b)) for a, b in world.data.contact.geom if robot in (roots[a], roots[b])}
 
 
 def set_fingers(world: World, opening: float) -> None:
@@ -131,7 +148,7 @@ KINDS: dict[str, Kind] = {
     "moved": Kind("object moved up to 10 cm", change=lambda world, rng: move_object(world, rng, SHIFT)),
     "dropped": Kind("object dropped from 10 cm", change=lambda world, rng: move_object(world, rng, SHIFT, DROP)),
     "closed": Kind("gripper wrongly closed", change=lambda world, rng: set_fingers(world, 0.0)),
-    "open": Kind("gripper wrongly open", change=lambda world, rng: set_fingers(world, world.most_opening)),
+    "open": Kind("gripper wrongly open", change=lambda world, rng: set_fingers(world, world.gripper.most)),
     "random": Kind("random action", wrong=random_action, needs_object=False),
     "opposite": Kind("opposite action", wrong=opposite_action, needs_object=False),
     "gripper": Kind("right arm, opposite gripper", wrong=wrong_gripper),
@@ -150,25 +167,18 @@ class Perturbation(Condition):
 
     def __init__(self, kind: str, moments: Mapping[int, int]):
         super().__init__(kind)
-        if kind not in KINDS:
-            raise UnknownName("perturbation", kind, KINDS)
-        if any(step < 0 for step in moments.values()):
-            raise UsageError(f"a perturbation at step {min(moments.values())}; expected 0 or later")
         vars(self).update(moments=moments)
 
-    def draw(self, seed: int) -> Drawn:
-        """Return the step at which it happens. Raises `UsageError` where none is given for the seed."""
-        if seed not in self.moments:
-            raise UsageError(f"perturbation {self.name!r} has no moment for seed {seed}; give one")
-        return Drawn(self.name, {self.name: self.moments[seed]})
+    def draw(self, seed: int) -> dict[str, Any]:
+        """Return the step at which it happens."""
+        return {self.name: self.moments[seed]}
 
 
 class _Training(Condition):
     """A condition whose knock is drawn when it happens, as in all rollouts that were recorded so far."""
 
-    def draw(self, seed: int) -> Drawn:
-        late = {name: self.ranges[name] for name in ("knock", "knock_step")}
-        return Drawn(self.name, {**super().draw(seed).values, **late})
+    def draw(self, seed: int) -> dict[str, Any]:
+        return super().draw(seed) | {name: self.ranges[name] for name in ("knock", "knock_step")}
 
 
 def standard_in(varied: Sequence[Condition]) -> Condition:
@@ -181,32 +191,19 @@ STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), kn
 
 
 class Events:
-    """Events of one episode: which, how much and when is in `drawn`, the rest is drawn from the seed.
+    """Events of one episode: which, how much and when is in `drawn`, the rest is drawn from the seed."""
 
-    Raises `UsageError` for a perturbation that needs an object in a task without one.
-    """
-
-    def __init__(self, world: World, drawn: Drawn, seed: int):
-        self._world, self._share = world, drawn.number("action_noise")
-        self._random, self._random_rng = drawn.number("random_actions"), rng_for(seed, "random actions")
-        self._noise, self._knock_rng = rng_for(seed, "action noise"), rng_for(seed, "knock")
-        self._knock = _ends(drawn.values["knock"]) if "knock" in drawn.values else None
-        low, high = _ends(drawn.values.get("knock_step", -1))
-        self._knock_step = int(self._knock_rng.integers(low, high, endpoint=True)) if self._knock else -1
-        name = next((name for name in drawn.values if name in KINDS), "")
-        self._kind, self._kind_step = KINDS.get(name), int(drawn.number(name, -1))
-        if self._kind is not None and name not in kinds_for(world.scene.task):
-            raise UsageError(f"perturbation {name!r} needs an object; {world.scene.task.name} has none")
-        self._kind_rng = rng_for(seed, f"perturbation {name}")
-
-    @staticmethod
-    def of(world: World, drawn: Drawn, seed: int) -> Events | None:
-        """Return what happens in an episode; None for nothing."""
-        return (
-            Events(world, drawn, seed)
-            if drawn.values.keys() & {"knock", "action_noise", "random_actions", *KINDS}
-            else None
+    def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
+        self._world = world
+        self._share, self._random = drawn.get("action_noise", 0.0), drawn.get("random_actions", 0.0)
+        self._noise, self._random_rng = rng_for(seed, "action noise"), rng_for(seed, "random actions")
+        self._knock, self._knock_rng = _ends(drawn.get("knock", 0.0)), rng_for(seed, "knock")
+        self._knock_step = (
+            int(self._knock_rng.integers(*_ends(drawn["knock_step"]), endpoint=True)) if "knock" in drawn else -1
         )
+        name = next((name for name in drawn if name in KINDS), "")
+        self._kind, self._kind_step = KINDS.get(name), drawn.get(name)
+        self._kind_rng = rng_for(seed, f"perturbation {name}")
 
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; returns whether a perturbation changed it.
@@ -215,7 +212,7 @@ class Events:
         was, bit for bit.
         """
         world = self._world
-        if self._knock is not None and step == self._knock_step:
+        if step == self._knock_step:
             move_object(world, self._knock_rng, self._knock)
         if self._kind is None or self._kind.change is None or step != self._kind_step:
             return False
@@ -255,6 +252,24 @@ def _settle(world: World) -> None:
     """Compute everything that follows from positions, contacts too."""
     world.update()
     mujoco.mj_forward(world.model, world.data)
+
+
+def _turn_arm(
+    world: World,
+    rng: np.random.Generator,
+    largest: float,
+    put: Callable[[F64], None],
+    is_free: Callable[[], bool],
+) -> None:
+    """Put the arm's joints up to `largest` [rad] from where they are, drawn until it is free; else where they were."""
+    scene = world.scene
+    low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
+    before = world.data.qpos[scene.arm_q].copy()
+    for _ in range(_MAX_DRAWS):
+        put(np.clip(before + rng.uniform(-largest, largest, len(before)), low, high))
+        if is_free():
+            return
+    put(before)
 
 
 def _move_arm(world: World, before: F64, q: F64) -> None:

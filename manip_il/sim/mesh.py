@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import UsageError, shorten
 
-SUFFIXES = (".stl", ".obj")
 MOST_FACES = 200_000  # MuJoCo's
-_TEXT = re.compile(r"mesh:(?P<path>.+?)(?P<length>:\d*\.?\d+)?", re.DOTALL)
-_HASH = re.compile(r"#[0-9a-f]{12}$")
+_LARGEST = 256 * 1024**2  # of a file [bytes]
+_TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P<length>:\d*\.?\d+)?", re.DOTALL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +48,11 @@ def parse_mesh(text: str) -> Mesh:
 
     LENGTH: of its longest side [m]; without one the file is in metres. Raises `UsageError`.
     """
-    if (path := mesh_path(text)) is None:
+    if (found := _TEXT.fullmatch(text)) is None:
         raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
-    if _HASH.search(path):
+    if found["hash"]:
         raise UsageError(f"object {text} is a mesh whose name alone is known here; give --task.object={nameable(text)}")
-    return _read(path, float(text.removeprefix(f"mesh:{path}")[1:] or 0))
+    return _read(found["path"], float((found["length"] or ":0")[1:]))
 
 
 def mesh_path(text: str) -> str | None:
@@ -64,7 +63,8 @@ def mesh_path(text: str) -> str | None:
 
 def is_stored(text: str) -> bool:
     """Return whether a text has the name and hash of a mesh, as data have it, and not its file."""
-    return _HASH.search(mesh_path(text) or "") is not None
+    found = _TEXT.fullmatch(text)
+    return bool(found and found["hash"])
 
 
 def nameable(text: str) -> str:
@@ -80,11 +80,7 @@ def moved(text: str, path: Path) -> str:
 @cache
 def _read(name: str, length: float) -> Mesh:
     path = Path(name)
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"object is mesh:{name}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
-    if not path.is_file():
-        raise UsageError(f"{name} does not exist; expected a mesh, an STL or OBJ file")
-    content = path.read_bytes()
+    content = checks.read_bytes(path, "a mesh, an STL or OBJ file", _LARGEST, UsageError)
     solid = _solid(name, content, path.suffix.lower())
     scale = length / solid.extents.max() if length else 1.0
     vertices, volume = (solid.vertices - solid.center_mass) * scale, float(solid.volume) * scale**3
@@ -105,20 +101,11 @@ def _solid(name: str, content: bytes, suffix: str) -> Any:
         solid = trimesh.Trimesh(found.vertices, found.faces)
     except Exception as error:
         raise UsageError(f"{name} is no mesh that can be read: {checks.one_line(error)}") from error
-    if not len(solid.faces):
-        raise UsageError(f"{name} is no mesh: it has no faces")
     if len(solid.faces) > MOST_FACES:
         raise UsageError(f"{name} has {len(solid.faces):,} faces; expected at most {MOST_FACES:,}: simplify it first")
     if not solid.is_watertight:
-        edges = np.unique(solid.edges_sorted, axis=0, return_counts=True)[1]
-        raise UsageError(
-            f"{name} is not closed: {int((edges != 2).sum()):,} of its edges are not shared by two faces; "
-            "close its holes in a mesh editor"
-        )
-    if not solid.is_winding_consistent:
-        solid.fix_normals()
-    if solid.volume < 0:
-        solid.invert()
+        raise UsageError(f"{name} is not closed; close its holes in a mesh editor")
+    solid.fix_normals(multibody=False)
     if not solid.volume > 1e-9 * solid.extents.max() ** 3:
         raise UsageError(f"{name} has a volume of {solid.volume:g}; expected a solid")
     return solid

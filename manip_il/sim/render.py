@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import math
 import os
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import mujoco
@@ -46,7 +47,7 @@ def pictures(
     the same bytes in any order.
     Raises `RenderError`, which says what to unset or install, where there is no off-screen OpenGL.
     """
-    renderer = _process.renderer(scene, cameras.look)
+    renderer = _renderer(scene, cameras.look)
     renderer.pose(data, scene.nominal if variation is None else variation)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
@@ -57,7 +58,7 @@ def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]
     Across and down from 0 to 1, and 1 for a point within the picture; zeros for any other. A point may be hidden by
     something before it. Raises what `pictures` raises.
     """
-    renderer = _process.renderer(scene, cameras.look)
+    renderer = _renderer(scene, cameras.look)
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
 
 
@@ -69,14 +70,46 @@ def framed_picture(
     x is red, y green, z blue. size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures`
     raises.
     """
-    renderer = _process.renderer(scene, look)
+    renderer = _renderer(scene, look)
     renderer.pose(data, scene.nominal)
     return renderer.picture(camera, size, axes=True)
 
 
 def close() -> None:
     """Free this process's OpenGL context; the next picture makes another."""
-    _process.close()
+    if _context.cache_info().currsize and _context()[0] == os.getpid():  # a forked child has nothing to free
+        _, gl = _context()
+        gl.make_current()
+        _prepared.cache_clear()
+        gl.free()
+        _context.cache_clear()
+
+
+def _renderer(scene: Scene, look: Look) -> _Renderer:
+    """The renderer that was used last, else another in its place, in this process's OpenGL context."""
+    try:
+        process, gl = _context()
+        if process == os.getpid():
+            gl.make_current()
+            return _prepared(scene, look)
+    except Exception as error:  # mujoco raises many kinds, from ImportError to its own
+        raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {remedy()}") from error
+    raise RenderError("OpenGL does not survive a fork; start processes that make pictures by 'spawn'")
+
+
+@cache
+def _context() -> tuple[int, Any]:
+    """The process that made an OpenGL context, and the context."""
+    made_by = context_class()  # without OpenGL not even this can be imported
+    setattr(made_by, "_context", None)  # noqa: B010 - its destructor wants it even where its constructor failed
+    gl = made_by(1, 1)  # its size does not matter, pictures have a buffer of their own
+    atexit.register(close)
+    return os.getpid(), gl
+
+
+@lru_cache(1)
+def _prepared(scene: Scene, look: Look) -> _Renderer:
+    return _Renderer(scene, look)
 
 
 class _Renderer:
@@ -132,9 +165,6 @@ class _Renderer:
         inside = ((found[:, :2] >= 0) & (found[:, :2] <= 1)).all(axis=1) & np.isfinite(ahead)
         return np.where(inside[:, None], found, 0.0).astype(np.float32)
 
-    def close(self) -> None:
-        self._context.free()
-
     def _make_room(self, height: int, width: int) -> None:
         """Pictures of all sizes share one buffer, which only grows: they may alternate at no cost."""
         have_height, have_width = self._context.offHeight, self._context.offWidth
@@ -148,54 +178,6 @@ def _free_camera(view: Overview) -> mujoco.MjvCamera:
     camera.lookat[:] = view.at
     camera.distance, camera.azimuth, camera.elevation = view.distance, view.azimuth, view.elevation
     return camera
-
-
-class _Process:
-    """This process's OpenGL context and the renderer that was used last."""
-
-    def __init__(self) -> None:
-        self._gl: Any = None
-        self._pid = 0  # of the process that made the context
-        self._key: tuple[Scene, Look] | None = None
-        self._renderer: _Renderer | None = None
-
-    def renderer(self, scene: Scene, look: Look) -> _Renderer:
-        key = (scene, look)
-        if self._gl is not None and self._pid != os.getpid():
-            raise RenderError("OpenGL does not survive a fork; start processes that make pictures by 'spawn'")
-        try:
-            self._make_current()
-            if self._renderer is None or self._key != key:
-                self._close_renderer()
-                self._renderer, self._key = _Renderer(*key), key
-        except Exception as error:  # mujoco raises many kinds, from ImportError to its own
-            raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {remedy()}") from error
-        return self._renderer
-
-    def close(self) -> None:
-        if self._gl is None or self._pid != os.getpid():  # a forked child has nothing to free
-            return
-        self._make_current()
-        self._close_renderer()
-        self._gl.free()
-        self._gl = None
-
-    def _make_current(self) -> None:
-        if self._gl is None:
-            context = context_class()  # without OpenGL not even this can be imported
-            setattr(context, "_context", None)  # noqa: B010 - its destructor wants it even where its constructor failed
-            self._gl = context(1, 1)  # its size does not matter, pictures have a buffer of their own
-            self._pid = os.getpid()
-            atexit.register(self.close)
-        self._gl.make_current()
-
-    def _close_renderer(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-
-_process = _Process()
 
 
 def _coarser(fine: NDArray[np.uint8]) -> Picture:

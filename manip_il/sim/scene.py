@@ -9,18 +9,16 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.action_space import ActionSpace, ServoUnits
-from manip_il.robots.geometry import outline
+from manip_il.robots.geometry import outline, require_free_home
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import TABLE_BEYOND, CameraPose, Robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
-from manip_il.sim.posture import require_free_home
 from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
@@ -96,7 +94,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
     hulls = {
         name: Hull(model, one.body, one.geom, robot.ee.lowest, gripper.most)
         for name, one in objects.items()
-        if _is_mesh(model, one.geom)
+        if model.geom_type[one.geom] == int(mujoco.mjtGeom.mjGEOM_MESH)
     }
     _check_objects(robot, task, model, objects, gripper, hulls)
     require_free_home(robot, model, PREFIX)
@@ -119,7 +117,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
 
 def _yaws(robot: Robot, model: mujoco.MjModel, roll: Any) -> tuple[float, float]:
     """Least and greatest yaw of the hand, off the one that counts as none, that its last joint turns it to [rad]."""
-    if robot.yaw == "world" or not roll.limited[0]:
+    if not robot.faces_ahead or not roll.limited[0]:
         return -np.inf, np.inf
     data, yaws = mujoco.MjData(model), []
     for turn in (0.0, _TURN):
@@ -144,10 +142,6 @@ def _objects(model: mujoco.MjModel) -> dict[str, Object]:
             name, geom = model.body(body).name, int(model.body_geomadr[body])
             objects[name] = Object(name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
     return objects
-
-
-def _is_mesh(model: mujoco.MjModel, geom: int) -> bool:
-    return int(model.geom_type[geom]) == int(mujoco.mjtGeom.mjGEOM_MESH)
 
 
 def _check_objects(
@@ -246,14 +240,15 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
     touching = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
     fixed = [i for i in range(model.ngeom) if model.body_weldid[model.geom_bodyid[i]] == 0]
     root = [i for i in touching if i in fixed]
-    corners = np.array([_corner_lows(model, data, i) for i in root or fixed or touching])
-    lowest = float(corners[:, 2].min())
+    placed = [outline(model, data, i) for i in root or fixed or touching]
+    middles = np.array([(one.max(axis=0) + one.min(axis=0))[:2] / 2 for one in placed])
+    lowest = min(float(one[:, 2].min()) for one in placed)
     floor = -robot.table.height
     height = lowest - 0.01 - floor
-    on_table = abs(lowest) < _ON_TABLE and abs(corners[:, 0].mean() - _table_x(robot)) < robot.table.size[0] / 2
+    on_table = abs(lowest) < _ON_TABLE and abs(middles[:, 0].mean() - _table_x(robot)) < robot.table.size[0] / 2
     if height <= 0.02 or on_table:
         return
-    x, y = corners[:, :2].mean(axis=0)
+    x, y = middles.mean(axis=0)
     spec.worldbody.add_geom(
         name="pedestal",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -261,12 +256,6 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
         pos=[x, y, floor + height / 2],
         rgba=[0.28, 0.29, 0.32, 1],
     )
-
-
-def _corner_lows(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
-    """The middle of a geom in x and y, and its lowest z [m], (3,); of its box, where it is no mesh."""
-    placed = outline(model, data, geom)
-    return np.append((placed.max(axis=0) + placed.min(axis=0))[:2] / 2, placed[:, 2].min())
 
 
 def _add_cameras(spec: mujoco.MjSpec, robot: Robot) -> None:

@@ -6,7 +6,7 @@ whole world, what `Condition` names so: see `_WORLD`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,49 +105,23 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     size is the edge or width [m]; an object of a drawn shape is of wood. camera_shift and camera_turn are there a
     camera.
     """
-    split = len(base) - WORLD_SIZE
-    world = base[split:].copy()
-    for name, place in _PLACES.items():
-        value = _value(name, drawn)
-        if value is not None:
-            world[place] = float(GEOMS[value]) if isinstance(value, str) else value
-    return np.concatenate([_objects_with(base[:split], drawn), world])
-
-
-def _value(name: str, drawn: Mapping[str, Any]) -> Any:
-    """Return what is drawn by the name of a state's numbers, of a camera where that names one; None for nothing."""
-    what, _, camera = name.partition(".")
-    value = drawn.get(what)
-    return value.get(camera) if camera and value is not None else value
-
-
-def _resized(size: F64, drawn: Mapping[str, Any]) -> F64:
-    """Return a `geom_size` (3,) [m] with the shape and the size that are drawn, if any; see `Shape.of_width`."""
-    if "shape" in drawn:
-        return _padded(Shape.of_width(drawn["shape"], drawn.get("size", _width(size))).size)
-    return size * (drawn["size"] / 2 / size.max()) if "size" in drawn else size
-
-
-def _width(size: F64) -> float:
-    """The edge or width [m] of a thing of a drawn shape."""
-    return 2 * float(size.max())
-
-
-def _padded(size: Sequence[float]) -> F64:
-    return np.array([*size, *[0.0] * (3 - len(size))])
-
-
-def _objects_with(objects: F64, drawn: Mapping[str, Any]) -> F64:
-    rows = objects.copy().reshape(-1, PER_OBJECT)
+    varied = base.copy()
+    rows = varied[: len(base) - WORLD_SIZE].reshape(-1, PER_OBJECT)
     for row in rows:
-        row[_SIZE] = _resized(row[_SIZE], drawn)
+        width = 2 * float(row[_SIZE].max())
         if "shape" in drawn:
-            row[_MASS] = Shape.of_width(drawn["shape"], _width(row[_SIZE])).mass
-    if "mass" in drawn:
-        rows[:, _MASS] = drawn["mass"]
-    if "friction" in drawn:
-        rows[:, _FRICTION] = drawn["friction"]
-    return rows.reshape(-1)
+            shape = Shape.of_width(drawn["shape"], drawn.get("size", width))
+            row[_SIZE], row[_MASS] = [*shape.size, *[0.0] * (3 - len(shape.size))], shape.mass
+        elif "size" in drawn:
+            row[_SIZE] *= drawn["size"] / width
+    for name, column in (("mass", _MASS), ("friction", _FRICTION)):
+        rows[:, column] = drawn.get(name, rows[:, column])
+    for name in _WORLD:
+        what, _, camera = name.partition(".")
+        if what in drawn:
+            value = drawn[what][camera] if camera else drawn[what]
+            part(varied, name)[:] = float(GEOMS[value]) if what == "shape" else value
+    return varied
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
@@ -169,16 +143,15 @@ def apply(
     plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst` afterwards, for what
     follows from masses.
     """
-    split = len(variation) - WORLD_SIZE
     _apply_dynamics(model, plain, motors, variation)
     shape = float(part(variation, "shape")[0])
-    _apply_shape(model, plain, objects, None if shape == _OWN else _KINDS[shape])
-    _apply_objects(model, plain, objects, variation[:split].reshape(-1, PER_OBJECT))
+    rows = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)
+    for one, row in zip(objects.values(), rows, strict=True):
+        _apply_object(model, plain, one, row, None if shape == _OWN else _KINDS[shape])
 
 
-def _apply_dynamics(model: mujoco.MjModel, plain: mujoco.MjModel, motors: NDArray[np.int64], variation: F64) -> None:
+def _apply_dynamics(changed: Any, plain: mujoco.MjModel, motors: NDArray[np.int64], variation: F64) -> None:
     """Multiply the arm's damping and gains: kv with the root of kp's factor, which keeps the damping ratio."""
-    changed: Any = model
     damping, gain = (float(part(variation, name)[0]) for name in ("joint_damping", "actuator_gain"))
     dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
     changed.dof_damping[dofs] = plain.dof_damping[dofs] * damping
@@ -187,43 +160,26 @@ def _apply_dynamics(model: mujoco.MjModel, plain: mujoco.MjModel, motors: NDArra
     changed.actuator_biasprm[motors, 2] = plain.actuator_biasprm[motors, 2] * np.sqrt(gain)  # -kv
 
 
-def _apply_shape(
-    model: mujoco.MjModel, plain: mujoco.MjModel, objects: Mapping[str, Object], shape: str | None
-) -> None:
-    changed: Any = model
-    for geom in (one.geom for one in objects.values()):
-        own = int(plain.geom_type[geom]), int(plain.geom_condim[geom]), float(plain.geom_friction[geom, 2])
-        kind, condim, rolling = own if shape is None else (int(GEOMS[shape]), *contact(shape))
-        changed.geom_type[geom], changed.geom_condim[geom], changed.geom_friction[geom, 2] = kind, condim, rolling
-
-
-def _apply_objects(
-    model: mujoco.MjModel, plain: mujoco.MjModel, objects: Mapping[str, Object], rows: NDArray[np.float64]
-) -> None:
-    changed: Any = model
-    for one, row in zip(objects.values(), rows, strict=True):
-        size, mass, friction = row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
-        kind, own = int(model.geom_type[one.geom]), int(plain.geom_type[one.geom])
-        if kind != _MESH:
-            _apply_size(changed, plain, one, kind, size)
-        if kind == own and np.array_equal(size, plain.geom_size[one.geom]):
-            inertia = plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
-        else:
-            inertia = _inertia(kind, size, mass)
-        changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
-        # Of two geoms that touch, the larger friction counts unless one has priority: here the drawn one counts.
-        drawn = friction != plain.geom_friction[one.geom, 0]
-        changed.geom_friction[one.geom, 0] = friction
-        changed.geom_priority[one.geom] = 1 if drawn else plain.geom_priority[one.geom]
-
-
-def _apply_size(changed: Any, plain: mujoco.MjModel, one: Object, kind: int, size: F64) -> None:
-    extent = extents(kind, size)
-    changed.geom_size[one.geom] = size
-    changed.geom_rbound[one.geom] = _bound(kind, size)
-    changed.geom_aabb[one.geom, 3:] = extent / 2
-    for node in range(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body]):
-        changed.bvh_aabb[node, 3:] = extent / 2
+def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, shape: str | None) -> None:
+    geom, size, mass, friction = one.geom, row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
+    own = int(plain.geom_type[geom])
+    kind, condim, rolling = own, int(plain.geom_condim[geom]), float(plain.geom_friction[geom, 2])
+    if shape is not None:
+        kind, (condim, rolling) = int(GEOMS[shape]), contact(shape)
+    if kind != _MESH:
+        nodes = slice(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body])
+        changed.geom_size[geom], changed.geom_rbound[geom] = size, _bound(kind, size)
+        changed.geom_aabb[geom, 3:] = changed.bvh_aabb[nodes, 3:] = extents(kind, size) / 2
+    if kind == own and np.array_equal(size, plain.geom_size[geom]):
+        inertia = plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
+    else:
+        inertia = _inertia(kind, size, mass)
+    changed.geom_type[geom], changed.geom_condim[geom] = kind, condim
+    changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
+    # Of two geoms that touch, the larger friction counts unless one has priority: here the drawn one counts.
+    drawn = friction != plain.geom_friction[geom, 0]
+    changed.geom_friction[geom, 0], changed.geom_friction[geom, 2] = friction, rolling
+    changed.geom_priority[geom] = 1 if drawn else plain.geom_priority[geom]
 
 
 def extents(kind: int, size: F64) -> F64:

@@ -65,9 +65,6 @@ class Window:
     Raises `RenderError` where there is no display.
     """
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> None:
-        """Return nothing, as a copied environment opens a window of its own."""
-
     def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):
         require_display()
         import mujoco.viewer

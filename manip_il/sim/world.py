@@ -94,28 +94,26 @@ class World:
     """One scene's physics, and what can be read from it by name.
 
     model and data change their identity with the variation: the shared model as compiled, or one of this world's own.
-    Poses need kinematics to be up to date (`update`).
+    ee: the frame between the fingertips, z out of the hand, y along the fingers' motion. Poses need kinematics to be up
+    to date (`update`).
     """
 
     def __init__(self, scene: Scene):
-        self.scene = scene
+        self.scene, self.robot, self.gripper = scene, scene.robot, scene.gripper
         self.variation = scene.nominal
-        self.model, self.data = scene.model, mujoco.MjData(scene.model)
-        self._plain = self.model, self.data
+        self._plain = scene.model, mujoco.MjData(scene.model)
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
         self._cache: dict[Any, Any] = {}  # until the world moves
-        self._poses: dict[str, Pose] = {}  # until the data change their identity
-        self._ee: Pose | None = None
-        self._shapes: dict[str, tuple[int, tuple[float, ...]]] = {}  # until the model changes
+        self._use(*self._plain)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> World:
-        """Return another world of the same scene in the same state: what points into these data is not copied."""
-        other = World(self.scene)
-        other.restore(self.physics(), self.variation)
-        return other
+    def _use(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self.model, self.data = model, data
+        at, self._poses = self.scene.ee_site, dict[str, Pose]()
+        self.ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))  # which follows it as the world moves
+        self._shapes: dict[str, tuple[int, tuple[float, ...]]] = {}
 
     def __reduce__(self) -> NoReturn:
-        raise ManipError("an environment cannot be pickled; pickle its configuration and get_state() instead")
+        raise ManipError("an environment cannot be copied or pickled; make another and give it get_state()")
 
     # Physics
 
@@ -125,17 +123,14 @@ class World:
         if variation.tobytes() == self.variation.tobytes():
             return
         self._cache.clear()
-        self._poses.clear()
-        self._ee = None
-        self._shapes.clear()
         self.variation = variation.copy()
         if variations.same_physics(variation, self.scene.nominal):
-            self.model, self.data = self._plain
+            self._use(*self._plain)
             return
         if self._own is None:
             model = copy.copy(self.scene.model)  # physics reads masses and sizes from there
             self._own = model, mujoco.MjData(model)
-        self.model, self.data = self._own
+        self._use(*self._own)
         variations.apply(self.model, self.scene.model, self.scene.objects, self.scene.arm_ctrl, variation)
         mujoco.mj_setConst(self.model, self.data)  # what follows from masses
 
@@ -179,14 +174,6 @@ class World:
             self._cache[key] = compute()
         return self._cache[key]
 
-    @property
-    def ee(self) -> Pose:
-        """The frame between the fingertips: z out of the hand, y along the fingers' motion."""
-        if self._ee is None:
-            at, data = self.scene.ee_site, self.data
-            self._ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))
-        return self._ee
-
     def pose(self, name: str) -> Pose:
         """Return the pose of a body, which follows it as the world moves. Raises `UnknownName`."""
         pose = self._poses.get(name)
@@ -204,40 +191,11 @@ class World:
     @property
     def opening(self) -> float:
         """Opening between the gripper's pads."""
-        return self.remember("opening", lambda: self.scene.gripper.opening(self.data.qpos))
-
-    @property
-    def most_opening(self) -> float:
-        """Opening between the pads of the open gripper."""
-        return self.scene.gripper.most
-
-    @property
-    def lowest(self) -> float:
-        """Height of `ee` over the table at which the fingertips just clear it."""
-        return self.scene.robot.ee.lowest
+        return self.remember("opening", lambda: self.gripper.opening(self.data.qpos))
 
     def ahead(self, position: F64) -> float:
         """Return the yaw that counts as none for a hand at a position (3,) [rad]."""
-        return yaw_ahead(self.scene.robot, self.data.xanchor[self.scene.shoulder], position)
-
-    @property
-    def faces_ahead(self) -> bool:
-        """Whether the hand's yaw counts from straight ahead of the shoulder, and not along the world's x."""
-        return self.scene.robot.yaw != "world"
-
-    @property
-    def leans(self) -> bool:
-        """Whether the arm has too few joints for a hand that points down everywhere."""
-        return self.scene.robot.leans
-
-    @property
-    def lopsided(self) -> bool:
-        """Whether one jaw alone moves."""
-        return self.scene.gripper.lopsided
-
-    def middle(self, opening: float) -> float:
-        """Return where the middle between the pads is along the hand's y, at an opening [m]."""
-        return self.scene.gripper.middle(opening)
+        return yaw_ahead(self.robot, self.data.xanchor[self.scene.shoulder], position)
 
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
         """Return the ways round, off straight ahead, to which a hand at a position (3,) [m] can turn for a yaw [rad].
@@ -259,12 +217,12 @@ class World:
     def hand_yaw(self) -> float:
         """Yaw of the hand [rad]."""
         hand = self.ee.rotation
-        return angle_across(hand) if self.scene.robot.leans else angle_ahead(hand)
+        return angle_across(hand) if self.robot.leans else angle_ahead(hand)
 
     def off_down(self, yaw: float) -> float:
         """Return how far the hand is from pointing down at a yaw [rad]; only off the yaw, of an arm that leans."""
         hand = self.ee.rotation
-        return off_yaw(hand, yaw) if self.scene.robot.leans else angle_from_down(hand, yaw)
+        return off_yaw(hand, yaw) if self.robot.leans else angle_from_down(hand, yaw)
 
     def extents(self, name: str) -> tuple[float, ...]:
         """Return lengths of an object along its own axes x, y and z; of a mesh those of a box about its origin."""
@@ -294,7 +252,7 @@ class World:
     def touched(self, name: str) -> bool:
         """Return whether every finger touches an object."""
         geom = self.scene.objects[name].geom
-        return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geom))
+        return self.remember(("touched", name), lambda: self.gripper.touches(self.model, self.data, geom))
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:
         """Return the ways from an object's centre to the nearest points of what stands around it, x and y, within 8 cm.
@@ -327,12 +285,7 @@ class World:
     @cached_property
     def reach(self) -> Reach:
         """Map of the points that the hand, pointing down, gets to."""
-        return reach_of(self.scene.robot)
-
-    @cached_property
-    def has_goal(self) -> bool:
-        """Whether the task shows where things are to go."""
-        return mujoco.mj_name2id(self.scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL) >= 0
+        return reach_of(self.robot)
 
     @cached_property
     def _mocap_goal(self) -> int:

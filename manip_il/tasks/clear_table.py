@@ -69,7 +69,7 @@ def _all_in(world: World) -> bool:
 def _rise(world: World) -> Target:
     """Stand over the box."""
     at = world.pose(BOX).position + [0.0, 0.0, 0.2]
-    return Target(at, hand_down(world.ahead(at)), world.most_opening)
+    return Target(at, hand_down(world.ahead(at)), world.gripper.most)
 
 
 _LET_GO, _CARRY = drop_rungs(current, _to, _inside, tuple(COLOURS))

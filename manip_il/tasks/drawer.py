@@ -131,7 +131,7 @@ def _leave(world: World) -> Target:
     """Straight up from the handle; the fingers open as they rise over it."""
     ee = world.ee.position
     over = min(1.0, max(0.0, (ee[2] - BAR_Z) / LEFT[2]))
-    opening = FINGERS + over * (world.most_opening - FINGERS)
+    opening = FINGERS + over * (world.gripper.most - FINGERS)
     return Target(np.array([ee[0], ee[1], BAR_Z + HOVER]), hand_down(_yaw(world)), opening)
 
 

@@ -122,28 +122,28 @@ def _grasp(world: World, name: str) -> Grasp:
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
     neighbours = world.neighbours(name)
     yaw, width, length, (off_x, off_y, off_z) = _nearest(
-        lie, world, position, world.most_opening - LEAST_ROOM, neighbours
+        lie, world, position, world.gripper.most - LEAST_ROOM, neighbours
     )
     x, y, z = position.tolist()
     x, y, z = x + off_x, y + off_y, z + off_z
-    lean = 0.0 if world.leans else world.reach.lean((x, y, z))
+    lean = 0.0 if world.robot.leans else world.reach.lean((x, y, z))
     angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
     ee_x, ee_y, ee_z = ee.position.tolist()
     dx, dy, dz = x - ee_x, y - ee_y, z - ee_z
-    aside = world.middle(width + 2 * BESIDE_JAW)  # of the object before a hand of which one jaw alone moves [m]
+    aside = world.gripper.middle(width + 2 * BESIDE_JAW)  # of the object before a hand of which one jaw alone moves [m]
     at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
-    room = max(0.0, world.most_opening - width)  # what the open gripper leaves beside it [m]
+    room = max(0.0, world.gripper.most - width)  # what the open gripper leaves beside it [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
     way = at_x - ee_x, at_y - ee_y
     half = lie.tall / 2 if lie.above is None else lie.above
-    away = math.hypot(*(_beside_jaw(*way, yaw, -dz < half) if world.lopsided else way))
+    away = math.hypot(*(_beside_jaw(*way, yaw, -dz < half) if world.gripper.lopsided else way))
     off = away + ANGLE_AS_LENGTH * max(0.0, angle - free)
     slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
-    funnel = slope * max(0.0, off - min(BY_JAW if world.lopsided else FUNNEL_RADIUS, TIGHT * room))
-    crowding = 1.0 if world.lopsided else _crowding(yaw, world.most_opening, neighbours)
+    funnel = slope * max(0.0, off - min(BY_JAW if world.gripper.lopsided else FUNNEL_RADIUS, TIGHT * room))
+    crowding = 1.0 if world.gripper.lopsided else _crowding(yaw, world.gripper.most, neighbours)
     narrower = max(0.0, room - NARROW) * crowding
     across, along, ahead = (a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist())
-    offset = across, along - world.middle(width), ahead
+    offset = across, along - world.gripper.middle(width), ahead
     return Grasp(
         offset=offset,
         width=width,
@@ -152,8 +152,8 @@ def _grasp(world: World, name: str) -> Grasp:
         settled=lie.tilt < MAX_TILT or is_inside(offset, CLOSING) or world.at_rest(name),
         yaw=yaw,
         angle=angle,
-        at=(at_x, at_y, max(z, world.lowest, z + half - DEEPEST)),
-        wide=world.most_opening - narrower,
+        at=(at_x, at_y, max(z, world.robot.ee.lowest, z + half - DEEPEST)),
+        wide=world.gripper.most - narrower,
         open_enough=world.opening >= width + min(OPEN_SLACK, OPEN_SHARE * room),
         off=off,
         height=min(half + HOVER, funnel),
@@ -183,7 +183,7 @@ def _nearest(
     go around [m]. neighbours: ways to what stands around the object; a grasp between whose fingers they are comes last.
     """
     grasps, at, ahead = lie.grasps[lie.level], world.hand_yaw, world.ahead(position)
-    if world.faces_ahead:
+    if world.robot.faces_ahead:
         at = world.turned(position)
         grasps = [
             (way, width, length, centre)

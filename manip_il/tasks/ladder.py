@@ -75,7 +75,7 @@ def _is_between(world: World, name: str, half: float) -> bool:
     """Whether the centre of a mesh as long as 2 `half` [m] is between the fingers."""
     (x, y, z), ee = IN_HAND, world.ee
     across, along, ahead = (world.pose(name).position - ee.position).dot(ee.rotation).tolist()
-    return is_inside((across, along - world.middle(world.opening), ahead), (half + x, y, half + z))
+    return is_inside((across, along - world.gripper.middle(world.opening), ahead), (half + x, y, half + z))
 
 
 def at_grasp(world: World, name: str) -> bool:
@@ -110,7 +110,7 @@ def close_on(world: World, name: str) -> Target:
     """Close the fingers at the object's position."""
     g = grasp_of(world, name)
     at = np.array(g.at)
-    if world.lopsided:  # the jaw that moves brings the object to the other; the hand does not follow
+    if world.gripper.lopsided:  # the jaw that moves brings the object to the other; the hand does not follow
         across = np.array([math.sin(g.yaw), -math.cos(g.yaw), 0.0])
         at += across * float(across @ (world.ee.position - at))
     return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
@@ -123,19 +123,19 @@ def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:
     height = lift.over(off)
     sideways = min(1.0, max(0.0, 1.0 - (z + height) / lift.rise_first)) if off > lift.free else 1.0
     position = world.ee.position + [sideways * x, sideways * y, z + height]
-    position[2] = max(position[2], world.lowest)
+    position[2] = max(position[2], world.robot.ee.lowest)
     return Target(position, hand_down(world.ahead(position)), CLOSED, max_step=lift.max_step)
 
 
 def let_go(world: World, name: str, height: float) -> Target:
     """Open the fingers about an object, no wider than frees it; then straight up to a height over its centre [m]."""
     g, ee = grasp_of(world, name), world.ee
-    beyond = min(RELEASE, world.most_opening - g.width)
+    beyond = min(RELEASE, world.gripper.most - g.width)
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
     up = world.pose(name).position[2] + height if free else ee.position[2]
     at = np.array([*ee.position[:2], up])
-    if world.lopsided:  # the jaw that stands goes off the object, as the other one does
-        along = g.offset[1] + world.middle(g.width) - world.middle(g.width + beyond)
+    if world.gripper.lopsided:  # the jaw that stands goes off the object, as the other one does
+        along = g.offset[1] + world.gripper.middle(g.width) - world.gripper.middle(g.width + beyond)
         at[:2] += along * ee.rotation[:2, 1]
     return Target(at, hand_down(world.hand_yaw), g.width + beyond)
 

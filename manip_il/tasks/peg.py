@@ -134,7 +134,7 @@ def _grip(world: World) -> Grip:
     angle = angle_between(ee.rotation, rotation)
     off = math.hypot(*(position - ee.position)[:2]) + 0.05 * max(0.0, angle - 0.1)
     height = min(OVER, SLOPE * max(0.0, off - FREE))
-    slack = min(OPEN_SLACK, _OPEN_SHARE * (world.most_opening - width))
+    slack = min(OPEN_SLACK, _OPEN_SHARE * (world.gripper.most - width))
     return Grip(position, rotation, off, angle, height, world.opening >= width + slack)
 
 

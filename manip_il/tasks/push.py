@@ -52,7 +52,7 @@ LEANING_HAND = Hand(0.065, 0.02, 0.045, 0.006)  # of a weak arm: on its way down
 
 
 def _style(world: World) -> Hand:
-    return LEANING_HAND if world.leans else UPRIGHT_HAND
+    return LEANING_HAND if world.robot.leans else UPRIGHT_HAND
 
 
 def _way(world: World) -> tuple[F64, float]:
@@ -65,7 +65,7 @@ def _way(world: World) -> tuple[F64, float]:
 def _across(world: World, direction: F64) -> F64:
     """Rotation of a hand that points down with its fingers across the push: of two, the nearer one, (3, 3)."""
     yaw, puck = math.atan2(direction[1], direction[0]), world.pose(PUCK).position
-    if world.faces_ahead:
+    if world.robot.faces_ahead:
         at, turns = world.turned(puck), world.turns(yaw, math.pi, puck)
     else:
         at, turns = world.hand_yaw, [yaw - math.pi, yaw, yaw + math.pi]
@@ -74,13 +74,13 @@ def _across(world: World, direction: F64) -> F64:
 
 def _hand(world: World) -> F64:
     """Return where the hand pushes: the middle between its fingers when they are open for that, (3,) [m]."""
-    return world.ee.position + world.ee.rotation[:, 1] * world.middle(_style(world).opening)
+    return world.ee.position + world.ee.rotation[:, 1] * world.gripper.middle(_style(world).opening)
 
 
 def _to(world: World, position: F64, direction: F64, max_step: float = 0.12) -> Target:
     """Target of a hand whose middle between the fingers is to be at a position (3,) [m], across a push (2,)."""
     rotation, opening = _across(world, direction), _style(world).opening
-    return Target(position - rotation[:, 1] * world.middle(opening), rotation, opening, max_step=max_step)
+    return Target(position - rotation[:, 1] * world.gripper.middle(opening), rotation, opening, max_step=max_step)
 
 
 def _behind(world: World) -> tuple[float, float]:
@@ -109,7 +109,7 @@ def _low_enough(world: World, behind: float) -> float:
     """Height under which a hand pushes that is some way behind the puck's middle [m]."""
     style = _style(world)
     apart = min(1.0, max(0.0, (behind - style.touching) / (style.behind - style.touching)))
-    return world.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
+    return world.robot.ee.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
 
 
 def _push(world: World) -> Target:
@@ -117,7 +117,7 @@ def _push(world: World) -> Target:
     behind, _ = _behind(world)
     on_line = world.pose(PUCK).position[:2] - direction * behind
     ahead = on_line + direction * (distance + max(0.0, behind - _style(world).behind))
-    return _to(world, np.append(ahead, world.lowest + LOW), direction, STEP)
+    return _to(world, np.append(ahead, world.robot.ee.lowest + LOW), direction, STEP)
 
 
 def _around(world: World) -> Target:
@@ -126,7 +126,7 @@ def _around(world: World) -> Target:
     hand = _hand(world)
     to = world.pose(PUCK).position[:2] - direction * _style(world).behind
     off = math.hypot(*(to - hand[:2]))
-    height = world.lowest + LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))
+    height = world.robot.ee.lowest + LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))
     sideways = min(1.0, max(0.0, 1.0 - (height - hand[2]) / 0.03))
     return _to(world, np.append(hand[:2] + sideways * (to - hand[:2]), height), direction)
 
@@ -203,5 +203,5 @@ class Push:
         direction, distance = _way(world)
         if _at_goal(world) or _pushes(world):
             return 0.5 + 0.5 * nearness(distance)
-        to = np.append(world.pose(PUCK).position[:2] - direction * _style(world).behind, world.lowest + LOW)
+        to = np.append(world.pose(PUCK).position[:2] - direction * _style(world).behind, world.robot.ee.lowest + LOW)
         return 0.45 * nearness(math.dist(to, _hand(world)))

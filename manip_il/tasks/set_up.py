@@ -170,7 +170,7 @@ def _let_stand(world: World) -> Target:
     free = world.opening > width + LET_GO and not world.touched(PEG)
     up = 0.1 if free else 0.0
     return Target(
-        ee.position + [0.0, 0.0, up], ee.rotation.copy(), min(width + RELEASE, world.most_opening), max_step=0.04
+        ee.position + [0.0, 0.0, up], ee.rotation.copy(), min(width + RELEASE, world.gripper.most), max_step=0.04
     )
 
 
@@ -214,7 +214,7 @@ def _approach(world: World) -> Target:
     too_low = grip.position[2] + height - ee[2]
     sideways = min(1.0, max(0.0, 1.0 - too_low / 0.03))
     position = np.append(ee[:2] + sideways * (grip.position - ee)[:2], grip.position[2] + height)
-    return Target(position, grip.rotation, world.most_opening, max_turn=TURN)
+    return Target(position, grip.rotation, world.gripper.most, max_turn=TURN)
 
 
 def hangs(world: World) -> bool:

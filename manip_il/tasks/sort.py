@@ -104,7 +104,7 @@ def _put_back(world: World) -> Target:
     centre, row = world.scene.robot.workspace.centre[1], world.pose(BINS[name]).position[1]
     inwards = FROM_BINS - abs(at[1] - row)  # still to go until it is off the bins
     if inwards <= 0:
-        return Target(ee - [0.0, 0.0, max(0.0, low)], hand_down(0.0), CLOSED if low > 0.008 else world.most_opening)
+        return Target(ee - [0.0, 0.0, max(0.0, low)], hand_down(0.0), CLOSED if low > 0.008 else world.gripper.most)
     missing = WALL + _HIGH - low
     sideways = min(1.0, max(0.0, 1.0 - missing / 0.03)) * math.copysign(inwards + 0.02, centre - row)
     return Target(ee + [0.0, sideways, missing], hand_down(0.0), CLOSED)
@@ -157,7 +157,7 @@ def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) 
 
 
 def _rise(world: World) -> Target:
-    return Target(world.pose(BINS[asked(world)]).position + [0.0, 0.0, AWAY], hand_down(0.0), world.most_opening)
+    return Target(world.pose(BINS[asked(world)]).position + [0.0, 0.0, AWAY], hand_down(0.0), world.gripper.most)
 
 
 _LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS))

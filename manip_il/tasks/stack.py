@@ -46,7 +46,7 @@ def stands(world: World) -> bool:
 def _rests(world: World) -> bool:
     """Whether the upper cube is on the base as a hand that leans puts it there: it lies level once it is let go."""
     x, y, z = (world.pose(TOP).position - place_on_base(world)).tolist()
-    return world.leans and math.hypot(x, y) < ON_XY and abs(z) < LEANS_Z and lie_of(world, TOP).tilt < LEANS
+    return world.robot.leans and math.hypot(x, y) < ON_XY and abs(z) < LEANS_Z and lie_of(world, TOP).tilt < LEANS
 
 
 def _may_let_go(world: World) -> bool:
@@ -129,7 +129,7 @@ class Stack:
         if stands(world):
             if _hand_is_away(world):
                 return 1.0
-            return 0.9 + 0.1 * min(1.0, world.opening / world.most_opening)
+            return 0.9 + 0.1 * min(1.0, world.opening / world.gripper.most)
         if held(world, TOP):
             return 0.5 + 0.4 * carry_progress(world, TOP, place_on_base(world), OVER_BASE)
         return 0.45 * grasp_progress(world, TOP)

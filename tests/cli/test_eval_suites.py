@@ -61,7 +61,7 @@ def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, 
     counts = {name: one["n_episodes"] for name, one in data["by_condition"].items()}
     assert counts == {one.name: 2 for one in conditions}
     for episode in data["episodes"]:
-        assert episode["drawn"] == dict(draw(conditions, episode["seed"]).values)
+        assert episode["drawn"] == dict(draw(conditions, episode["seed"]))
     assert data["settings"]["suite"] == "all"
     out = capsys.readouterr().out
     assert all(f"|{name} " in out for name in data["by_condition"])

@@ -11,7 +11,7 @@ import pytest
 from manip_il.cli.main import main
 from manip_il.errors import RenderError
 from manip_il.evaluation import robot_check
-from manip_il.robots.reach import Reach, keep_reach
+from manip_il.robots import reach
 from manip_il.robots.table import get_robot
 
 from ..robots.own import tree_of, write
@@ -25,7 +25,9 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def with_map(path: Path) -> Path:
-    keep_reach(get_robot(str(path)), Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21))))
+    place = reach._place(get_robot(str(path)))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(place, origin=np.array([-1.0, -1.0, 0.0]), errors=np.zeros((41, 41, 21)))
     return path
 
 

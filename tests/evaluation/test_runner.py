@@ -16,7 +16,7 @@ from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.runner import evaluate
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import NOMINAL, draw
+from manip_il.sim.conditions import NOMINAL, turn_of
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
 
@@ -64,7 +64,7 @@ def test_an_episode_of_a_suite_is_that_of_its_condition_alone(act):
     together = {one.seed: one for one in evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it").episodes}
     nominal = {one.seed: one for one in evaluate(Engine(1), job_of(act), SEEDS, "it").episodes}
     same = [seed for seed in SEEDS if together[seed].detail["end"] == nominal[seed].detail["end"]]
-    assert same == [seed for seed in SEEDS if draw(ALL, seed).condition == NOMINAL.name]
+    assert same == [seed for seed in SEEDS if turn_of(ALL, seed) == NOMINAL]
     assert len(same) == 3
 
 
@@ -73,8 +73,8 @@ def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
     env = env_of(ENV, conditions=ALL)
     for episode in result.episodes:
         env.start(episode.seed)
-        assert episode.detail["drawn"] == dict(env.drawn.values)
-        assert episode.detail["condition"] == env.drawn.condition
+        assert episode.detail["drawn"] == env.drawn
+        assert episode.detail["condition"] == turn_of(ALL, episode.seed).name
     assert {episode.detail["condition"] for episode in result.episodes} == {one.name for one in ALL}
     assert result.settings.suite == "all"
     assert result.settings.conditions == ALL

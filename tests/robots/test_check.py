@@ -10,9 +10,9 @@ import pytest
 from manip_il.evaluation.robot_check import (
     check_starts,
 )
+from manip_il.robots.geometry import meeting_at
 from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
-from manip_il.sim.posture import meeting_at
 from manip_il.sim.scene import PREFIX
 from manip_il.tasks.envs import scene_of
 

@@ -1,4 +1,4 @@
-"""Where a model's files are found, and that a text without end neither hangs the program nor takes all memory."""
+"""Where a model's files are found."""
 
 from __future__ import annotations
 

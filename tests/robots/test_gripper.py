@@ -32,7 +32,7 @@ def with_cube(robot: str, opening: float, offset: tuple[float, float, float]) ->
     world.data.qpos[gripper.q] = gripper.command(opening)
     world.update()
     mujoco.mju_mat2Quat(quat, world.ee.rotation.ravel())
-    middle = np.array([0.0, world.middle(opening), 0.0])
+    middle = np.array([0.0, world.gripper.middle(opening), 0.0])
     world.place(OBJECT, world.ee.position + world.ee.rotation @ (middle + offset), quat)
     world.update()
     return world
@@ -94,7 +94,7 @@ def test_the_cube_is_touched_by_all_fingers_or_not_at_all(robot: str, openings, 
 @given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.008, 0.008), st.floats(-0.008, 0.008), st.floats(0.005, 0.02))
 def test_what_no_finger_is_near_is_never_touched(robot: str, x: float, z: float, beside: float):
     # The distance of two boxes that stand apart is now and then said to be none.
-    room = world_of(robot).most_opening - EDGE
+    room = world_of(robot).gripper.most - EDGE
     assert not with_cube(robot, EDGE + min(room, 2 * beside), (x, 0, z)).touched(OBJECT)
 
 
@@ -107,4 +107,4 @@ def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
         world.data.qpos[gripper.q] = gripper.command(opening)
         world.update()
         lowest = min(float(outline(world.model, world.data, geom)[:, 2].min()) for geom in gripper.geoms)
-        assert lowest - (float(world.ee.position[2]) - world.lowest) > top + 1e-3
+        assert lowest - (float(world.ee.position[2]) - world.robot.ee.lowest) > top + 1e-3

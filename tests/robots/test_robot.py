@@ -158,9 +158,9 @@ def test_the_fingers_move_along_the_hands_y(robot: str):
         places.append(np.array([world.data.geom_xpos[pads[0]] for pads in gripper.pads]))
     moved = (places[1] - places[0]) @ world.ee.rotation
     moves = moved[np.abs(moved).max(axis=1) > 1e-9]  # of some one jaw alone
-    assert len(moves) == 2 - world.lopsided
+    assert len(moves) == 2 - world.gripper.lopsided
     assert (np.abs(moves[:, 1]) > 0.02).all()
-    assert world.leans or (np.abs(moves[:, [0, 2]]) < 0.4 * np.abs(moves[:, [1]])).all()
+    assert world.robot.leans or (np.abs(moves[:, [0, 2]]) < 0.4 * np.abs(moves[:, [1]])).all()
 
 
 @every_robot

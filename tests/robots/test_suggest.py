@@ -25,17 +25,19 @@ def model_in(folder: Path, jaws: str) -> Path:
 @pytest.mark.parametrize("jaws", JAWS)
 def test_hand_and_fingers_are_found_and_which_way_they_open(jaws: str, tmp_path: Path):
     found, said = suggest(model_in(tmp_path, jaws)), tree_of(jaws)["gripper"]
-    assert found.hand == "hand"
-    assert set(found.joints) == set(said["joints"])
-    assert set(found.fingers) == set(said["fingers"])
-    assert np.sign(np.subtract(found.open, found.closed)).tolist() == [1.0, 1.0]
+    gripper = found["gripper"]
+    assert found["hand"] == "hand"
+    assert set(gripper["joints"]) == set(said["joints"])
+    assert set(gripper["fingers"]) == set(said["fingers"])
+    assert np.sign(np.subtract(gripper["open"], gripper["closed"])).tolist() == [1.0, 1.0]
 
 
 def test_one_jaw_that_moves_has_the_hand_for_the_other():
     found = suggest(get_robot("so101").files.model)
-    assert (found.hand, found.joints) == ("gripper", ("gripper",))
-    assert found.fingers == ("gripper", "moving_jaw_so101_v1")
-    assert found.open[0] > found.closed[0]
+    gripper = found["gripper"]
+    assert (found["hand"], gripper["joints"]) == ("gripper", ["gripper"])
+    assert gripper["fingers"] == ["gripper", "moving_jaw_so101_v1"]
+    assert gripper["open"] > gripper["closed"]
 
 
 def test_a_gripper_of_its_own_goes_onto_the_last_body(tmp_path: Path):
@@ -43,8 +45,8 @@ def test_a_gripper_of_its_own_goes_onto_the_last_body(tmp_path: Path):
     arm.write_text(ARM.replace("FINGERS", '<body name="flange"><geom size="0.01"/></body>'))
     gripper.write_text(f'<mujoco><worldbody><body name="palm">{JAWS["slides"][0]}</body></worldbody></mujoco>')
     found = suggest(arm, gripper)
-    assert found.hand == "flange"
-    assert set(found.joints) == {"left", "right"}
+    assert found["hand"] == "flange"
+    assert set(found["gripper"]["joints"]) == {"left", "right"}
 
 
 def test_an_arm_without_fingers_is_refused_in_one_line(tmp_path: Path):

@@ -12,7 +12,7 @@ from manip_il.tasks.envs import make_env
 from manip_il.tasks.sort import asked
 from manip_il.tasks.table import TASKS
 
-from ..scenes import started
+from ..scenes import has_goal, started
 from ..tables import every_scene, every_scene_with_cubes
 
 
@@ -31,7 +31,7 @@ def test_the_hand_and_a_goal_are_shown_where_they_are(robot: str, task: str):
     np.testing.assert_allclose(vector(values, "ee"), ee.position, atol=1e-6)
     np.testing.assert_allclose(vector(values, "ee.axis_y"), ee.rotation[:, 1], atol=1e-6)
     np.testing.assert_allclose(vector(values, "ee.axis_z"), ee.rotation[:, 2], atol=1e-6)
-    if env.world.has_goal:
+    if has_goal(env.world):
         np.testing.assert_allclose(vector(values, "goal"), env.world.goal, atol=1e-6)
         np.testing.assert_allclose(env.world.goal, env.data.mocap_pos[0])
 

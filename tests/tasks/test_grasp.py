@@ -96,8 +96,8 @@ def test_objects_of_any_shape_are_observed_by_the_same_numbers():
     drawn = set[str]()
     for seed in range(20):
         env.start(seed)
-        drawn.add(env.drawn.values["shape"])
-        alike = f"{env.drawn.values['shape']}:0.05"
+        drawn.add(env.drawn["shape"])
+        alike = f"{env.drawn['shape']}:0.05"
         other = make_env(object=alike)
         other.set_state(State(env.world.physics(), other.scene.nominal, 0))
         ours = dict(zip(environment_state_names(env.scene), env.observe().environment_state, strict=True))

@@ -77,7 +77,7 @@ def _to_goal(world: World) -> Target:
     heading = world.goal if _at_goal(world) else _look(world)[1]
     at, ee = world.pose(OBJECT).position, world.ee.position
     position = ee + (0.0 if heading is None else heading - at)
-    position[2] = max(position[2], world.lowest)
+    position[2] = max(position[2], world.robot.ee.lowest)
     beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # where a hand that turns would meet a thing
     yaw = world.hand_yaw if beside else world.ahead(position)
     return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
