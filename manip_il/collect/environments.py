@@ -17,6 +17,7 @@ from manip_il.data.fingerprint import canonical_json, environment_fingerprint
 from manip_il.data.schema import OPENINGS, SERVOS, RobotTaskSpec
 from manip_il.mdp import STATE_EXTRAS
 from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.spec import model_bytes
 from manip_il.robots.table import is_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
@@ -122,8 +123,5 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
     if not config.object:  # as before there was any
         del settings["object"]
-    if config.robot in STOCK:
-        model = described_stock(config.robot, config.task).model_bytes
-    else:
-        model = config_scene(config).model_bytes()
-    return environment_fingerprint(model, settings) | own
+    made = described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)
+    return environment_fingerprint(model_bytes(made.model), settings) | own

@@ -16,7 +16,6 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +25,7 @@ from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import CLEARANCE, Body
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import angle_off_vertical, hand_down, off_yaw
-from manip_il.robots.spec import arm_spec
+from manip_il.robots.spec import arm_spec, model_bytes
 from manip_il.robots.table import get_robot
 
 if TYPE_CHECKING:
@@ -66,8 +65,7 @@ class Reach:
         """Whether the hand gets to all corners of each cell of the grid, (x - 1, y - 1, z - 1)."""
         there = self.errors < ARRIVES
         for axis in range(3):
-            low, high = np.delete(there, -1, axis), np.delete(there, 0, axis)
-            there = low & high
+            there = np.delete(there, -1, axis) & np.delete(there, 0, axis)
         return there
 
     @cached_property
@@ -148,11 +146,9 @@ def _place(robot: Robot) -> Path:
 def _key(robot: Robot) -> str:
     """Hash what a map follows from: the constants of this file, the YAML, and the robot's model as it is compiled."""
     constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, CLEARANCE)
-    model = arm_spec(robot).compile()
-    compiled = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, compiled)
+    compiled = model_bytes(arm_spec(robot).compile())
     said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))  # paths do not count
-    return hashlib.sha256(repr((constants, said)).encode() + compiled.tobytes()).hexdigest()[:16]
+    return hashlib.sha256(repr((constants, said)).encode() + compiled).hexdigest()[:16]
 
 
 def _solve(robot: Robot) -> Reach:

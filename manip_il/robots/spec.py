@@ -136,6 +136,13 @@ def arm_model(robot: Robot) -> mujoco.MjModel:
     return spec.compile()
 
 
+def model_bytes(model: mujoco.MjModel) -> bytes:
+    """Return a compiled model, byte for byte: what a fingerprint hashes."""
+    buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
 def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
     """Raise `UnknownName` for a name that a model has not; kind: of what it names."""
     known = [one.name for one in there if one.name and one.name != "world"]

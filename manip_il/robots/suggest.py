@@ -69,10 +69,6 @@ def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
     }
 
 
-def _moves(body: Any) -> bool:
-    return bool(body.joints or body.find_all("joint"))
-
-
 def _depth(body: Any) -> int:
     """Joints one after another, at most, from a body on."""
     return len(body.joints) + max((_depth(child) for child in body.bodies), default=0)
@@ -82,7 +78,7 @@ def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
     """The body at which the chain of joints parts into fingers, and the first body of each; one jaw alone may be."""
     body = spec.worldbody
     while True:
-        moving = [child for child in body.bodies if _moves(child)]
+        moving = [child for child in body.bodies if _depth(child)]
         longest = max(moving, key=_depth, default=None)
         if longest is None:
             break
@@ -100,7 +96,7 @@ def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
 def _flange(body: Any) -> Any:
     """The body that a gripper is put on: the last of the chain, or what is fixed to it and named so."""
     while True:
-        moving = [child for child in body.bodies if _moves(child)]
+        moving = [child for child in body.bodies if _depth(child)]
         if not moving:
             break
         body = max(moving, key=_depth)

@@ -88,15 +88,10 @@ class Shape:
         """Text that means it, as short as can be."""
         if self.mesh is not None:
             return self.mesh.text
-        ways = ((self.lengths[0],), (self.lengths[0], self.lengths[2]), self.lengths)
-        fitting = (way for way in ways if (len(way) == 3) <= (self.kind == "box") and self._is(way))
-        return f"{self.kind}:{'x'.join(f'{length:.12g}' for length in next(fitting))}"
-
-    def _is(self, numbers: tuple[float, ...]) -> bool:
-        try:
-            return _lengths(self.kind, *numbers) == self.lengths
-        except TypeError:
-            return False
+        numbers = self.lengths if self.kind == "box" else self.lengths[::2]
+        if _lengths(self.kind, self.lengths[0]) == self.lengths:
+            numbers = self.lengths[:1]
+        return f"{self.kind}:{'x'.join(f'{length:.12g}' for length in numbers)}"
 
     @property
     def size(self) -> tuple[float, ...]:

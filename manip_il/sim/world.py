@@ -83,12 +83,6 @@ class Scene:
         """Robot and task, for messages."""
         return f"{self.robot.name} {self.task.name}"
 
-    def model_bytes(self) -> bytes:
-        """Return the compiled model, byte for byte: what a fingerprint hashes."""
-        buffer = np.zeros(mujoco.mj_sizeModel(self.model), dtype=np.uint8)
-        mujoco.mj_saveModel(self.model, None, buffer)
-        return buffer.tobytes()
-
 
 class World:
     """One scene's physics, and what can be read from it by name.

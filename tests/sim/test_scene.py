@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il.robots.spec import model_bytes
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.scene import build_scene
@@ -49,7 +50,7 @@ def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str):
 def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: str):
     scene = scene_of(robot, task)
     assert scene_of(robot, task) is scene
-    assert build_scene.__wrapped__(get_robot(robot), TASKS[task]).model_bytes() == scene.model_bytes()
+    assert model_bytes(build_scene.__wrapped__(get_robot(robot), TASKS[task]).model) == model_bytes(scene.model)
 
 
 @every_scene

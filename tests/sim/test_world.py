@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il.robots.spec import model_bytes
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.envs import scene_of
@@ -44,14 +45,14 @@ def test_a_world_as_compiled_shares_its_scenes_model(robot: str, task: str):
 
 
 def test_a_varied_world_has_a_model_of_its_own_and_leaves_the_shared_one(world: World):
-    before, other = world.scene.model_bytes(), World(world.scene)
+    before, other = model_bytes(world.scene.model), World(world.scene)
     world.vary(with_drawn(world.scene.nominal, HEAVY))
     assert World(world.scene).model is world.scene.model
     other.vary(with_drawn(world.scene.nominal, {"size": 0.03}))
     assert world.extents(OBJECT)[0] == pytest.approx(0.07)
     assert other.extents(OBJECT)[0] == pytest.approx(0.03)
     fall(world)
-    assert world.scene.model_bytes() == before
+    assert model_bytes(world.scene.model) == before
 
 
 def test_a_variation_is_the_same_world_whatever_it_was_before(world: World):
@@ -61,13 +62,7 @@ def test_a_variation_is_the_same_world_whatever_it_was_before(world: World):
     world.vary(drawn)
     other.vary(drawn)
     assert fall(world) == fall(other)
-    assert model_bytes(world) == model_bytes(other)
-
-
-def model_bytes(world: World) -> bytes:
-    buffer = np.zeros(mujoco.mj_sizeModel(world.model), dtype=np.uint8)
-    mujoco.mj_saveModel(world.model, None, buffer)
-    return buffer.tobytes()
+    assert model_bytes(world.model) == model_bytes(other.model)
 
 
 def test_the_drawn_friction_counts_whatever_the_cube_touches(world: World):

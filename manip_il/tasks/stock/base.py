@@ -33,13 +33,6 @@ class StockBase:
         """State of the task after the last step."""
         return self._streak > 0
 
-    @property
-    def model_bytes(self) -> bytes:
-        """Compiled model of the environment."""
-        buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
-        mujoco.mj_saveModel(self.model, None, buffer)
-        return buffer.tobytes()
-
     def _begin(self, state: State | None = None) -> None:
         """Count from 0, or on from a state."""
         self._step, self._streak, self._ever = (state.step, state.streak, state.ever) if state else (0, 0, False)
