@@ -1,7 +1,7 @@
-"""The learner of GAIL, AIRL and PPO: an mlp in environments of its own, which improves by the rewards that it is given.
+"""The learner of GAIL, AIRL and PPO: an mlp with its own environments, improved by rewards that the algorithm gives it.
 
-An iteration is whole episodes from seeds of its own, and draws from random streams of its own: a run that was killed
-goes on from its last finished iteration to the same bytes.
+Each iteration runs whole episodes, with its own seeds and random streams, so a killed run resumes from its last
+finished iteration to the same bytes.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ Kept = TypeVar("Kept", bound=Discriminator)
 
 
 class Agent:
-    """A policy in environments, and the demonstrations that it imitates, if there are some.
+    """A policy, its environments, and the demonstrations that it imitates, if any.
 
-    number, simulated: iterations and control steps so far; metrics: of the last iteration. validated_at: control steps
-    at the last validation. Raises what `start_conversion` and `read_demonstrations` raise, and `UsageError` for options
-    that do not fit those.
+    number, simulated: iterations and control steps so far; metrics: those of the last iteration. validated_at: control
+    steps at the last validation. Raises what `start_conversion` and `read_demonstrations` raise, and `UsageError` for
+    options that do not match them.
     """
 
     def __init__(self, config: LearningConfig, clock: Stopwatch):
@@ -63,13 +63,13 @@ class Agent:
         self._expert = demonstrations.padded(horizon, actions.normalised) if demonstrations else None
 
     def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
-        """Return a discriminator that belongs to the agent and is saved with it. make: of the actor's network."""
+        """Return `make(network)`, a discriminator that is saved with the agent. network: the actor's."""
         with lent_generators(self._stream("discriminator")):
             self._modules["discriminator"] = made = make(self._policy.model)
         return made
 
     def rollouts(self) -> Transitions:
-        """Begin an iteration with its episodes; return all steps, those of absorbing states too."""
+        """Start an iteration by running its episodes; return all steps, including those in absorbing states."""
         config = self.config
         self.number += 1
         self.envs.seed(stream_seeds("reinforcement", self.number * config.episodes, config.seed)[-config.episodes])
@@ -87,18 +87,18 @@ class Agent:
         return states[:, :n], states[:, n:], np.concatenate(self.envs.executed).astype(np.float32)
 
     def log_prob(self, rows: Transitions) -> F32:
-        """Return rows' log-densities for the learner above their mean [nats], (N,); see `Learner.log_prob`."""
+        """Return the rows' log-densities under the learner minus their mean [nats], (N,); see `Learner.log_prob`."""
         with threads(1):
             return self._learner.log_prob(rows)
 
     def discriminate(self, d: Discriminator, steps: Transitions) -> None:
         """Fit a discriminator to the demonstrations and the agent's steps.
 
-        The demonstrated actions get noise as wide as the learner's first spread: it is then known by where it aims.
-        Without it, it is known by its exploration, which tells it nothing and makes the densities of AIRL meaningless.
+        The demonstrated actions get noise with the learner's initial standard deviation. Without it the discriminator
+        would only detect the learner's exploration noise, and AIRL's densities would be meaningless.
         """
         if self._expert is None:
-            raise UsageError("no demonstrations to tell the learner from; give --dataset.root=DIR")
+            raise UsageError("no demonstrations to compare the learner with; give --dataset.root=DIR")
         rng = rng_for(self._stream("discriminator"), "batches")
         with self._clock.timed("fit"), threads(1):
             expert = self._learner.explored(self._expert, rng)
@@ -108,15 +108,15 @@ class Agent:
         self.metrics |= {f"discriminator_{name}": value for name, value in found.items()}
 
     def improve(self, rewards: F32) -> None:
-        """Let PPO learn from the rewards (N,) of the last rollouts."""
+        """Update the policy by PPO with the rewards (N,) of the last rollouts."""
         self.metrics["return"] = float(rewards.sum() / self.config.episodes)
         remaining = max(0.0, 1.0 - self.simulated / self.config.steps)
-        moves = self.number > self.config.warmup_iterations
+        warm = self.number > self.config.warmup_iterations
         with self._clock.timed("fit"), threads(1), lent_generators(self._stream("updates")):
-            self.metrics |= self._learner.improve(rewards, actor=moves, remaining=remaining)
+            self.metrics |= self._learner.improve(rewards, actor=warm, remaining=remaining)
 
     def save(self, folder: Path) -> None:
-        """Write a checkpoint of the iteration: its policy, and all that the next one needs."""
+        """Write a checkpoint of the iteration: its policy, and everything that the next iteration needs."""
         fingerprint, space = env_fingerprint(self.config.env), self._conversion.space
         origin = Origin.of(self._spec, fingerprint, self._options(), action_space=space)
         step = {"step": self.number, "simulated": self.simulated, "metrics": self.metrics}
@@ -127,7 +127,7 @@ class Agent:
             write_own_files(new, origin, step | {"validated_at": self.validated_at})
 
     def load(self, folder: Path) -> None:
-        """Go on from a checkpoint. Raises `ManipError` for one that is not whole."""
+        """Load a checkpoint to continue from. Raises `ManipError` if it is incomplete."""
         step = read_step(folder)
         with in_one_line(f"{folder} cannot be resumed"), threads(1):
             self.number, self.simulated = int(step["step"]), int(step["simulated"])
@@ -135,14 +135,14 @@ class Agent:
             self._learner.load(folder / TRAINING_STATE, self._modules)
 
     def _options(self) -> dict[str, Any]:
-        """The options that a checkpoint names."""
-        left_out = ("method", "env", "datasets", "start", "reward")
-        kept = {name: value for name, value in asdict(self.config).items() if name not in left_out}
+        """The options that are stored in a checkpoint."""
+        omitted = ("method", "env", "datasets", "start", "reward")
+        kept = {name: value for name, value in asdict(self.config).items() if name not in omitted}
         names = [root.resolve().name for root in self.config.datasets]
         start = self.config.start
         return kept | {"datasets": names, "init": None if start is None else start.resolve().name}
 
     def _stream(self, purpose: str) -> int:
-        """A seed for one purpose of an iteration."""
+        """The seed for one purpose in the current iteration."""
         base = stream_base("reinforcement", self.config.seed)
         return int(rng_for(base + self.number, purpose).integers(2**63))

@@ -1,4 +1,4 @@
-"""Adversarial inverse reinforcement learning: Fu, Luo & Levine, ICLR 2018, algorithm 1, with PPO for its last step."""
+"""Adversarial inverse reinforcement learning: Fu, Luo & Levine, ICLR 2018, algorithm 1, with PPO as its policy step."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from manip_il.learn.discriminators import AirlDiscriminator
 
 
 def airl(run: Run, c: LearningConfig) -> Iterator[Result]:
-    """Yield every iteration: roll out the agent, fit f by D = exp f / (exp f + pi), improve it by f - log pi."""
+    """Yield each iteration: roll out the agent, fit f by D = exp f / (exp f + pi), improve the agent by f - log pi."""
     agent = run.agent()
     d = agent.keep(lambda actor: AirlDiscriminator(c.discriminator, actor, c.discount))
     yield from run.begin(agent)

@@ -1,4 +1,4 @@
-"""Behaviour cloning: a policy is fitted to the expert's own demonstrations, of which every round adds some."""
+"""Behaviour cloning: fit a policy to the expert's own demonstrations; every round adds some."""
 
 import math
 import shutil
@@ -15,7 +15,7 @@ from manip_il.data.atomic import new_folder
 
 
 def cloning(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Yield every round: demonstrate, fit to all demonstrations, validate."""
+    """Yield each round: record demonstrations, fit to all of them, validate."""
     data: list[Rollouts] = []
     for i in range(c.rounds + 1):
         data.append(run.demonstrations(c.episodes_per_round if i else c.demonstrations, i))
@@ -26,10 +26,10 @@ def cloning(run: Run, c: RunConfig) -> Iterator[Result]:
 def clone_with_labels(
     config: RunConfig, labels: int, other: Path, folder: Path, engine: Engine, watch: Watch
 ) -> tuple[Path, int]:
-    """Fit a policy, as every round's is fitted, to `labels` labels of demonstrations alone: the baseline of a run.
+    """Fit a policy to `labels` labels from demonstrations alone, with a round's options: the baseline of a run.
 
-    The demonstrations are those of round 0 of the run in `other`, and the ones that follow in their stream of seeds.
-    Returns the checkpoint and the number of labels.
+    The demonstrations are those of round 0 of the run in `other`, and more from the same stream of seeds.
+    Return the checkpoint and the number of labels.
     """
     run = Run(replace(config, label_budget=labels), folder, engine, watch)
     here, count = round_folder(folder, 0), config.demonstrations

@@ -1,4 +1,4 @@
-"""Options of one run of an algorithm: the driver, the data, and all of it checked against each other."""
+"""Options of one run of an imitation algorithm, and checks that they are consistent."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
-if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
+if TYPE_CHECKING:  # so that `manip-il dagger --help` does not import numpy
     from manip_il.collect.query import Query
     from manip_il.sim.conditions import Condition
 
 
 @dataclass(frozen=True)
 class BetaSchedule:
-    """`kind:parameter`. Round 0 is the expert's own: beta is 1.
+    """A schedule `kind:parameter`. In round 0 only the expert drives: beta is 1.
 
     `constant:0` lets the learner drive alone from round 1 on (the paper's parameter-free choice), `linear:5` falls
-    evenly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round.
+    linearly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round.
     """
 
     kind: str
@@ -32,7 +32,7 @@ class BetaSchedule:
 
     @classmethod
     def parse(cls, text: str) -> BetaSchedule:
-        """Read what `str` writes. Raises `UsageError` for anything else."""
+        """Parse the format of `str`. Raises `UsageError` for anything else."""
         kind, _, parameter = text.partition(":")
         try:
             number = float(parameter)
@@ -47,7 +47,7 @@ class BetaSchedule:
         return f"{self.kind}:{self.parameter:g}"
 
     def __call__(self, round_: int) -> float:
-        """Return the probability that the expert drives a step of this round."""
+        """Return the probability that the expert drives a step in this round."""
         if round_ == 0:
             return 1.0
         if self.kind == "constant":
@@ -57,8 +57,8 @@ class BetaSchedule:
         return self.parameter**round_
 
 
-ALGORITHMS = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}  # each the function and module of its name
-EXPERT_DRIVES = ("cloning", "dart")  # throughout, so that label, query and beta mean nothing
+ALGORITHMS = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}  # keys name modules and functions
+EXPERT_DRIVES = ("cloning", "dart")  # only the expert drives, so label, query and beta have no effect
 
 if TYPE_CHECKING:
     Method = str
@@ -66,61 +66,59 @@ else:
     Method = Literal[*ALGORITHMS]  # the choices of `--method`
 
 _LEARNER_ALONE = BetaSchedule("constant", 0.0)
-_DEFAULTS = ("per_state", None, _LEARNER_ALONE)  # of label, query and beta
+_DEFAULTS = ("per_state", None, _LEARNER_ALONE)  # label, query, beta
 
 
 @dataclass(frozen=True)
 class RunConfig(Seeded):
-    """Options of `manip-il dagger` by their names; round 0 is the expert's own demonstrations unless it is given.
+    """Options of `manip-il dagger`, by name. Round 0 records the expert's demonstrations unless `datasets` has some.
 
-    datasets: recorded demonstrations, in place of those that round 0 would record. start: a `pretrained_model` folder
-    that is round 0's policy, in place of cloning; without datasets, round 0 then has no demonstrations. Later rounds
-    begin with its weights, and have its architecture.
+    datasets: recorded demonstrations that replace those of round 0. start: the `pretrained_model` folder of a policy
+    that replaces cloning in round 0; without datasets, round 0 then has no demonstrations. Later rounds start from its
+    weights and keep its architecture.
 
-    query_rule: None is the default of the label mode, see `query`. hold: of validation's rollouts, too. patience: what
-    follows are the same states again. disturbed_share: under `manip_il.sim.events.STANDARD`. cameras: what is pictured;
-    with redraw, no pictures are recorded. conditions: what the worlds of all episodes differ in, validation's too.
+    query_rule: None for the label mode's default, see `query`. hold: also applies to validation. patience: without
+    progress a rollout only repeats its states. disturbed_share: conditions are `manip_il.sim.events.STANDARD`. cameras:
+    the rendered ones; with redraw, no pictures are recorded. conditions: variations of the world, also in validation.
     """
 
     env: EnvConfig = field(default_factory=make_config)
     method: str = "dagger"
-    demonstrations: int = option(50, "successful expert episodes to begin with (round 0)", at_least=1)
+    demonstrations: int = option(50, "successful expert episodes of round 0", at_least=1)
     rounds: int = option(
         5, "DAgger rounds after round 0; a resumed run may have more", at_least=0, at_most=99, grows=True
     )
     episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones", at_least=1)
-    label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends", at_least=1)
+    label_budget: int | None = option(None, "total number of expert labels at which the run ends", at_least=1)
     beta: BetaSchedule = option(
         lambda: _LEARNER_ALONE, "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B"
     )
     label: Literal["per_state", "takeover", "branch"] = option(
         "per_state",
-        "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
+        "what the expert gives if queried: one action, a drive to the end, or a branch (docs/dagger.md)",
     )
     query_rule: Query | None = None
     branch_steps: int | None = option(
-        None, "control steps of a branch; by default as many as the policy plans", at_least=1
+        None, "control steps of a branch; by default as many as the policy plans ahead", at_least=1
     )
-    ensemble: int = option(
-        1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND", at_least=1
-    )
-    refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
+    ensemble: int = option(1, "policies fitted per round, for --query=ensemble:BOUND; the first one drives", at_least=1)
+    refit: Literal["scratch", "warm"] = option("scratch", "each round's initial weights: random or the last round's")
     refit_steps: int | None = option(
-        None, "gradient steps in later rounds, with --refit=warm; by default as many", at_least=1
+        None, "gradient steps in later rounds, with --refit=warm; by default as many as in round 0", at_least=1
     )
     fit: FitConfig = field(default_factory=FitConfig)
-    validation_episodes: int = option(200, "unseen episodes that choose the best round", at_least=1)
+    validation_episodes: int = option(200, "unseen episodes by which the best round is chosen", at_least=1)
     hold: int = option(10, "control steps of a rollout after success")
     patience: int = option(
-        100, "control steps without progress after which a rollout with a label a state ends", at_least=1
+        100, "control steps without progress after which a rollout ends, if every state gets a label", at_least=1
     )
     disturbed_share: float = option(
-        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions", at_least=0, at_most=1
+        0.5, "share of a round's rollouts with disturbances: knocked object, noisy actions", at_least=0, at_most=1
     )
     cameras: CameraConfig | None = None
     redraw: int = option(
         0,
-        "scenes drawn anew from round 0's states for a policy on pictures, and as many a state in later rounds",
+        "redrawn scenes of round 0's states, for a policy on pictures; later rounds get as many per state",
         at_least=0,
     )
     conditions: tuple[Condition, ...] = ()
@@ -130,40 +128,40 @@ class RunConfig(Seeded):
     def __post_init__(self) -> None:
         check_bounds(self)
         if self.disturbed_share and self.env.robot in STOCK:
-            raise UsageError(f"disturbed_share is {self.disturbed_share}; {self.env.robot} is unmodified, expected 0")
+            raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 for {self.env.robot}")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
             raise UsageError("redraw is for policies on pictures, with --label=per_state")
         if self.method not in ALGORITHMS:
             raise UnknownName("method", self.method, ALGORITHMS)
         if self.method in EXPERT_DRIVES and (self.label, self.query_rule, self.beta) != _DEFAULTS:
-            raise UsageError(f"method {self.method!r} has the expert drive throughout; leave out label, query and beta")
+            raise UsageError(f"only the expert drives in {self.method!r}; leave out label, query and beta")
         if self.fit.takes_images and self.cameras is None:
             raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
         if self.cameras is not None and not self.fit.takes_images:
             raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation")
         if self.method == "dart" and self.cameras is not None:
-            raise UsageError("method 'dart' measures the learner's errors from state vectors; it is not for images")
+            raise UsageError("method 'dart' measures the learner's errors on state vectors; it does not support images")
         self._check_queries()
 
     def _check_queries(self) -> None:
         rule = self.query_rule
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
-            raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
+            raise UsageError(f"beta is '{self.beta}', but label 'takeover' starts with the learner alone; omit beta")
         if self.start is not None and self.ensemble > 1:
-            raise UsageError(f"ensemble is {self.ensemble}, but --policy.path is one policy to begin with")
+            raise UsageError(f"ensemble is {self.ensemble}, but --policy.path gives one policy; expected 1")
         if (rule is not None and rule.kind == "ensemble") != (self.ensemble > 1):
-            raise UsageError(f"ensemble is {self.ensemble}, query '{rule or 'every'}'; ensemble:BOUND takes 2 or more")
+            raise UsageError(f"ensemble is {self.ensemble}, query '{rule or 'every'}'; ensemble:BOUND needs 2 or more")
 
     @property
     def steps_of_branch(self) -> int:
-        """Return the control steps of a branch: those given, else enough to learn a whole plan from."""
+        """Control steps of a branch; by default enough to learn one whole plan from."""
         return self.branch_steps or sum(plan_of(self.fit))
 
     @property
     def query(self) -> Query:
-        """The rule by which the expert is queried, by default one of the label mode.
+        """The rule that decides when the expert is queried; by default it depends on the label mode.
 
-        `per_state`: everywhere; `takeover`: once; `branch`: for as many labels as steps.
+        `per_state`: in every state; `takeover`: once; `branch`: so often that there are as many labels as steps.
         """
         from manip_il.collect.query import Query
 
@@ -173,8 +171,8 @@ class RunConfig(Seeded):
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
-    """Return how many actions a policy plans at once, and how many last frames of an episode it does not learn from."""
-    if fit.is_mlp:  # without LeRobot, whose import takes seconds
+    """Return how many actions a policy plans at once, and how many final frames of an episode it does not learn."""
+    if fit.is_mlp:  # avoids importing LeRobot, which takes seconds
         return 1, 0
     from manip_il.learn.lerobot_config import policy_config
 
@@ -183,9 +181,9 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
 
 
 def check_labels(config: RunConfig) -> None:
-    """Raise `UsageError` for labels that the policy cannot learn from.
+    """Raise `UsageError` for labels that the policy cannot learn from, or for invalid LeRobot options.
 
-    LeRobot's configurations are made for this, which imports it; they raise what is wrong with them, too.
+    This imports LeRobot to construct its configurations.
     """
     from manip_il.learn.lerobot_config import lerobot_options
 
@@ -195,11 +193,11 @@ def check_labels(config: RunConfig) -> None:
     name, rule = fit.policy.get("type", "mlp"), config.query
     if config.label == "per_state" and plan > 1 and rule.kind != "every":
         raise UsageError(
-            f"query={rule} with label=per_state yields single labels, and {name} learns from {plan} in a row; "
+            f"query={rule} with label=per_state gives single labels, but {name} learns from {plan} in a row; "
             "use label=branch or label=takeover"
         )
     if config.label == "branch" and config.steps_of_branch <= dropped:
         raise UsageError(
-            f"branch_steps is {config.steps_of_branch}, but {name} leaves out the last {dropped} frames of "
+            f"branch_steps is {config.steps_of_branch}, but {name} ignores the last {dropped} frames of "
             "every episode; give more, or --policy.drop_n_last_frames=0"
         )

@@ -9,7 +9,7 @@ from manip_il.algorithms.run import Run
 
 
 def dagger(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Yield every round: roll out the learner, query the expert where it went, aggregate, refit, validate."""
+    """Yield each round: roll out the learner, query the expert in the visited states, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)
     yield run.validate(policy)

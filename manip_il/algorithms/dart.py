@@ -1,4 +1,4 @@
-"""DART: demonstrations under noise for the expert that looks like the learner's errors (Laskey et al., CoRL 2017)."""
+"""DART: demonstrations under noise that resembles the learner's errors (Laskey et al., CoRL 2017)."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +17,7 @@ from manip_il.learn.policy import LearnedPolicy, actions_along
 
 
 def dart(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Yield every round: demonstrate under noise like the learner's errors, aggregate, refit, validate."""
+    """Yield each round: demonstrate under noise like the learner's errors, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)
     yield run.validate(policy)
@@ -29,16 +29,16 @@ def dart(run: Run, c: RunConfig) -> Iterator[Result]:
 
 
 def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tuple[float, ...], ...]:
-    """Return the covariance (n, n) of learner minus expert over a dataset of the expert's, for a round's noise.
+    """Return the covariance (n, n) of learner minus expert over an expert's dataset, the noise of the next round.
 
-    Maximum likelihood for a Gaussian with mean zero, as the paper fits it. Best on data that the policy has not
-    learnt from, or its errors are taken for smaller than they are. trust: see `LearnedPolicy.load`. Raises `ManipError`
-    without a sound label.
+    It is the maximum likelihood fit of a Gaussian with mean zero, as in the paper. Use data that the policy was not
+    fitted to, or its errors are underestimated. trust: see `LearnedPolicy.load`. Raises `ManipError` if there is no
+    valid label.
     """
     table = Dataset.open(root).columns((STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX))
-    learner, sound = LearnedPolicy.load(policy, trust=trust), table[LABEL_VALID].reshape(-1) != 0
-    errors = [(actions - table[ACTION][rows])[sound[rows]] for rows, actions in actions_along(learner, table)]
+    learner, valid = LearnedPolicy.load(policy, trust=trust), table[LABEL_VALID].reshape(-1) != 0
+    errors = [(actions - table[ACTION][rows])[valid[rows]] for rows, actions in actions_along(learner, table)]
     off = np.concatenate(errors)
     if not len(off):
-        raise ManipError(f"{root} holds no valid label to compare the policy with")
+        raise ManipError(f"{root} has no valid label to compare the policy with")
     return tuple(map(tuple, (off.T @ off / len(off)).tolist()))

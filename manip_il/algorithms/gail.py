@@ -1,4 +1,4 @@
-"""Generative adversarial imitation learning: Ho & Ermon, NeurIPS 2016, algorithm 1, with PPO for the policy's step."""
+"""Generative adversarial imitation learning: Ho & Ermon, NeurIPS 2016, algorithm 1, with PPO as its policy step."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from manip_il.learn.discriminators import GailDiscriminator
 
 
 def gail(run: Run, c: LearningConfig) -> Iterator[Result]:
-    """Yield every iteration: roll out the agent, fit the discriminator, improve the agent by its reward."""
+    """Yield each iteration: roll out the agent, fit the discriminator, improve the agent by its reward."""
     agent = run.agent()
     d = agent.keep(lambda actor: GailDiscriminator(c.discriminator, actor))
     yield from run.begin(agent)

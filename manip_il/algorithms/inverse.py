@@ -1,7 +1,7 @@
-"""Inverse reinforcement learning on `carry`: a dataset's paths on the grids of their layouts, and what they tell.
+"""Inverse reinforcement learning on `carry`: paths from a dataset, the weights inferred from them, and their report.
 
-Layouts, goals and the object's places are read from what the environment shows; nothing else of a dataset is used.
-What comes out are the weights of a reward, `reward.json`, and the page of `manip-il reward irl`.
+Layouts, goals and object positions are read from `observation.environment_state`; nothing else of a dataset is used.
+The results are the weights of a reward, `reward.json`, and the report of `manip-il reward irl`.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from manip_il.tasks.pick_place import OBJECT
 
 F64 = NDArray[np.float64]
 CARRY = "carry"
-_MOVED = 0.004  # from where it stood, at which an object is on its way [m]
+_MOVED = 0.004  # distance from the start beyond which an object counts as moving [m]
 FILE_NAME = "reward.json"
 _PANELS = 3
-_SIDE = 80  # points along a side of the map
+_SIDE = 80  # points along each side of the map
 
 
 @dataclass(frozen=True)
 class Carried:
-    """Path of an episode. positions: of the object from where it stood to the goal, (T, 3) [m]."""
+    """An episode's path. positions: the object's, from its start to the goal, (T, 3) [m]."""
 
     episode: int
     grid: Grid
@@ -52,17 +52,15 @@ class Carried:
 
 
 def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Carried]:
-    """Return what was carried in a dataset's episodes that reached the goal, in order.
+    """Return the paths of a dataset's successful episodes, in order.
 
-    Raises `ManipError` for a dataset of another task, if no episode reached the goal, and for a path through things.
+    Raises `ManipError` for a dataset of another task, without a successful episode, or with a path through things.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
     places = {name: column for column, name in enumerate(spec.environment_state_names)}
     if f"{EDGE}.here" not in places:
-        raise ManipError(
-            f"{root} is of the task {spec.task}; expected a dataset of manip-il record --task.type={CARRY}"
-        )
+        raise ManipError(f"{root} has the task {spec.task}; expected a dataset of manip-il record --task.type={CARRY}")
     table = dataset.columns([schema.ENVIRONMENT_STATE, schema.SUCCESS, EPISODE_INDEX])
     scene = scene_of(get_robot(spec.robot).name, CARRY, spec.object)
     index = table[EPISODE_INDEX].ravel()
@@ -80,12 +78,12 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
             raise ManipError(f"episode {episode}: the object's path does not lead through free space to the goal")
         found.append(Carried(episode, grid, positions, Demonstration(grid.problem, path)))
     if not found:
-        raise ManipError(f"{root}: in none of its {len(np.unique(index))} episodes the object gets to the goal")
+        raise ManipError(f"{root}: the object reaches the goal in none of its {len(np.unique(index))} episodes")
     return found
 
 
 def carried_stretch(positions: F64, goal: F64) -> F64:
-    """Return the positions (T, 3) [m] from the last at which the object stood to the first at the goal (3,)."""
+    """Return the positions (T, 3) [m] from the last one at rest to the first one at the goal (3,)."""
     moved = np.flatnonzero(np.linalg.norm(positions - positions[0], axis=1) > _MOVED)
     first = max(int(moved[0]) - 1, 0) if len(moved) else 0
     off = np.linalg.norm(positions - goal, axis=1)
@@ -96,7 +94,7 @@ def carried_stretch(positions: F64, goal: F64) -> F64:
 
 @dataclass(frozen=True)
 class Inverse:
-    """Weights and whom they were learnt of. source: the dataset, in words."""
+    """Learnt weights and the paths that they were learnt from. source: the dataset, in words."""
 
     source: str
     carried: tuple[Carried, ...]
@@ -104,19 +102,19 @@ class Inverse:
 
     @property
     def open_names(self) -> tuple[str, ...]:
-        """Features of which nothing is known."""
+        """Features whose weights the demonstrations do not determine."""
         return tuple(FEATURES[k] for k in self.learnt.open)
 
     @cached_property
     def weights(self) -> F64:
-        """Weights to plan with, (K,): those of which nothing is known are 0."""
+        """Weights to plan with, (K,); undetermined ones are 0."""
         found = self.learnt.weights.copy()
         found[list(self.learnt.open)] = 0.0
         return found
 
     @cached_property
     def replanned(self) -> tuple[tuple[NDArray[np.int64], F64], ...]:
-        """The cheapest paths in the demonstrations' places: nodes (n,) and features (K,)."""
+        """Cheapest paths from the demonstrations' starts: nodes (n,) and features (K,) of each."""
         shown = [one.demonstration for one in self.carried]
         return tuple(cheapest_path(one.problem, plan(one.problem, self.weights), one.start) for one in shown)
 
@@ -128,12 +126,12 @@ class Inverse:
 
     @property
     def excess(self) -> float:
-        """Share that the demonstrations cost above the re-planned paths for these weights."""
+        """Excess cost of the demonstrations over the re-planned paths, by these weights, as a share."""
         shown, planned = self.means
         return float(shown @ self.weights / (planned @ self.weights) - 1)
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything for `reward.json`, whose `names` and `weights` a reward is read from."""
+        """Return the content of `reward.json`; a reward is read from `names` and `weights`."""
         known = [k for k in range(len(FEATURES)) if k not in self.learnt.open]
         intervals = self.learnt.intervals
         return {
@@ -150,7 +148,7 @@ class Inverse:
 
 
 def weight_table(found: Inverse) -> Table:
-    """Return the weights, one row a feature."""
+    """Return a table of the weights, one row per feature."""
     learnt, (shown, planned), rows = found.learnt, found.means, []
     for k, name in enumerate(FEATURES):
         weight, interval = f"{learnt.weights[k]:.2f}", ""
@@ -164,17 +162,17 @@ def weight_table(found: Inverse) -> Table:
 
 
 def open_line(found: Inverse) -> str:
-    """Return which weights are not identified, as a sentence; empty if all are."""
+    """Return a sentence that names the weights that are not identified; empty if all are."""
     if not found.open_names:
         return ""
     return (
-        f"All demonstrations agree in {', '.join(found.open_names)}: nothing tells these weights, which are left out "
-        "of the reward (0 when it is planned with)."
+        f"All demonstrations agree in {', '.join(found.open_names)}, so these weights are not identified. The reward "
+        "omits them, and plans with 0 instead."
     )
 
 
 def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> Report:
-    """Return the report of what was learnt."""
+    """Return the report of the learnt weights."""
     weights = Section(
         "What a metre costs",
         tables=(weight_table(found),),
@@ -184,14 +182,14 @@ def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> R
         "The cost over the table",
         figures=(_cost_figure(found),),
         notes=(
-            "Cost of a metre of path at the height at which the object was carried, from above; things in grey. "
-            "Solid: as demonstrated. Dashed: the cheapest path for these weights.",
+            "Cost of a metre of path, seen from above, at the height at which the object was carried; things in grey. "
+            "Solid: demonstrated path. Dashed: cheapest path for these weights.",
         ),
     )
     return Report(
-        title="What the demonstrations care about",
-        verdict=f"{len(found.carried)} demonstrations pay {found.excess:.1%} more than the cheapest paths for the "
-        "weights that were learnt of them.",
+        title="Costs inferred from demonstrations",
+        verdict=f"By the learnt weights, the {len(found.carried)} demonstrations cost {found.excess:.1%} more than the "
+        "cheapest paths.",
         command=command,
         config=config,
         sections=(weights, costs),
@@ -199,7 +197,7 @@ def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> R
 
 
 def _cost_figure(found: Inverse) -> Figure:
-    """The cost of a metre over the table in the layouts with the most on it, with both paths."""
+    """Maps of the cost of a metre, with both paths, for the layouts with the most things on the table."""
     count = [len(one.grid.layout.places) + (one.grid.layout.edge is not None) for one in found.carried]
     chosen = np.argsort(-np.array(count), kind="stable")[:_PANELS].tolist()
     with drawing(len(chosen), size=(3.0, 3.1)) as (drawn, axes):
@@ -218,7 +216,7 @@ def _cost_figure(found: Inverse) -> Figure:
 
 
 def _draw_cost(axis: Any, one: Carried, weights: F64) -> Any:
-    """The cost of a metre from above, at the height of the path's middle, and the things."""
+    """Draw the cost of a metre, seen from above, at the path's median height, and the things."""
     layout, points = one.grid.layout, one.grid.points
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     x, y = (np.linspace(low[k], high[k], _SIDE) for k in (0, 1))

@@ -1,4 +1,4 @@
-"""Reinforcement learning by PPO from a reward that is given (Schulman et al. 2017)."""
+"""Reinforcement learning by PPO with a given reward (Schulman et al. 2017)."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,9 +11,9 @@ from manip_il.learn.transitions import F32
 
 
 def ppo(run: Run, c: LearningConfig, reward: Callable[..., F32] | None = None) -> Iterator[Result]:
-    """Yield every iteration: roll out the agent, improve it by the reward, by default that in `c.reward`.
+    """Yield each iteration: roll out the agent, improve it by the reward, by default the one in `c.reward`.
 
-    reward: of joint states (N, n), environment states (N, k) and absolute actions (N, n), (N,).
+    reward: maps joint states (N, n), environment states (N, k) and absolute actions (N, n) to rewards (N,).
     """
     reward = reward or LearnedReward.load(c.reward or Path())
     agent = run.agent()

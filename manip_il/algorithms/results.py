@@ -1,4 +1,4 @@
-"""What a run says while it goes on, and what it yields: progress, results, the best of them, and their report."""
+"""Progress and results of a run: callbacks, timing, one result per round or iteration, the best one, and the report."""
 
 from __future__ import annotations
 
@@ -25,40 +25,40 @@ VALIDATION = "validation"
 
 @dataclass(frozen=True)
 class Watch:
-    """Functions that a run calls with its progress. An exception from one ends the run; what is on disk stays."""
+    """Callbacks for a run's progress. An exception from one ends the run; files already written remain."""
 
     on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
     on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
-    on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} at a step without metrics
-    on_step: Callable[[], None] = lambda: None  # of anything else
+    on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} for a step without metrics
+    on_step: Callable[[], None] = lambda: None  # for any other step
 
 
 class Stopwatch:
-    """Seconds by stage."""
+    """Seconds spent in each stage."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, float] = {}
 
     @contextmanager
     def timed(self, stage: str) -> Generator[None]:
-        """Add what a stage takes to its seconds."""
+        """Add the time spent inside the `with` block to a stage."""
         started = time.monotonic()
         yield
         self._seconds[stage] = self._seconds.get(stage, 0.0) + time.monotonic() - started
 
     def take(self) -> dict[str, float]:
-        """Return the seconds of every stage since the last call, rounded."""
+        """Return the seconds spent in each stage since the last call, rounded."""
         taken, self._seconds = dict.fromkeys(STAGES, 0.0) | self._seconds, {}
         return {stage: round(seconds, 3) for stage, seconds in taken.items()}
 
 
 @dataclass(frozen=True)
 class Result:
-    """One finished round of imitation, or iteration of reinforcement learning; 0 is what an iteration began with.
+    """One finished round of imitation, or iteration of reinforcement learning; iteration 0 is the initial policy.
 
-    steps, episodes: simulated so far. metrics: of the method, such as `labels`, the sound ones learnt from so far.
-    policy: its checkpoint. validated: None if no validation was due. seconds: by stage, 0 of one that was found
-    finished on disk.
+    steps, episodes: simulated so far. metrics: the method's, such as `labels`, the valid labels learnt from so far.
+    policy: the checkpoint. validated: None if no validation was due. seconds: by stage; 0 for stages that were already
+    on disk.
     """
 
     unit: Literal["round", "iteration"]
@@ -72,14 +72,14 @@ class Result:
 
     @property
     def validation(self) -> EvalResult:
-        """The validation. Raises `ManipError` if none was due."""
+        """Validation result. Raises `ManipError` if none was due."""
         if self.validated is None:
             raise ManipError(f"{self.unit} {self.number} was not validated")
         return self.validated
 
     @property
     def labels(self) -> int:
-        """Sound labels learnt from so far."""
+        """Valid labels learnt from so far."""
         return int(self.metrics["labels"])
 
     def to_json(self) -> dict[str, Any]:
@@ -98,17 +98,17 @@ class Result:
 
 
 def best_result(results: Iterable[Result]) -> Result:
-    """Return the highest validation success; of equals the later, which has seen more."""
+    """Return the result with the highest validation success; among equals the latest, which has seen the most data."""
     return max(results, key=lambda result: (result.validation.success.rate, result.number))
 
 
 def validations(folder: Path) -> dict[int, EvalResult]:
-    """Return the validations of a run of reinforcement learning by iteration, in order."""
+    """Return the validations of a reinforcement learning run, in order, by iteration."""
     return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
 
 
 def best_validation(found: dict[int, EvalResult]) -> int:
-    """Return the iteration with the highest validation success, the later of equals."""
+    """Return the iteration with the highest validation success; among equals the latest."""
     return max(found, key=lambda number: (found[number].success.rate, number))
 
 
@@ -119,9 +119,9 @@ def learning_report(
     command: str,
     config: Mapping[str, Any],
 ) -> Report:
-    """Return the report of a run. found: its validations by iteration, not none. records: lines of metrics.jsonl."""
-    best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "policy given"}
-    facts = ["The best policy was chosen on these episodes, so they flatter it; measure it by manip-il eval."]
+    """Return the report of a run. found: validations by iteration, at least one. records: lines of metrics.jsonl."""
+    best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "initial policy"}
+    facts = ["The best policy was chosen on these episodes, which overestimate it; measure it with manip-il eval."]
     if 0 in found and best:
         facts.insert(0, Comparison(names[0], names[best], ((found[0], found[best]),)).verdict)
     return run_report(

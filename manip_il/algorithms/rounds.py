@@ -1,9 +1,9 @@
-"""The parts of a round of imitation: its rollouts, and the policy that is fitted to those of all rounds.
+"""The parts of an imitation round: its rollouts, and the policy that is fitted to the rollouts of all rounds.
 
-round_003/journals/    every rollout, the moment it ended
-round_003/dataset/     what is learnt from; missing if the expert gave no label
-round_003/redrawn/     scenes drawn anew of its states, if policies learn from those
-round_003/policy/      the fit; policy_1, ... of an ensemble
+round_003/journals/    every rollout, written as soon as it ends
+round_003/dataset/     the training data; missing if the expert gave no label
+round_003/redrawn/     redrawn scenes of its states, if policies learn from those
+round_003/policy/      the fit; the other members of an ensemble are policy_1, ...
 round_003/eval.json    the validation
 """
 
@@ -33,7 +33,7 @@ from manip_il.mdp import Episode
 from manip_il.seeding import stream_base
 
 _LOG = logging.getLogger(__name__)
-CHUNK_STEPS = 20_000  # of a round, for LeRobot's policies, if none are given
+CHUNK_STEPS = 20_000  # default gradient steps per round for LeRobot's policies
 DATASET, JOURNALS, POLICY, REDRAWN = "dataset", "journals", "policy", "redrawn"
 
 
@@ -41,8 +41,8 @@ DATASET, JOURNALS, POLICY, REDRAWN = "dataset", "journals", "policy", "redrawn"
 class Rollouts:
     """One round's episodes. dataset: None if the expert gave no label. beta: the expert's share of the steps.
 
-    labels: sound ones. queries: states in which the expert was queried. episodes, successes: of the rollouts. steps:
-    control steps simulated.
+    labels: valid labels. queries: states in which the expert was queried. episodes, successes: counts of rollouts.
+    steps: simulated control steps.
     """
 
     round: int
@@ -57,9 +57,9 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A round's policy. members: the `pretrained_model` folders of an ensemble, of which the first drives.
+    """A round's policy. members: the `pretrained_model` folders of an ensemble; the first one drives.
 
-    trust: whether models that they name may be loaded.
+    trust: whether to load models that a checkpoint refers to.
     """
 
     round: int
@@ -68,7 +68,7 @@ class Fitted:
 
     @property
     def path(self) -> Path:
-        """Return the checkpoint of the policy that drives."""
+        """Checkpoint of the policy that drives."""
         return self.members[0]
 
 
@@ -83,8 +83,8 @@ def mixture(policy: Fitted, beta: float) -> PolicyDriver:
 
 
 def expert_job(config: RunConfig, round_: int) -> RolloutJob:
-    """Return the expert's rollouts."""
-    cameras = None if config.redraw else config.cameras  # states are enough
+    """Return the job of the expert's rollouts in a round."""
+    cameras = None if config.redraw else config.cameras  # redrawing needs states only
     job = RolloutJob(config.env, ExpertDriver(), config.hold, round=round_, cameras=cameras)
     return replace(job, conditions=config.conditions)
 
@@ -99,11 +99,11 @@ def record_round(
         recording.write(folder / JOURNALS)
         recording.make(episodes, folder / DATASET)
     except NothingToLearnError:
-        _LOG.warning("round %d: no labels, as the expert was queried in none of its rollouts", job.round)
+        _LOG.warning("round %d: no labels, because the expert was never queried", job.round)
 
 
 def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere: bool) -> Rollouts:
-    """Return what lies on disk of a round's rollouts."""
+    """Return a round's rollouts as found on disk."""
     episodes = (read_journal(path)[1] for path in list_episodes(folder / JOURNALS))
     ends = [(len(episode), episode.success) for episode in episodes]
     dataset = folder / DATASET if (folder / DATASET).is_dir() else None
@@ -115,7 +115,7 @@ def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere:
 
 
 def given_rollouts(folder: Path, datasets: Sequence[Path], repo_id: str) -> Rollouts:
-    """Return round 0 made of the datasets that were given, if any; they are copied into the run."""
+    """Return round 0 with the given datasets, if any; they are copied into the run."""
     root = folder / DATASET
     if not datasets:
         return Rollouts(0)
@@ -127,7 +127,7 @@ def given_rollouts(folder: Path, datasets: Sequence[Path], repo_id: str) -> Roll
 
 
 def merge_rounds(datasets: Sequence[Path], root: Path, repo_id: str, best: int) -> None:
-    """Write all rounds' labels as one dataset, unless it is there. best: round, which it names."""
+    """Write all rounds' labels as one dataset, unless it exists. best: the best round, stored in its provenance."""
 
     def episodes(dataset: Path) -> int:
         return Dataset.open(dataset).info.episodes
@@ -142,9 +142,9 @@ def _count_labels(root: Path) -> int:
 
 
 def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
-    """Return the scenes drawn anew of the states of the last of the rounds' datasets.
+    """Return the scenes to redraw from the states of the last dataset.
 
-    As many a state as of round 0's, numbered on from those of the rounds before.
+    There are as many per state as in round 0, and numbers continue after those of earlier rounds.
     """
     assert config.cameras is not None
     states = [len(Dataset.open(dataset)) for dataset in datasets]
@@ -153,7 +153,7 @@ def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
 
 
 def begin_with(policy: Path, folder: Path) -> Path:
-    """Copy a policy into the folder of a round that has nothing to fit; return its `pretrained_model`."""
+    """Copy a policy into the folder of a round without training data; return its `pretrained_model`."""
     last = folder / POLICY / "checkpoints" / "last"
     if not last.is_dir():
         with new_folder(last) as new:
@@ -164,20 +164,20 @@ def begin_with(policy: Path, folder: Path) -> Path:
 def fit_round(
     roots: Sequence[Path], folder: Path, fit: FitConfig, member: int, on_log: Callable[[dict[str, Any]], None]
 ) -> Path:
-    """Fit, or go on with fitting, a policy of a round to datasets; return the checkpoint's `pretrained_model`.
+    """Fit a round's policy to datasets, or resume the fit; return the checkpoint's `pretrained_model`.
 
-    member: of the ensemble. on_log: sees the metrics, {} at a step without.
+    member: index in the ensemble. on_log: is called with each step's metrics, {} if there are none.
     """
-    from manip_il.learn.train import Trainer  # torch stays out of what only rolls out
+    from manip_il.learn.train import Trainer  # rollouts alone do not need torch
 
     into = folder / (f"{POLICY}_{member}" if member else POLICY)
     return Trainer([*map(Dataset.open, roots)], fit, into, resume=True).fit(on_log)
 
 
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
-    """Return the options of one round's fit. init_from: where a warm one starts from.
+    """Return the options of one round's fit. init_from: the policy that a warm fit starts from.
 
-    Any other starts from the run's start policy, if there is one. member: of the ensemble, each from a seed of its own.
+    Without it, a fit starts from the run's start policy, if any. member: index in the ensemble; each has its own seed.
     """
     steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
     if init_from is not None:

@@ -1,14 +1,14 @@
 """One run of a method in a folder: the steps that the loops of `cloning`, `dart`, `dagger`, `gail`, `airl`, `ppo` take.
 
-Every step leaves its result in the folder, whole, and is skipped if that is there already: a run that was killed goes
-on where it was by running its loop again.
+Every step writes its complete result into the folder, and is skipped if the result exists. So a killed run is resumed
+by running its loop again.
 
-    round_003/           of imitation: see `rounds`
-    held_out/            the expert's demonstrations that no policy learns from
-    dataset/             all rounds' labels, once the run has ended
-    checkpoints/last/    of reinforcement learning, the last finished iteration: see `agent`
-    validation/          by iteration, every validated policy and its eval.json
-    best/                the policy with the highest validation success, the later of equals
+    round_003/           imitation: see `rounds`
+    held_out/            imitation: expert demonstrations that no policy learns from
+    dataset/             imitation: all rounds' labels, once the run has ended
+    checkpoints/last/    reinforcement learning: the last finished iteration, see `agent`
+    validation/          reinforcement learning: every validated policy and its eval.json, by iteration
+    best/                the policy with the highest validation success; among equals the latest
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.events import standard_in
 
-if TYPE_CHECKING:  # torch and stable-baselines3 stay out of what only rolls out
+if TYPE_CHECKING:  # rollouts alone do not need torch and stable-baselines3
     from manip_il.algorithms.agent import Agent
 
 BEST, CHECKPOINTS, HELD_OUT = "best", "checkpoints", "held_out"
 
 
 class Run:
-    """A folder, the workers, and what has been made so far.
+    """A run's folder, its workers, and its results so far.
 
     config: a `RunConfig` for imitation, a `LearningConfig` for reinforcement learning.
     """
@@ -77,22 +77,22 @@ class Run:
         self._fitted: Fitted | None = None
 
     def results(self) -> Iterator[Result]:
-        """Run, or go on with, the loop of the method: the function of its name, in the module of its name."""
+        """Run or resume the method's loop: the function with the method's name, in the module of that name."""
         name = self.config.method
         loop = getattr(importlib.import_module(f"manip_il.algorithms.{name}"), name)
         return self.follow(loop(self, self.config))
 
     def follow(self, results: Iterator[Result]) -> Iterator[Result]:
-        """Yield what a loop over the steps of this run yields, until it ends or the label budget is spent.
+        """Yield the results of a loop over this run's steps, until it ends or the label budget is spent.
 
-        Rounds that were finished before are yielded again. After the last, `dataset` holds the labels of all rounds.
+        Rounds that were already finished are yielded again. At the end, `dataset` holds the labels of all rounds.
         """
         rounds: list[Result] = []
         for result in results:
             yield result
             if result.unit == "round":
                 rounds.append(result)
-                if self._left(result.number + 1) == 0:
+                if self._budget(result.number + 1) == 0:
                     break
         if rounds:
             best = best_result(rounds)
@@ -101,7 +101,7 @@ class Run:
             merge_rounds(made, self.folder / DATASET, f"local/{self.config.env.name}_dagger", best.number)
 
     def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
-        """Record `count` successful episodes of the expert as a round's; round 0 may be given, see `RunConfig`."""
+        """Record a round with `count` successful expert episodes; datasets may replace round 0's, see `RunConfig`."""
         here, config = self._folder(round_), self.config
         if round_ == 0 and (config.datasets or config.start):
             with self._clock.timed("collect"):
@@ -114,13 +114,13 @@ class Run:
                 stream = f"round/{round_}" if round_ else "demonstrations"
                 seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
                 episodes = collect_successes(self._engine, job, seeds, count, here / JOURNALS, self._watch.on_episode)
-                recording = Recording(self._repo_id(round_), True, count, provenance(job), labels=self._left(round_))
+                recording = Recording(self._repo_id(round_), True, count, provenance(job), labels=self._budget(round_))
                 record_round(here, job, episodes, recording)
             self._made[round_] = read_rollouts(here, round_, beta=1.0, queried_everywhere=True)
         return self._made[round_]
 
     def held_out(self, count: int = 10) -> Path:
-        """Record episodes of the expert that no policy learns from; return their dataset."""
+        """Record expert episodes that no policy learns from; return their dataset."""
         root, journals = (self.folder / HELD_OUT / name for name in (DATASET, JOURNALS))
         with self._clock.timed("collect"):
             if not root.is_dir():
@@ -133,10 +133,10 @@ class Run:
         return root
 
     def rollouts(self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0) -> Rollouts:
-        """Record a round's episodes, successful or not, with the expert's labels as `config.label` has them.
+        """Record a round's episodes, successful or not, with the expert's labels in the mode `config.label`.
 
-        query: when the expert is queried; None: in every state. disturbed: share of the episodes that run under
-        `STANDARD` as well.
+        query: when the expert is queried; None: in every state. disturbed: share of episodes with the disturbances
+        `STANDARD`.
         """
         here, config, rule = self._folder(round_), self.config, query or Query()
         count = config.episodes_per_round
@@ -152,7 +152,7 @@ class Run:
                     collect(self._engine, hard, seeds[:first], here / JOURNALS, self._watch.on_episode),
                     collect(self._engine, job, seeds[first:], here / JOURNALS, self._watch.on_episode),
                 )
-                name, left = self._repo_id(round_), self._left(round_)
+                name, left = self._repo_id(round_), self._budget(round_)
                 recording = Recording(name, provenance=provenance(job), only_labelled=not job.labels_all, labels=left)
                 record_round(here, job, episodes, recording)
             everywhere = config.label == "per_state" and rule.kind in ("every", "safety")
@@ -160,13 +160,13 @@ class Run:
         return self._made[round_]
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
-        """Fit the policy, and the others of an ensemble after it, to rollouts; it belongs to the last one's round."""
+        """Fit the policy, then the rest of an ensemble, to rollouts; it belongs to the round of the last rollouts."""
         config, before, round_ = self.config, self._fitted, data[-1].round
         here, members = self._folder(round_), list[Path]()
         if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
             members.append(begin_with(config.start, here))
         else:
-            roots = [self._learnt_from(one, one.dataset) for one in data if one.dataset is not None]
+            roots = [self._training_dataset(one, one.dataset) for one in data if one.dataset is not None]
             starts = before.members if before and config.refit == "warm" else (None,) * config.ensemble
             for member, start in enumerate(starts):
                 name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
@@ -178,7 +178,7 @@ class Run:
         return self._fitted
 
     def validate(self, policy: Fitted) -> Result:
-        """Measure a round's policy on the validation's seeds, which ends the round."""
+        """Evaluate a round's policy on the validation seeds; return the round's result."""
         round_, config = policy.round, self.config
         self._watch.on_stage("validate", round_, config.validation_episodes)
         driver = PolicyDriver((policy.path,), trust=config.fit.trust)
@@ -193,7 +193,7 @@ class Run:
             metrics={
                 "beta": here.beta,
                 "labels": sum(one.labels for one in so_far),
-                # More than labels if it must answer to decide (`safety`, the held-out episodes of `dart`).
+                # More than the labels if not every answer becomes one (`safety`, the held-out episodes of `dart`).
                 "queries": sum(one.queries for one in so_far) + self._held_out_steps,
                 "rollout_success": here.successes / max(1, here.episodes),
             },
@@ -203,15 +203,15 @@ class Run:
         )
 
     def agent(self) -> Agent:
-        """Return what reinforcement learning improves, new."""
+        """Return a new agent for reinforcement learning."""
         from manip_il.algorithms.agent import Agent
 
         return Agent(self.config, self._clock)
 
     def begin(self, agent: Agent) -> Iterator[Result]:
-        """Take the agent to its last finished iteration, if there is one; yield that, else the clone that it begins as.
+        """Load the agent's last finished iteration and yield it; without one, yield the initial clone, if any.
 
-        So the line of an iteration is not lost that ended before it was written.
+        So an iteration that was killed before its metrics were written still gets its line.
         """
         checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
         if checkpoint is not None:
@@ -221,7 +221,7 @@ class Run:
             yield self._iteration(agent, start)
 
     def finish(self, agent: Agent) -> Result:
-        """Write the iteration, which ends it; validate its policy if that is due."""
+        """Save the finished iteration; validate its policy if that is due."""
         folder = self.folder / CHECKPOINTS
         agent.save(folder / f"{agent.number:06d}")
         for other in folder.iterdir():
@@ -231,18 +231,18 @@ class Run:
         return self._iteration(agent, folder / "last" / PRETRAINED_MODEL)
 
     def _iteration(self, agent: Agent, policy: Path) -> Result:
-        """The result of an agent's iteration, with a validation if one is due; 0 is always validated."""
+        """The result of an agent's iteration, with a validation if one is due; iteration 0 is always validated."""
         every, validated = self.config.validation_every, None
         due = agent.simulated // every != agent.validated_at // every
         if due or agent.simulated >= self.config.steps or agent.number == 0:
             agent.validated_at = agent.simulated
-            validated = self._validate_kept(policy, agent.number)
+            validated = self._validate_copy(policy, agent.number)
         episodes, seconds = agent.number * self.config.episodes, self._clock.take()
         metrics = agent.metrics
         return Result("iteration", agent.number, agent.simulated, episodes, metrics, policy, validated, seconds)
 
-    def _validate_kept(self, policy: Path, number: int) -> EvalResult:
-        """Evaluate a policy, of which the run keeps a copy, unless that has been done; keep it if it is the best."""
+    def _validate_copy(self, policy: Path, number: int) -> EvalResult:
+        """Copy a policy into the run and evaluate it, unless that is done; copy it to `best` if it is the best."""
         here = self.folder / VALIDATION / f"{number:06d}"
         if not here.is_dir():
             with new_folder(here) as new:
@@ -254,7 +254,7 @@ class Run:
         return found
 
     def _evaluate(self, job: RolloutJob, path: Path, name: str) -> EvalResult:
-        """Evaluate a job on the validation's seeds and write `path`, unless that has been done. name: in the file."""
+        """Evaluate a job on the validation seeds and write `path`, unless it exists. name: stored in the file."""
         with self._clock.timed("validate"):
             if path.is_file():
                 return EvalResult.read(path)
@@ -265,7 +265,7 @@ class Run:
             return found
 
     def _keep_best(self, policy: Path) -> None:
-        """Copy the best policy's `pretrained_model` to where it is looked for."""
+        """Copy the best policy's `pretrained_model` to `best`."""
         with new_folder(self.folder / BEST, replace=True) as new:
             shutil.copytree(policy, new / PRETRAINED_MODEL)
 
@@ -275,15 +275,15 @@ class Run:
     def _repo_id(self, round_: int) -> str:
         return f"local/{self.config.env.name}_round_{round_}"
 
-    def _left(self, round_: int) -> int | None:
-        """Labels that may still be had in a round; None without a limit."""
+    def _budget(self, round_: int) -> int | None:
+        """Labels that the budget still allows in a round; None without a budget."""
         if self.config.label_budget is None:
             return None
-        had = sum(one.labels for one in self._made.values() if one.round < round_)
-        return max(0, self.config.label_budget - had)
+        spent = sum(one.labels for one in self._made.values() if one.round < round_)
+        return max(0, self.config.label_budget - spent)
 
-    def _learnt_from(self, rollouts: Rollouts, dataset: Path) -> Path:
-        """The dataset that policies learn from of a round: its own, or scenes drawn anew of its states."""
+    def _training_dataset(self, rollouts: Rollouts, dataset: Path) -> Path:
+        """A round's training dataset: its own, or redrawn scenes of its states."""
         root = self._folder(rollouts.round) / REDRAWN
         if not self.config.redraw:
             return dataset

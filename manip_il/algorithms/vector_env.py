@@ -1,7 +1,7 @@
-"""Environments in lockstep for reinforcement learning: whole episodes of one length, as stable-baselines3 takes them.
+"""Environments in lockstep for reinforcement learning: whole episodes of equal length, as stable-baselines3 needs them.
 
-Physics alone: no state is kept and no expert is asked. An episode that has ended goes on in an absorbing state, in
-which nothing is simulated (see `manip_il.learn.transitions`).
+They simulate only: no state is stored and no expert is queried. A finished episode continues in an absorbing state,
+in which nothing is simulated (see `manip_il.learn.transitions`).
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ F32, F64 = NDArray[np.float32], NDArray[np.float64]
 
 
 class RobotEpisode:
-    """One of our environments. hold: control steps from success to the end; None: to the last step in any case."""
+    """An episode of our environment. hold: control steps from success to the end; None: success does not end it."""
 
     def __init__(self, config: EnvConfig, hold: int | None):
         self._env, self._hold = make_env(config), hold
         self._held = 0
 
     def start(self, seed: int) -> None:
-        """Begin the episode of a seed."""
+        """Start the episode of a seed."""
         self._env.start(seed)
         self._held = 0
 
     def inputs(self) -> F32:
-        """Return joint and environment state, raw, (n + k,)."""
+        """Return joint and environment state, not normalised, (n + k,)."""
         seen = self._env.observe()
         return np.concatenate([seen.state, seen.environment_state])
 
     def advance(self, action: F64) -> None:
-        """Apply joint targets and opening (n,)."""
+        """Apply joint targets and the gripper's opening (n,)."""
         self._env.advance(action)
         self._held += self._held > 0 or self._env.solved
 
@@ -60,7 +60,7 @@ class RobotEpisode:
 
 @dataclass(frozen=True)
 class ActionRange:
-    """Mean, scale and range of raw targets, (n,) each: a normalised action y means mean + scale y, within the range."""
+    """Mean, scale and range of raw targets, (n,) each. A normalised action y means mean + scale y, within the range."""
 
     mean: F32
     scale: F32
@@ -69,16 +69,16 @@ class ActionRange:
 
     @classmethod
     def of(cls, network: MLPNetwork) -> ActionRange:
-        """Return the units and the range of a network's targets."""
+        """Return the scale and range of a network's targets."""
         names = ("target_mean", "target_scale", "target_low", "target_high")
         return cls(*(getattr(network, name).numpy().copy() for name in names))
 
     def raw(self, actions: F32) -> F32:
-        """Return raw targets (B, n) of normalised actions (B, n)."""
+        """Return the raw targets (B, n) for normalised actions (B, n)."""
         return np.clip(actions * self.scale + self.mean, self.low, self.high)
 
     def normalised(self, targets: F32) -> F32:
-        """Return normalised actions (B, n) of raw targets (B, n); 0 where a target never changes."""
+        """Return the normalised actions (B, n) for raw targets (B, n); 0 for a target that never changes."""
         safe = np.where(self.scale > 0, self.scale, 1.0)
         return np.where(self.scale > 0, (np.clip(targets, self.low, self.high) - self.mean) / safe, 0.0).astype(
             np.float32
@@ -86,7 +86,7 @@ class ActionRange:
 
     @property
     def space(self) -> spaces.Box:
-        """Normalised actions within the range."""
+        """Box of normalised actions within the range."""
         low, high = (
             np.where(self.scale > 0, self.normalised(one), sign) for one, sign in ((self.low, -1), (self.high, 1))
         )
@@ -94,10 +94,10 @@ class ActionRange:
 
 
 class Unending(gymnasium.Env[F32, Any]):
-    """An episode that goes on in an absorbing state once it has ended, and never says that it has.
+    """An episode that never terminates: once finished, it continues in an absorbing state.
 
-    Observes (d + 2,): inputs, absorbing or not, share of `horizon` gone. Steps take actions, not targets. episode: a
-    `RobotEpisode`, or what has its methods. simulated: control steps since `reset`.
+    Observations (d + 2,): inputs, whether absorbing, elapsed share of `horizon`. `step` takes actions, not targets.
+    episode: a `RobotEpisode` or an object with its methods. simulated: control steps since `reset`.
     """
 
     def __init__(self, episode: Any, space: spaces.Box, horizon: int):
@@ -128,9 +128,9 @@ class Unending(gymnasium.Env[F32, Any]):
 
 
 class Lockstep(DummyVecEnv):
-    """Episodes of one length, side by side; `seed` sets that of the first at the next `reset`, the others follow on it.
+    """Parallel episodes of equal length. `seed` sets the first one's seed at the next `reset`; the others count up.
 
-    conversion: of the policy's raw targets into actions; the first of the inputs are the measured joints that it needs.
+    conversion: from the policy's raw targets to actions; it needs the measured joints, which are the first inputs.
     executed: actions (T, B, n) since `reset`.
     """
 
@@ -150,23 +150,23 @@ class Lockstep(DummyVecEnv):
 
     @property
     def simulated(self) -> int:
-        """Control steps since `reset`, of all episodes; none in absorbing states."""
+        """Control steps of all episodes since `reset`, without absorbing states."""
         return sum(one.simulated for one in self.envs)
 
     @override
     def reset(self) -> F32:
-        """Begin the episodes; return observations (B, d + 2)."""
+        """Start the episodes; return observations (B, d + 2)."""
         self.executed = []
         return np.asarray(super().reset())
 
     @override
     def step_async(self, actions: F32) -> None:
-        """Take normalised actions (B, n), of which targets become actions for all episodes at once."""
+        """Step with normalised actions (B, n), which are converted to actions for all episodes at once."""
         targets = self.range.raw(actions).astype(np.float32)
         running = [row for row, one in enumerate(self.envs) if not one.episode.ended]
         executed = np.zeros(targets.shape)
         if running:
-            [seen] = self.buf_obs.values()  # without the copy that `_obs_from_buf` makes
+            [seen] = self.buf_obs.values()  # avoids the copy that `_obs_from_buf` makes
             executed[running] = self._conversion.decode(targets[running], seen[running, : targets.shape[1]])
         self.executed.append(executed)
         super().step_async(executed)

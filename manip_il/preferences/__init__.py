@@ -1,1 +1,1 @@
-"""Rewards from preferences between clips: pairs, who compares them, the fit, and scores of datasets by a reward."""
+"""Rewards from preferences between clips: choosing pairs, collecting answers, fitting a reward, scoring datasets."""

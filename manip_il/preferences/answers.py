@@ -1,11 +1,11 @@
-"""Answers about pairs of clips: `preferences.json`, several of them joined, and those of simulated teachers.
+"""Answers about pairs of clips: reading and joining `preferences.json` files, and simulated teachers.
 
 Teachers compare clips by true progress (B-Pref, Lee et al. 2021, section 3):
 
     P(left is better) = sigmoid(beta (G(left) - G(right))),    G(clip) = sum over its steps of progress
 
-A clip's return is the sum of progress over its steps, as B-Pref's is of the task's reward: progress is what is true of
-a state, so a clip that is farther on is the better one, and one that gets on faster is, too.
+A clip's return is the sum of progress over its steps; B-Pref sums the task's reward. Progress is a property of the
+state, so a clip is better if it is closer to success or gets there faster.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from manip_il.preferences.pairs import Clips, Pairs, read_file
 FILE_NAME = "preferences.json"
 FORMAT, VERSION = "manip_il preferences", 1
 LEFT, RIGHT, EQUAL, SKIP = ANSWERS = ("left", "right", "equal", "skip")
-BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # how much of the left clip being better an answer says
-_ALIKE = 1e-9  # difference of returns that is rounding
+BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # probability that the left clip is better
+_ROUNDING = 1e-9  # largest difference between equal returns
 
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer about a pair, by its number. when: ISO 8601; None of a simulated teacher."""
+    """An answer about the pair with that number. when: ISO 8601; None if a simulated teacher answered."""
 
     pair: int
     answer: str
@@ -45,14 +45,14 @@ class Answer:
 
 @dataclass(frozen=True)
 class Preferences:
-    """Answers of one person or teacher. pairs: the hash of the pairs that they are about."""
+    """Answers of one person or teacher. pairs: hash of the pairs that were compared."""
 
     pairs: str
     who: str
     answers: tuple[Answer, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything for `preferences.json`."""
+        """Return the content of `preferences.json`."""
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     @classmethod
@@ -62,9 +62,9 @@ class Preferences:
 
     @classmethod
     def read(cls, path: Path, pairs: Sequence[Pairs]) -> Preferences:
-        """Return the answers in a file, with the numbers that its pairs have among those of all files (`join_pairs`).
+        """Return the answers in a file, numbered by the pairs of all files together (`join_pairs`).
 
-        Raises `ManipError` for a file that holds no answers, `MismatchError` for answers about other pairs.
+        Raises `ManipError` for a file without answers, `MismatchError` for answers about other pairs.
         """
         found = read_file(path, FORMAT, VERSION, cls.from_json)
         place = next((number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None)
@@ -77,9 +77,9 @@ class Preferences:
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """All answers but skips. pair: number of each one's, (A,); better: of the left clip, (A,), one of `BETTER`.
+    """All answers except skips. pair: numbers of the pairs, (A,); better: values of `BETTER` for the left clip, (A,).
 
-    skipped: answers that were `skip`. contradictory: pairs of which one answer says left and another right.
+    skipped: number of `skip` answers. contradictory: number of pairs with both a left and a right answer.
     """
 
     pair: NDArray[np.int64]
@@ -89,7 +89,7 @@ class Answers:
 
 
 def join_answers(given: Sequence[Preferences]) -> Answers:
-    """Return answers as one; two about a pair are two observations, also where they contradict each other."""
+    """Join answers; two answers about one pair are two observations, even if they contradict each other."""
     every = [one for preferences in given for one in preferences.answers]
     kept = [one for one in every if one.answer != SKIP]
     left, right = ({one.pair for one in kept if one.answer == answer} for answer in (LEFT, RIGHT))
@@ -103,9 +103,9 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
 
 @dataclass(frozen=True)
 class Teacher:
-    """One of `TEACHERS`, with B-Pref's parameters in its notation.
+    """One of `TEACHERS`, with B-Pref's parameters.
 
-    beta: rationality; infinite: the better clip always. epsilon: share of answers that are the wrong way round.
+    beta: rationality; if infinite, the better clip is always chosen. epsilon: share of answers that are reversed.
     """
 
     name: str
@@ -114,7 +114,7 @@ class Teacher:
 
     @classmethod
     def parse(cls, text: str) -> Teacher:
-        """Return the teacher of `perfect`, `boltzmann[:TEMPERATURE]` or `mistaken[:EPSILON]`."""
+        """Parse `perfect`, `boltzmann[:TEMPERATURE]` or `mistaken[:SHARE]`; `UsageError` for anything else."""
         name, _, number = text.partition(":")
         if name not in TEACHERS:
             raise UnknownName("teacher", name, TEACHERS)
@@ -129,9 +129,9 @@ class Teacher:
         raise UsageError(f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE")
 
     def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
-        """Return what it answers about every pair. Raises `ManipError` if the sources have no true progress."""
+        """Return the teacher's answer about every pair. Raises `ManipError` if the sources have no true progress."""
         if clips.progress is None:
-            raise ManipError("the sources have no column progress, by which teachers compare; ask people")
+            raise ManipError("the sources have no column progress, which teachers compare by; ask people")
         returns = clips.progress[clips.rows].sum(-1)
         difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
         mistaken = rng.random(len(returns)) < self.epsilon
@@ -139,14 +139,14 @@ class Teacher:
         left = difference > 0 if sure else chance < expit(self.beta * difference)
         found = np.where(left != mistaken, LEFT, RIGHT)
         if sure:
-            found[np.abs(difference) < _ALIKE] = EQUAL
+            found[np.abs(difference) < _ROUNDING] = EQUAL
         return found.tolist()
 
 
-TEACHERS = {"perfect": 0.0, "boltzmann": 1.0, "mistaken": 0.1}  # by default the number behind the name
+TEACHERS = {"perfect": 0.0, "boltzmann": 1.0, "mistaken": 0.1}  # default of the number after the name
 
 
 def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:
-    """Return a teacher's preferences; the same generator gives the same ones."""
+    """Return a teacher's preferences about the pairs; they depend only on the state of `rng`."""
     answers = [Answer(number, one) for number, one in enumerate(teacher.answers(clips, rng))]
     return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", tuple(answers))

@@ -1,4 +1,4 @@
-"""The page that asks people: two films side by side, pair after pair; one file, which reaches nothing else."""
+"""The page that asks people to compare two films side by side: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from manip_il.preferences.answers import FORMAT, VERSION
 from manip_il.preferences.pairs import Clips, Pairs
 from manip_il.sim.config import FILM, CameraConfig
 
-SIDE = 240  # of a film [pixels]
-MOST_FPS = 10  # of a film, at its own speed: a picture takes tens of milliseconds to draw
+SIDE = 240  # edge of a film [pixels]
+MOST_FPS = 10  # films play in real time; rendering a picture takes tens of milliseconds
 _CAMERA = "front"
 
 
-Films = list[list[bytes]]  # of every pair, left and right: MP4
+Films = list[list[bytes]]  # MP4s of each pair, left and right
 
 
 def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], None] = lambda: None) -> Films:
-    """Return an MP4 of the left and the right clip of every pair.
+    """Return MP4s of the left and right clip of every pair.
 
-    robot: the YAML of the sources' robot, if that does not ship. Raises `RenderError` without off-screen OpenGL and
-    `ManipError` for sources whose states cannot be pictured.
+    robot: YAML of the sources' robot, if it is not a built-in one. Raises `RenderError` without off-screen OpenGL and
+    `ManipError` for sources whose states cannot be rendered.
     """
     pairs = clips.pairs
     opened = [open_source(Path(source.root), robot) for source in pairs.sources]

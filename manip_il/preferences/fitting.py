@@ -1,4 +1,4 @@
-"""A reward from pairs and answers, and how well it foretells what it has not learnt from."""
+"""Fit a reward to answers about pairs, and measure how well it predicts held-out answers."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from manip_il.preferences.answers import Answers
 from manip_il.preferences.pairs import Clips
 
 F64 = NDArray[np.float64]
-TIE = 0.01  # difference of the clips' mean progress below which none is the better one
+TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A fit, and its agreement on pairs that were held out, each by one network of the ensemble.
+    """A fit, and its agreement on held-out pairs; each network of the ensemble holds out some.
 
-    answered: with the answers left and right; true: with the clips' true progress, but where that differs by less than
-    `TIE`; None where there is none.
+    answered: agreement with the answers left and right; true: agreement with true progress, without pairs that differ
+    by less than `TIE`; None if there is no progress.
     """
 
     fit: Fit
@@ -32,7 +32,7 @@ class Fitted:
     true: Proportion | None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the numbers for `fit.json`."""
+        """Return the content of `fit.json`."""
         return {
             "agreement_with_answers": _counts(self.answered),
             "agreement_with_progress": None if self.true is None else _counts(self.true),
@@ -51,13 +51,13 @@ def fit_answers(
     difference, true = true_difference(clips), None
     if difference is not None:
         pairs, first = np.unique(answers.pair, return_index=True)
-        told = np.abs(difference[pairs]) >= TIE
-        true = _proportion(((fit.logits[first] > 0) == (difference[pairs] > 0))[told])
+        clear = np.abs(difference[pairs]) >= TIE
+        true = _proportion(((fit.logits[first] > 0) == (difference[pairs] > 0))[clear])
     return Fitted(fit, shape, _proportion(right[answers.better != 0.5]), true)
 
 
 def true_difference(clips: Clips) -> F64 | None:
-    """Return mean true progress of every pair's left clip minus that of its right one, (P,); None without progress."""
+    """Return the mean true progress of each left clip minus that of the right one, (P,); None without progress."""
     if clips.progress is None:
         return None
     means = clips.progress[clips.rows].mean(axis=-1)
@@ -73,9 +73,9 @@ def _counts(one: Proportion) -> dict[str, Any]:
 
 
 def summary_lines(found: Fitted, answers: Answers) -> list[str]:
-    """Return what was learnt as plain lines."""
-    told = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
-    lines = [f"{told}, {answers.skipped:,} skipped, {answers.contradictory:,} pairs with contradictory answers"]
+    """Return a summary of the answers and the fit as plain lines."""
+    given = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
+    lines = [f"{given}, {answers.skipped:,} skipped, {answers.contradictory:,} pairs with contradictory answers"]
     lines.append(f"agreement with answers on held-out pairs: {found.answered}")
     if found.true is not None:
         lines.append(f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}")

@@ -1,4 +1,4 @@
-"""Read the columns of a dataset that a reward takes, and find the datasets that a folder stands for."""
+"""Read the columns of a dataset that a reward needs, and find the datasets in a folder."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from manip_il.learn.sources import check_same_sources
 from manip_il.mdp import require_finite
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
-_ROUNDS = "round_*/dataset"  # of a run
+_ROUNDS = "round_*/dataset"  # a run's datasets
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
     """The frames of a dataset, or of several joined: states (N, n), environment states (N, k), actions (N, n).
 
-    actions: what drove the robot. episodes: number of each frame's, (N,), ascending. progress, success: (N,), None
+    actions: the executed ones. episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
     if the dataset has no such column.
     """
 
@@ -39,27 +39,27 @@ class Frames:
 
     @cached_property
     def firsts(self) -> I64:
-        """Row of every episode's first frame, (E,)."""
+        """Row of each episode's first frame, (E,)."""
         return np.flatnonzero(np.diff(self.episodes, prepend=-1))
 
     @cached_property
     def lengths(self) -> I64:
-        """Frames of every episode, (E,)."""
+        """Number of frames of each episode, (E,)."""
         return np.diff(self.firsts, append=len(self.states))
 
     @cached_property
     def inputs(self) -> F32:
-        """Inputs of a reward, (N, n + k + n): state, environment state and action."""
+        """A reward's inputs, (N, n + k + n): state, environment state and action."""
         return np.concatenate([self.states, self.environment_states, self.actions], axis=1)
 
 
 def read_frames(root: Path) -> Frames:
-    """Return the frames of a dataset. Raises `ManipError` for one that lacks our columns, or is not finite."""
+    """Return the frames of a dataset. Raises `ManipError` if it lacks our columns or has non-finite numbers."""
     dataset = Dataset.open(root)
-    spec, there = dataset.spec, list(dataset.features)
-    action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in there else schema.ACTION
+    spec, present = dataset.spec, list(dataset.features)
+    action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in present else schema.ACTION
     needed = [schema.STATE, schema.ENVIRONMENT_STATE, action]
-    more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in there]
+    more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in present]
     table = dataset.columns([*needed, *more, EPISODE_INDEX])
     for name in (*needed, *more):
         require_finite(f"{root}, column {name}", table[name])
@@ -77,14 +77,14 @@ def read_frames(root: Path) -> Frames:
 
 
 def read_all(roots: Sequence[Path]) -> list[Frames]:
-    """Return the frames of datasets. Raises `MismatchError` unless they are of one task and their columns agree."""
+    """Return the frames of datasets. Raises `MismatchError` unless they have the same task and columns."""
     found = [read_frames(root) for root in roots]
     check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
     return found
 
 
 def find_datasets(folders: Sequence[Path]) -> list[Path]:
-    """Return the datasets that folders stand for: every round's of a run, else themselves."""
+    """Return the datasets in folders: those of every round for a run, otherwise the folder itself."""
     found: list[Path] = []
     for folder in folders:
         found += [path for path in sorted(folder.glob(_ROUNDS)) if (path / INFO).is_file()] or [folder]

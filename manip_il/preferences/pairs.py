@@ -1,4 +1,4 @@
-"""Pairs of clips to compare: which are chosen, evenly or where rewards disagree; `pairs.json`, and its frames."""
+"""Pairs of clips to compare, chosen evenly or by disagreement of a reward's networks; `pairs.json` and its frames."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from manip_il.learn.reward import LearnedReward
 from manip_il.preferences.frames import Frames, read_all
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
-Members = Callable[[F32], F64]  # rewards (M, B) of inputs (B, d)
-POOL = 10  # pairs that each is chosen from, by disagreement
-_TRIES = 100  # draws of a pair that is not there yet
+Members = Callable[[F32], F64]  # maps inputs (B, d) to the rewards (M, B) of M networks
+POOL = 10  # candidates per pair when choosing by disagreement
+_TRIES = 100  # attempts to draw a new pair
 FILE_NAME = "pairs.json"
 FORMAT, VERSION = "manip_il pairs", 1
-_LARGEST = 64 * 1024 * 1024  # [bytes]
+_LARGEST = 64 * 1024 * 1024  # largest file read [bytes]
 
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset. root: its folder, from where the command ran; sha256: `dataset_sha256`."""
+    """A dataset. root: its folder, relative to where the command ran; sha256: `dataset_sha256`."""
 
     root: str
     sha256: str
@@ -40,7 +40,7 @@ class Source:
 
 
 class Clip(NamedTuple):
-    """The beginning of a clip: number of the source, of its episode, and of the episode's frame."""
+    """The start of a clip: indices of the source, of its episode, and of the episode's frame."""
 
     source: int
     episode: int
@@ -49,10 +49,10 @@ class Clip(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """Pairs of clips of one length, the left one and the right one, in the datasets of one task.
+    """Pairs of clips, left and right, of equal length, from datasets of one task.
 
-    clip: length of every clip [control steps]. With clips of different lengths the longer one would collect the
-    reward's constant more often, which no comparison tells. chosen: how, in words.
+    clip: length of every clip [control steps]. If lengths differed, the reward's constant offset, which comparisons do
+    not determine, would count more often for the longer clip. chosen: how the pairs were chosen, in words.
     """
 
     robot: str
@@ -69,11 +69,11 @@ class Pairs:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of everything: by it answers say which pairs they are about."""
+        """Hash of the content; answers store it to identify their pairs."""
         return hashlib.sha256(canonical_json(self.to_json()).encode()).hexdigest()
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything for `pairs.json`, a clip as [source, episode, first frame]."""
+        """Return the content of `pairs.json`; a clip is [source, episode, first frame]."""
         return {"format": FORMAT, "version": VERSION, **asdict(self)}
 
     @classmethod
@@ -85,12 +85,12 @@ class Pairs:
 
     @classmethod
     def read(cls, path: Path) -> Pairs:
-        """Return the pairs in a file. Raises `ManipError` for what is none."""
+        """Return the pairs in a file. Raises `ManipError` for any other file."""
         return read_file(path, FORMAT, VERSION, cls.from_json)
 
 
 def read_file[Read](path: Path, form: str, version: int, make: Callable[[dict[str, Any]], Read]) -> Read:
-    """Return what `make` makes of a JSON file of a format and version. Raises `ManipError` for any other file."""
+    """Return `make(content)` for a JSON file of a format and version. Raises `ManipError` for any other file."""
     data = checks.read_json(path, form, _LARGEST)
     try:
         if (data["format"], data["version"]) != (form, version):
@@ -102,19 +102,19 @@ def read_file[Read](path: Path, form: str, version: int, make: Callable[[dict[st
 
 @dataclass(frozen=True, eq=False)
 class Clips:
-    """The clips of pairs in their datasets."""
+    """Pairs together with the frames of their datasets."""
 
     pairs: Pairs
     frames: tuple[Frames, ...]
 
     @cached_property
     def offsets(self) -> I64:
-        """Row of the first frame of every source in `inputs`, (S,)."""
+        """Row of each source's first frame in `inputs`, (S,)."""
         return np.cumsum([0, *(len(one.states) for one in self.frames)])[:-1]
 
     @cached_property
     def inputs(self) -> F32:
-        """Inputs of a reward, of all frames, (N, d)."""
+        """A reward's inputs for all frames, (N, d)."""
         return np.concatenate([one.inputs for one in self.frames])
 
     @cached_property
@@ -125,12 +125,12 @@ class Clips:
 
     @property
     def too_short(self) -> int:
-        """Number of episodes of the sources that no clip is from."""
+        """Number of episodes that are shorter than a clip."""
         return sum(int((one.lengths < self.pairs.clip).sum()) for one in self.frames)
 
     @cached_property
     def rows(self) -> I64:
-        """Rows of the left and the right clips' frames in `inputs`, (P, 2, L)."""
+        """Rows in `inputs` of the frames of left and right clips, (P, 2, L)."""
         begin = [
             [self.offsets[clip.source] + self.frames[clip.source].firsts[clip.episode] + clip.first for clip in pair]
             for pair in self.pairs.pairs
@@ -139,7 +139,7 @@ class Clips:
 
 
 def join_pairs(given: Sequence[Pairs]) -> Pairs:
-    """Return the pairs of several files, numbered on. Raises `MismatchError` for two lengths of clips."""
+    """Join the pairs of several files, numbered consecutively. Raises `MismatchError` if clip lengths differ."""
     first = given[0]
     for other in given[1:]:
         if first.clip != other.clip:
@@ -156,11 +156,11 @@ def join_pairs(given: Sequence[Pairs]) -> Pairs:
 
 
 def read_clips(pairs: Pairs) -> Clips:
-    """Return the clips of pairs. Raises `ManipError` for a dataset that is not there or was changed since."""
+    """Return the clips of pairs. Raises `ManipError` if a dataset is missing or has changed since."""
     for source in pairs.sources:
         root = Path(source.root)
         if not root.is_dir():
-            raise ManipError(f"{root}, which the pairs are from, is not here; run in the folder where they were chosen")
+            raise ManipError(f"{root} with the clips of the pairs is missing; run in the folder where they were chosen")
         if (found := dataset_sha256(root)) != source.sha256:
             raise MismatchError(f"sha256 of {root}", "the file of pairs", source.sha256[:12], "the dataset", found[:12])
     return Clips(pairs, tuple(read_all([Path(source.root) for source in pairs.sources])))
@@ -174,11 +174,11 @@ def choose_pairs(
     rng: np.random.Generator,
     reward: LearnedReward | None = None,
 ) -> Clips:
-    """Return pairs of clips of `length` control steps from datasets; see `Clips.too_short` for what is left out.
+    """Choose pairs of clips of `length` control steps from datasets; episodes shorter than a clip are ignored.
 
-    With `reward`, those of `POOL` times as many are kept about which its networks disagree most: the standard deviation
-    over them of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021). Raises `MismatchError`
-    unless datasets and reward are of one task, `ManipError` if there are not so many pairs.
+    With `reward`, draw `POOL` times as many, and keep those on which its networks disagree most, by the standard
+    deviation of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021). Raises `MismatchError`
+    unless datasets and reward have the same task, `ManipError` if there are too few pairs.
     """
     frames = tuple(read_all(roots))
     longest = max(int(one.lengths.max()) for one in frames)
@@ -188,7 +188,7 @@ def choose_pairs(
         reward.check_fits(str(roots[0]), frames[0].spec)
     drawn = _draw(frames, length, count * (1 if reward is None else POOL), rng)
     if len(drawn) < count:
-        raise ManipError(f"--count is {count}; {len(drawn)} pairs of clips of {length} steps were found")
+        raise ManipError(f"--count is {count}; only {len(drawn)} pairs of clips of {length} steps were found")
     spec = frames[0].spec
     made = Pairs(
         robot=spec.robot,
@@ -203,14 +203,14 @@ def choose_pairs(
         seed=seed,
     )
     if reward is not None:
-        doubt = disagreement(Clips(made, frames), reward.members)
-        kept = np.sort(np.argsort(-doubt, kind="stable")[:count])
+        spread = disagreement(Clips(made, frames), reward.members)
+        kept = np.sort(np.argsort(-spread, kind="stable")[:count])
         made = replace(made, pairs=tuple(drawn[place] for place in kept), chosen="where rewards disagree")
     return Clips(made, frames)
 
 
 def disagreement(clips: Clips, members: Members) -> F64:
-    """Return the standard deviation of P(left is better) over an ensemble, of every pair (P,)."""
+    """Return the standard deviation over an ensemble of P(left is better), for each pair, (P,)."""
     rows = clips.rows
     rewards = members(clips.inputs[rows.reshape(-1)])
     returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
@@ -218,12 +218,12 @@ def disagreement(clips: Clips, members: Members) -> F64:
 
 
 def _draw(frames: Sequence[Frames], length: int, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
-    """Different pairs of clips; every source is in as many as any other, with another or itself."""
+    """Distinct pairs of clips; all sources appear equally often, paired with others or with themselves."""
     found = dict[tuple[Clip, Clip], None]()
     sources = [number for number, one in enumerate(frames) if one.lengths.max() >= length]
 
     def draw(source: int) -> Clip:
-        """One clip of a source: every episode alike, every place in it alike."""
+        """A clip of a source: a uniformly drawn episode, then a uniformly drawn first frame."""
         lengths = frames[source].lengths
         episode = int(rng.choice(np.flatnonzero(lengths >= length)))
         return Clip(source, episode, int(rng.integers(0, int(lengths[episode]) - length + 1)))

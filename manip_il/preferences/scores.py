@@ -1,11 +1,11 @@
-"""Scores of a dataset's frames and episodes by a reward, and the file that LeRobot's RA-BC weights samples by.
+"""Scores of a dataset's frames and episodes by a reward, and the file of sample weights for LeRobot's RA-BC.
 
-RA-BC learns from frames after which progress rises. A frame's score does not tell whether it is worth learning from:
-what fails gets nearer, too, before it does. Whether its episode ends well does, so what is written as progress is
+RA-BC learns from frames after which progress rises. A frame's own score does not tell whether to learn from it, because
+failing episodes also approach the goal at first. How the episode ends does tell, so the progress written is
 
     progress_t = t (score of the episode - bar),    bar = upper quartile of the episodes' scores - BELOW
 
-which rises all along an episode that ends near the best quarter, and falls along the others.
+It rises throughout an episode that ends near the best quarter, and falls throughout the others.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from manip_il.preferences.frames import Frames
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
-LAST = 1.0  # of an episode, over which its score is the mean [s]
-BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it an episode may end
-WORST = 10  # episodes that are listed
-_METADATA = b"reward_model_path"  # as LeRobot's own scripts say it
+LAST = 1.0  # an episode's score is the mean over its last second [s]
+BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it a kept episode may be
+WORST = 10  # number of episodes listed
+_METADATA = b"reward_model_path"  # the key that LeRobot's own scripts write
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores of a dataset. frames: of every frame, (N,), 0 to 1; reward: its name.
+    """Scores of a dataset. frames: score of each frame, (N,), 0 to 1; reward: the reward's name.
 
-    An episode's score is the mean of its last second's frames: how far it got, and stayed.
+    An episode's score is the mean over its last second: how far it got and stayed.
     """
 
     root: str
@@ -49,24 +49,24 @@ class Scores:
 
     @cached_property
     def episodes(self) -> F64:
-        """Score of every episode, (E,)."""
+        """Score of each episode, (E,)."""
         return episode_scores(self.frames, self.data)
 
     @property
     def bar(self) -> float:
-        """Score below which an episode's frames weigh nothing: where the best quarter begins, less `BELOW`."""
+        """Score below which an episode's frames have no weight: the upper quartile minus `BELOW`."""
         return float(np.quantile(self.episodes, BEST)) - BELOW
 
     @property
     def succeeded(self) -> NDArray[np.bool_] | None:
-        """Whether every episode succeeded at some step, (E,); None if nothing says so."""
+        """Whether each episode succeeded at some step, (E,); None if the dataset does not say."""
         if self.data.success is None:
             return None
         return np.logical_or.reduceat(self.data.success, self.data.firsts)
 
     @property
     def auc(self) -> float | None:
-        """Area under the ROC curve of finding failed episodes by a low score; None without both kinds."""
+        """Area under the ROC curve for detecting failed episodes by a low score; None if all or none failed."""
         return roc_auc(self.episodes, self.succeeded)
 
     def worst(self, count: int) -> list[int]:
@@ -74,7 +74,7 @@ class Scores:
         return np.argsort(self.episodes, kind="stable")[:count].tolist()
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything for `scores.json`; frames' scores are in the parquet file."""
+        """Return the content of `scores.json`; frames' scores are in the parquet file."""
         succeeded, bar = self.succeeded, self.bar
         numbers = self.data.episodes[self.data.firsts].tolist()
         episodes: list[Mapping[str, Any]] = [
@@ -97,7 +97,7 @@ class Scores:
 
 
 def episode_scores(values: F64, frames: Frames) -> F64:
-    """Return the mean over the last `LAST` seconds of every episode, (E,), of values of its frames (N,)."""
+    """Return the mean of the frames' values (N,) over the last `LAST` seconds of each episode, (E,)."""
     last = max(1, round(LAST * frames.spec.fps))
     ends = frames.firsts + frames.lengths
     begins = np.maximum(frames.firsts, ends - last)
@@ -106,9 +106,9 @@ def episode_scores(values: F64, frames: Frames) -> F64:
 
 
 def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
-    """Return P(a failed episode's score is below a successful one's), ties half (Mann and Whitney 1947).
+    """Return P(a failed episode's score is below a successful one's); ties count half (Mann and Whitney 1947).
 
-    scores, succeeded: of every episode, (E,). None if one kind is missing.
+    scores, succeeded: one per episode, (E,). None if all or none succeeded.
     """
     if succeeded is None or succeeded.all() or not succeeded.any():
         return None
@@ -118,9 +118,9 @@ def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
 
 
 def write_weights(path: Path, scores: Scores) -> None:
-    """Write what LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse` of every frame.
+    """Write the columns that LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse`.
 
-    Beside them `score`, which it does not read. Raises `WriteError` if the disk is full or read-only.
+    RA-BC ignores the additional column `score`. Raises `WriteError` if the disk is full or read-only.
     """
     data = scores.data
     steps = np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths)
@@ -140,7 +140,7 @@ def write_weights(path: Path, scores: Scores) -> None:
 
 
 def worst_table(scores: Scores, count: int = WORST) -> Table:
-    """Return the episodes with the lowest scores, lowest first."""
+    """Return a table of the episodes with the lowest scores, lowest first."""
     data, succeeded = scores.data, scores.succeeded
     rows = tuple(
         (
@@ -155,9 +155,9 @@ def worst_table(scores: Scores, count: int = WORST) -> Table:
 
 
 def fact_lines(scores: Scores) -> list[str]:
-    """Return which episodes are kept, and how well the score finds failed ones."""
+    """Return how many episodes are kept, and how well the score detects failed ones."""
     kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
-    lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}: the frames of the others weigh 0"]
+    lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}; frames of the others have weight 0"]
     if scores.auc is not None:
-        lines.append(f"area under the ROC curve of finding failed episodes: {scores.auc:.3f}")
+        lines.append(f"area under the ROC curve for detecting failed episodes: {scores.auc:.3f}")
     return lines

@@ -1,1 +1,1 @@
-"""Rewards inferred from demonstrations: weights of the costs of paths."""
+"""Rewards inferred from demonstrations, as weights of path features."""

@@ -1,11 +1,11 @@
-"""Bayesian inverse reinforcement learning (Ramachandran & Amir 2007): what the demonstrations leave of the weights.
+"""Bayesian inverse reinforcement learning (Ramachandran & Amir 2007): a posterior of the weights.
 
-Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Likelihood: of the paths that are the
-cheapest for some taste, and its own, a demonstration takes one with a probability in proportion to exp(-w . features).
-So a demonstrator chooses between sensible paths, and the better one is for its taste the likelier; the sum over them is
-exact, and small enough for chains of tens of thousands of steps. Tastes are drawn from the prior, and then from the
-posterior, which finds the paths that nearly tie. The posterior is drawn by random-walk Metropolis in log w, whose steps
-are fitted in warm-ups, then fixed.
+Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Likelihood: the demonstrator chooses among
+its own path and those that are cheapest for some other weights ("tastes"), in proportion to exp(-w . features). So it
+chooses between sensible paths, and is likelier to take a better one; the sum over the paths is exact, and small enough
+for chains of tens of thousands of steps. Tastes are drawn from the prior, then from the posterior, which finds paths of
+nearly equal cost. The posterior is sampled by random-walk Metropolis in log w; its steps are tuned in warm-ups, then
+fixed.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from numpy.typing import NDArray
 from manip_il.rewards.paths import Demonstration, add_rivals, rivals
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
-Density = Callable[[F64], F64]  # logarithms (C,) at points (C, K)
+Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
-TASTES = 60  # of the prior, for each demonstration
+TASTES = 60  # drawn from the prior for each demonstration
 CHAINS = 4
-_ROUNDS, _MORE = 3, 30  # rounds of tastes of the posterior
-_DRAWS, _WARM_UP = 10_000, 2_000  # of a chain, and of each warm-up
-_FIRST, _FITS = 0.3, 2  # size of the first steps, and warm-ups after which the steps are fitted to what was seen
-_STEP = 2.38  # over the root of the dimensions: a random walk's step, in deviations (Roberts et al. 1997)
+_ROUNDS, _MORE = 3, 30  # rounds of drawing tastes from the posterior, and tastes per round
+_DRAWS, _WARM_UP = 10_000, 2_000  # steps of a chain and of each warm-up
+_FIRST, _FITS = 0.3, 2  # initial step size, and number of warm-ups; each one tunes the steps
+_STEP = 2.38  # random walk's step in deviations, before division by sqrt(dimension) (Roberts et al. 1997)
 
 
 @dataclass(frozen=True)
 class Choices:
-    """Paths that were to be chosen from, those of all demonstrations one after the other.
+    """The paths that the demonstrators chose among, for all demonstrations in order.
 
-    excess: their features above the demonstration's own, (m, K) [m], the own first with 0. starts: where each
-    demonstration's begin, (D,).
+    excess: a path's features minus those of the demonstration, (m, K) [m]; the demonstration itself, 0, comes first.
+    starts: first row of each demonstration, (D,).
     """
 
     excess: F64
@@ -42,12 +42,12 @@ class Choices:
 
     @classmethod
     def of(cls, sums: Sequence[F64]) -> Choices:
-        """Return the choices whose features are (m, K) for each demonstration, the chosen path's first."""
+        """Return the choices with features (m, K) for each demonstration, the chosen path's first."""
         starts = np.cumsum([0, *map(len, sums[:-1])]).astype(np.int64)
         return cls(np.concatenate([one - one[0] for one in sums]), starts)
 
     def log_likelihood(self, weights: F64) -> F64:
-        """Return the logarithm of the probability of all that was chosen, (C,), for weights (C, K)."""
+        """Return the log-likelihood of all demonstrated choices, (C,), for weights (C, K)."""
         costs = self.excess @ weights.T
         least = np.minimum.reduceat(costs, self.starts)
         lengths = np.diff(np.append(self.starts, len(costs)))
@@ -57,7 +57,7 @@ class Choices:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws of the weights. draws: (C, N, K) of C chains [1/m]."""
+    """Draws of the weights from C chains. draws: (C, N, K) [1/m]."""
 
     draws: F64
 
@@ -73,7 +73,7 @@ class Posterior:
 
     @property
     def agreement(self) -> F64:
-        """R-hat of the draws' logarithms in halves of chains, (K,); 1 where they agree (Gelman et al. 2013, 11.4)."""
+        """Split R-hat of the log-weights, (K,); 1 if the chains agree (Gelman et al. 2013, 11.4)."""
         points = np.log(self.draws)
         half = points.shape[1] // 2
         parts = np.concatenate([points[:, :half], points[:, half : 2 * half]])
@@ -82,12 +82,12 @@ class Posterior:
         return np.sqrt((half - 1) / half + between / np.maximum(within, np.finfo(float).tiny))
 
     def ratios(self, base: int, level: float) -> F64:
-        """Return the credible interval of every weight over that of feature `base`, (K, 2)."""
+        """Return the credible interval of each weight divided by that of feature `base`, (K, 2)."""
         ratios = self.pooled / self.pooled[:, [base]]
         return np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T
 
     def thin(self, count: int) -> F64:
-        """Return draws that are evenly apart along the chains, (count, K)."""
+        """Return evenly spaced draws, (count, K)."""
         return self.pooled[np.linspace(0, len(self.pooled) - 1, count).round().astype(np.int64)]
 
 
@@ -97,7 +97,7 @@ def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: flo
 
 
 def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
-    """Return the posterior of each demonstration's choice between the paths that are cheapest for some taste."""
+    """Return the posterior, given each demonstration's choice among the paths that are cheapest for some taste."""
     features = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
     for _ in range(_ROUNDS):
@@ -114,7 +114,7 @@ def draw_posterior(
     warm_up: int = _WARM_UP,
     chains: int = CHAINS,
 ) -> Posterior:
-    """Return draws of the weights given what was chosen. prior: mean of a weight [1/m]. count: of every chain."""
+    """Return draws of the weights given the choices. prior: mean of a weight [1/m]. count: draws per chain."""
 
     def density(logs: F64) -> F64:
         weights = np.exp(logs)
@@ -129,9 +129,9 @@ def draw_posterior(
 
 
 def sample(density: Density, start: F64, root: F64, count: int, rng: np.random.Generator) -> F64:
-    """Return `count` draws of every chain that begins at `start` (C, K), (C, count, K).
+    """Return `count` draws, (C, count, K), from each chain; the chains start at `start` (C, K).
 
-    root: Cholesky root of the steps' covariance, (K, K).
+    root: Cholesky factor of the steps' covariance, (K, K).
     """
     chains, size = start.shape
     now, height = start, density(start)

@@ -1,13 +1,13 @@
 """Maximum entropy inverse reinforcement learning (Ziebart et al. 2008, 2010).
 
-Of all distributions over paths whose expected features are the demonstrations', the one of most entropy is
-p(path) = exp(-w . features(path)) / Z(w). Its weights are those of the greatest likelihood, which is concave; the
-gradient is the difference between expected and demonstrated features. Who always takes the cheapest path leaves the
-scale of the weights open, so a normal prior holds it.
+Among all distributions over paths with the demonstrations' expected features, the one with the highest entropy is
+p(path) = exp(-w . features(path)) / Z(w). Its weights maximise the likelihood, which is log-concave; the gradient is
+the difference between expected and demonstrated features. A demonstrator that always takes the cheapest path leaves the
+scale of the weights undetermined, so a normal prior bounds it.
 
-The sum Z over paths of every length solves z = M z + e_goal, M = exp(-cost) of every edge. It is found by summing over
-ever longer paths, relative to the cheapest path's cost, so that nothing underflows: on a grid of 10,000 nodes with 26
-neighbours in 5 ms, where a sparse LU decomposition of I - M takes 170 ms.
+The sum Z over paths of any length solves z = M z + e_goal with M = exp(-cost) for every edge. It is computed by summing
+over longer and longer paths, relative to the cheapest path's cost to avoid underflow. A grid of 10,000 nodes with 26
+neighbours takes 5 ms, a sparse LU decomposition of I - M 170 ms.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from manip_il.rewards.paths import LENGTH, Demonstration, PathProblem, plan, sta
 F64 = NDArray[np.float64]
 PRIOR = 300.0  # standard deviation of a weight [1/m]
 _MOST_STEPS = 200
-_ENOUGH, _SAME = 1e-4, 1e-6  # gradient [m] and relative gain of a step at which it ends
-_LEAST_UNIT, _TINY = 1e-2, 1e-300  # of a feature, in the largest
-_ABOVE = 1.001  # times the least weight for which the sum over all paths is finite
-_NO_MORE = 1e-14  # share that longer paths may still add
-_MOST_EDGES = 20_000  # of a path
+_GRADIENT_TOLERANCE, _LOSS_TOLERANCE = 1e-4, 1e-6  # [m] and relative; L-BFGS-B stops below either
+_LEAST_UNIT, _TINY = 1e-2, 1e-300  # smallest feature unit relative to the largest, and the smallest divisor
+_ABOVE = 1.001  # safety factor on the smallest weight for which the sum over all paths is finite
+_TOLERANCE = 1e-14  # relative; longer paths that add less are ignored
+_MOST_EDGES = 20_000  # longest path
 
 
 @dataclass(frozen=True)
 class SoftPlan:
     """Distribution of the paths to a goal.
 
-    values: soft cost-to-go -log Z of every node, (S,), infinite where no path leads to the goal. chances: with which
-    each edge is taken by who is at its beginning, (E,).
+    values: soft cost-to-go -log Z of every node, (S,), infinite if no path leads to the goal. chances: probability of
+    each edge, given its first node, (E,).
     """
 
     problem: PathProblem
@@ -51,9 +51,9 @@ class SoftPlan:
         return self.problem.matrix(self.chances).T.tocsr()
 
     def visits(self, start: int) -> F64:
-        """Return how often every edge is passed on the way from a start, expected, (E,) (Ziebart et al. 2008, alg. 1).
+        """Return the expected visits of every edge on the way from a start, (E,) (Ziebart et al. 2008, alg. 1).
 
-        Raises `ManipError` where no path leads to the goal.
+        Raises `ManipError` if no path leads to the goal.
         """
         if not np.isfinite(self.values[start]):
             raise ManipError(f"no path leads from node {start} to the goal")
@@ -63,20 +63,20 @@ class SoftPlan:
         for _ in range(_MOST_EDGES):
             now = self._moves @ now
             total += now
-            if now.sum() - now[self.problem.goal] <= _NO_MORE:
+            if now.sum() - now[self.problem.goal] <= _TOLERANCE:
                 return total[self.problem.edges[:, 0]] * self.chances
         raise ManipError(f"paths of more than {_MOST_EDGES} edges are likely; expected higher costs")
 
     def features(self, start: int) -> F64:
-        """Return the expected sums of the features on the way from a start, (K,)."""
+        """Return the expected feature sums on the way from a start, (K,)."""
         return self.visits(start) @ self.problem.features
 
 
 def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
-    """Return the distribution of paths for weights (K,); the larger they are, the closer it is to the cheapest path.
+    """Return the distribution of paths for weights (K,); the larger they are, the likelier is the cheapest path.
 
-    Raises `ManipError` where the sum over all paths is infinite, because steps cost less than the choice between them
-    adds (the spectral radius of M is 1 or more).
+    Raises `ManipError` if the sum over all paths is infinite, because their number grows faster than exp(cost) (the
+    spectral radius of M is 1 or more).
     """
     costs, edges = problem.costs(weights), problem.edges
     hard = plan(problem, weights).costs
@@ -91,7 +91,7 @@ def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
 
 
 def _sum_paths(problem: PathProblem, shares: F64) -> F64:
-    """Solve z = M z + e_goal for the matrix of `shares` (E,), (S,)."""
+    """Return the solution z (S,) of z = M z + e_goal; M has the entries `shares` (E,)."""
     matrix = problem.matrix(shares)
     found, end = np.zeros(problem.nodes), np.zeros(problem.nodes)
     end[problem.goal] = 1.0
@@ -100,18 +100,15 @@ def _sum_paths(problem: PathProblem, shares: F64) -> F64:
             before, found = found, matrix @ found + end
             if not np.isfinite(found[problem.goal]) or not np.isfinite(found).all():
                 break
-            if (found - before <= _NO_MORE * found).all():
+            if (found - before <= _TOLERANCE * found).all():
                 return found
     raise ManipError(
-        "the sum over all paths is infinite: steps cost less than the choice between them adds; expected higher weights"
+        "the sum over all paths is infinite: their number grows faster than their costs; expected higher weights"
     )
 
 
 def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR) -> tuple[float, F64]:
-    """Return the mean negative log-likelihood with the prior's share, and its gradient (K,).
-
-    Raises what `soft_plan` raises.
-    """
+    """Return the negative log-posterior per demonstration and its gradient (K,). Raises what `soft_plan` raises."""
     count = len(demonstrations)
     loss = 0.5 * float(weights @ weights) / (prior**2 * count)
     gradient = weights / (prior**2 * count)
@@ -123,9 +120,9 @@ def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float 
 
 
 def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
-    """Return weights (K,) [1/m] from which on the sum over all paths is finite: a step outweighs the choice of it.
+    """Return the smallest weights (K,) [1/m] for which the sum over all paths is guaranteed to be finite.
 
-    That is log(most edges of a node) over the shortest edge for length, and 0 for the other features.
+    This is log(largest number of edges of a node) over the shortest edge for length, and 0 for the other features.
     """
     found = np.zeros(demonstrations[0].problem.features.shape[1])
     shortest = min(float(one.problem.features[:, LENGTH].min()) for one in demonstrations)
@@ -135,9 +132,9 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 
 
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
-    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B; the larger, the surer. prior: [1/m].
+    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: [1/m].
 
-    It begins from twice the least weights on a few of the demonstrations, and goes on from there on all.
+    The search starts at twice the least weights on a few of the demonstrations, then continues on all of them.
     """
     least = least_weights(demonstrations)
     weights = np.maximum(2 * least, least.max() / 2)
@@ -147,7 +144,7 @@ def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
 
 
 def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, prior: float) -> F64:
-    """The most likely weights (K,), in units of the features' deviations from what is expected."""
+    """The most likely weights (K,); the optimiser scales each by its feature's initial deviation."""
     missed = [one.sums - soft_plan(one.problem, start).features(one.start) for one in demonstrations]
     units = np.sqrt(np.mean(np.square(missed), axis=0))
     units = (units / max(float(units.max()), _TINY)).clip(min=_LEAST_UNIT)
@@ -156,7 +153,7 @@ def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, p
         value, gradient = loss_of(demonstrations, scaled / units, prior)
         return value, gradient / units
 
-    options: Any = {"maxiter": _MOST_STEPS, "gtol": _ENOUGH, "ftol": _SAME}
+    options: Any = {"maxiter": _MOST_STEPS, "gtol": _GRADIENT_TOLERANCE, "ftol": _LOSS_TOLERANCE}
     bounds = [(low, None) for low in least * units]
     found = minimize(loss, start * units, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return np.asarray(found.x / units, np.float64)

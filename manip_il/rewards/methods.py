@@ -1,4 +1,4 @@
-"""The three methods of inverse reinforcement learning side by side, and what they find in one form."""
+"""The three methods of inverse reinforcement learning, behind one function with one type of result."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from manip_il.rewards.paths import LENGTH, Demonstration, open_features, rivals
 
 F64 = NDArray[np.float64]
 METHODS = ("max_margin", "bayesian", "max_entropy")
-LEVEL = 0.9  # of intervals
-_TASTES = 20  # that tell whether paths differ in a feature
+LEVEL = 0.9  # level of the credible intervals
+_TASTES = 20  # random weights whose paths show whether a feature matters
 
 
 @dataclass(frozen=True)
 class Learnt:
-    """Weights as a method found them.
+    """The weights that a method found.
 
-    weights: (K,), over that of length. open: features in which all demonstrations agree, so that nothing is known of
-    their weights. intervals: of the weights, (K, 2), if the method has them; chains: how well they are known, in words.
+    weights: (K,), divided by that of length. open: features in which all demonstrations agree, so that their weights
+    are not identified. intervals: the weights' credible intervals, (K, 2), or None; chains: their quality, in words.
     """
 
     method: str
@@ -33,7 +33,7 @@ class Learnt:
 
 
 def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
-    """Return what a method of `METHODS` finds of one demonstration or more."""
+    """Return the weights that a method of `METHODS` infers from one or more demonstrations."""
     tastes = bayesian.prior_tastes(_TASTES, demonstrations[0].problem.features.shape[1], rng)
     unknown = tuple(open_features(demonstrations, rivals(demonstrations, tastes)))
     if method == "bayesian":
@@ -46,6 +46,6 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
 
 
 def prior_interval(level: float = LEVEL) -> tuple[float, float]:
-    """Return the prior's interval of a weight over another: of two exponential ones, P(ratio < r) = r / (1 + r)."""
+    """Return the prior interval of one weight over another; for two exponentials P(ratio < r) = r / (1 + r)."""
     low, high = (1 - level) / 2, (1 + level) / 2
     return low / (1 - low), high / (1 - high)

@@ -1,6 +1,6 @@
-"""Paths to a goal over a graph whose edges have features: weights turn them into costs, Dijkstra finds the cheapest.
+"""Paths to a goal on a graph whose edges have features: weights turn features into costs, Dijkstra finds cheap paths.
 
-Demonstrations are such paths; what they were preferred to tells about the weights, and leaves some of them open.
+Demonstrations are such paths. Comparing them with the alternatives tells something about the weights.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from scipy.sparse.csgraph import dijkstra
 from manip_il.errors import ManipError
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
-NOWHERE = -1  # as the node that follows: none
-LENGTH = 0  # the feature that every edge has, over whose weight the others are given
-_FIFTH, _FEW = 5, 5  # of how many demonstrations one is a beginning, and how many are that at least
-_DIGITS = 6  # decimals [m] in which the features of different paths differ
-_SAME = 1e-6  # [m] that sums of a feature may differ by and be the same
+NOWHERE = -1  # next node if there is none
+LENGTH = 0  # feature that every edge has; other weights are given relative to its weight
+_EVERY, _FEW = 5, 5  # the first stage takes every fifth demonstration, if these are at least five
+_DIGITS = 6  # decimals [m] to which the features of equal paths agree
+_SAME = 1e-6  # largest difference between equal feature sums [m]
 
 
 @dataclass(frozen=True)
 class PathProblem:
     """S nodes, E edges with K features each, one goal.
 
-    edges: (E, 2), from and to, each pair once and none from a node to itself. features: (E, K), 0 or more, such as
-    metres of the edge above a thing; the first is the edge's length, above 0.
+    edges: (E, 2), from and to, each pair once, without self-loops. features: (E, K), 0 or more, such as metres of the
+    edge above a thing; the first one is the edge's length and positive.
     """
 
     edges: I64
@@ -41,37 +41,37 @@ class PathProblem:
 
     @cached_property
     def _numbers(self) -> Any:
-        """Numbers of the edges, from 1 on, as a sparse matrix from -> to, (S, S)."""
+        """Edge numbers, counted from 1, as a sparse matrix from -> to, (S, S)."""
         return csr_array((np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes))
 
     def costs(self, weights: F64) -> F64:
-        """Return what every edge costs, (E,), for weights (K,), 0 or more."""
+        """Return the cost of every edge, (E,), for non-negative weights (K,)."""
         return self.features @ weights
 
     def matrix(self, values: F64) -> Any:
-        """Return values of the edges (E,) as a sparse matrix from -> to, (S, S). Zeros stay entries."""
+        """Return values of the edges (E,) as a sparse matrix from -> to, (S, S). Zeros are stored too."""
         numbers = self._numbers
         return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
     def edges_of(self, path: I64) -> I64:
-        """Return the edges along a path of nodes (n,), (n - 1,). Raises `ManipError` if two are not joined."""
+        """Return the edges (n - 1,) along a path of nodes (n,). Raises `ManipError` if an edge is missing."""
         numbers = self._numbers
         found = np.array([numbers[pair] for pair in pairwise(path.tolist())], np.int64) - 1
         if (found < 0).any():
-            raise ManipError("a path goes where no edge leads")
+            raise ManipError("no edge joins two consecutive nodes of a path")
         return found
 
     def sums(self, path: I64) -> F64:
-        """Return the features of a path of nodes (n,), summed over its edges, (K,)."""
+        """Return the feature sums (K,) over the edges of a path of nodes (n,)."""
         return self.features[self.edges_of(path)].sum(axis=0)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The cheapest way to the goal from everywhere.
+    """The cheapest path to the goal from every node.
 
-    costs: (S,), infinite where no path leads to the goal. following: the next node, (S,), `NOWHERE` at the goal and
-    where no path leads.
+    costs: (S,), infinite if no path leads to the goal. following: the next node, (S,), `NOWHERE` at the goal and if
+    there is no path.
     """
 
     costs: F64
@@ -79,18 +79,18 @@ class Plan:
 
 
 def plan(problem: PathProblem, weights: F64) -> Plan:
-    """Return the cheapest way from every node for weights (K,)."""
+    """Return the cheapest path from every node for weights (K,)."""
     return plan_edges(problem, problem.costs(weights))
 
 
 def plan_edges(problem: PathProblem, costs: F64) -> Plan:
-    """Return the cheapest way from every node for costs of edges (E,), 0 or more: Dijkstra backwards from the goal."""
+    """Return the cheapest path from every node for edge costs (E,), 0 or more: Dijkstra backwards from the goal."""
     found, following = dijkstra(problem.matrix(costs).T.tocsr(), indices=problem.goal, return_predecessors=True)
     return Plan(found, np.where(following < 0, NOWHERE, following).astype(np.int64))
 
 
 def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64, F64]:
-    """Return the nodes of a plan's path from a start, (n,), and its feature sums, (K,).
+    """Return the nodes (n,) and feature sums (K,) of a plan's path from a start.
 
     Raises `ManipError` if no path leads to the goal.
     """
@@ -105,38 +105,38 @@ def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64,
 
 @dataclass(frozen=True)
 class Demonstration:
-    """A path of nodes (n,) that somebody took from a start to the goal of a problem."""
+    """A demonstrated path of nodes (n,) to the goal of a problem."""
 
     problem: PathProblem
     path: I64
 
     @property
     def start(self) -> int:
-        """The node it begins at."""
+        """First node."""
         return int(self.path[0])
 
     @cached_property
     def sums(self) -> F64:
-        """Features summed along it, (K,)."""
+        """Feature sums along the path, (K,)."""
         return self.problem.sums(self.path)
 
 
 def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstration]]:
-    """Return what to fit one after the other: a fifth of many demonstrations, as a beginning, then all."""
-    few = demonstrations[::_FIFTH]
+    """Return the demonstrations to fit in turn: first a fifth, unless that is too few, then all."""
+    few = demonstrations[::_EVERY]
     return [few, demonstrations] if len(few) >= _FEW else [demonstrations]
 
 
 def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
-    """Return what each demonstration competes with: sums of the paths that are cheapest for tastes (n, K), each once.
+    """Return each demonstration's alternatives: feature sums of the distinct paths that are cheapest for tastes (n, K).
 
-    The demonstration's own sums stand first: (m, K), m at most n + 1.
+    The demonstration's own sums come first: (m, K), m at most n + 1.
     """
     return add_rivals(demonstrations, [one.sums[None] for one in demonstrations], tastes)
 
 
 def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64) -> list[F64]:
-    """Return sums (m, K) of each demonstration's rivals, and those for more tastes (n, K) that are not there yet."""
+    """Return the sums (m, K) of each demonstration's alternatives, extended by new ones for more tastes (n, K)."""
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
         more = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]
@@ -147,6 +147,6 @@ def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tas
 
 
 def open_features(demonstrations: Sequence[Demonstration], sums: Sequence[F64]) -> list[int]:
-    """Return the features in which every demonstration agrees with all its rivals (m, K): their weights are open."""
+    """Return the features in which no demonstration differs from its alternatives (m, K): weights not identified."""
     off = [np.abs(others - one.sums).max(axis=0) for one, others in zip(demonstrations, sums, strict=True)]
     return [int(k) for k in np.flatnonzero(np.max(off, axis=0) <= _SAME)]

@@ -1,1 +1,1 @@
-"""Theorems on imitation, seen: on processes solved exactly, on linear systems, and on an arm."""
+"""Theorems on imitation, compared with exactly solved processes, linear systems and an arm."""

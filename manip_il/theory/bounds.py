@@ -1,9 +1,9 @@
-"""Losses of cloning and DAgger over the horizon, beside what the two theorems allow.
+"""Losses of cloning and DAgger over the horizon, compared with the bounds of two theorems.
 
 Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross & Bagnell 2010).
-Theorem 8.2: one that errs in a share eps of its own states loses at most u H eps, where u is the most that one wrong
-step costs an expert who drives on (Ross et al. 2011, Theorem 2.2; the chapter has u in its constant). Rewards are 0 to
-1 a step. A policy is fitted to trajectories; in states without data it takes the worst action, as the theorems allow.
+Theorem 8.2: one that errs in a share eps of its own states loses at most u H eps; u is the largest cost of one wrong
+step if the expert then drives (Ross et al. 2011, Theorem 2.2; the chapter has u in its constant). Rewards are 0 to 1
+per step. Policies are fitted to trajectories; in states without data they take the worst action, as theory allows.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from manip_il.theory.processes import PLACES, PROCESSES, Process
 
 F64 = NDArray[np.float64]
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
-ERROR = 0.03  # of a policy on average, times the horizon: so small that the gap does not saturate
-DRAWS = 16  # of the data that a policy is fitted on, at each horizon
-ROUNDS, MORE = 5, 20  # DAgger's, each with a share 1 / MORE of as many trajectories as the expert's
+ERROR = 0.03  # mean error of a policy times the horizon, small enough that the gap does not saturate
+DRAWS = 16  # training sets drawn at each horizon
+ROUNDS, MORE = 5, 20  # DAgger's rounds; each adds a share 1 / MORE of the first number of trajectories
 _BOOTSTRAPS = 2_000
 _ROUNDING = 1e-9
 Learner = Literal["cloning", "DAgger"]
@@ -31,10 +31,10 @@ Learner = Literal["cloning", "DAgger"]
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Losses of a learner over the horizon, one for each draw of its data, (h, D).
+    """Losses of a learner over the horizon, for each draw of its data, (h, D).
 
-    errors: share of the states in which the policy errs; gaps: the expert's return less its own; bounds: on the gaps,
-    by the learner's theorem.
+    errors: share of states in which the policy errs; gaps: the expert's return minus the policy's; bounds: upper bounds
+    on the gaps by the learner's theorem.
     """
 
     problem: str
@@ -51,32 +51,32 @@ class Curve:
 
     @property
     def slope(self) -> float:
-        """The power of the horizon with which gap over error grows."""
-        return float(self._powers(self.ratios))
+        """Power of the horizon with which gap over error grows."""
+        return float(self._log_slopes(self.ratios))
 
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the slope, by bootstrap over draws at each horizon."""
+        """95 % interval of the slope, by bootstrap over the draws at each horizon."""
         rng = rng_for(0, f"slope of {self.problem}, {self.learner}, worst")
         horizons, draws = self.gaps.shape
         chosen = rng.integers(draws, size=(_BOOTSTRAPS, horizons, draws))
         gaps, errors = (one[np.arange(horizons)[:, None], chosen].mean(axis=2) for one in (self.gaps, self.errors))
-        low, high = np.quantile(self._powers(gaps / errors), [0.025, 0.975])
+        low, high = np.quantile(self._log_slopes(gaps / errors), [0.025, 0.975])
         return float(low), float(high)
 
     @property
     def above(self) -> int:
-        """Number of policies whose gap is above its bound by more than rounding."""
+        """Number of policies whose gap exceeds its bound by more than rounding."""
         return int((self.gaps > self.bounds * (1 + _ROUNDING) + _ROUNDING).sum())
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything for a file."""
+        """Return the curve as JSON."""
         losses = {name: getattr(self, name).tolist() for name in ("errors", "gaps", "bounds")}
         found = {"slope": self.slope, "interval": self.interval, "above": self.above}
         return {"problem": self.problem, "learner": self.learner, "horizons": self.horizons, **losses, **found}
 
-    def _powers(self, ratios: F64) -> F64:
-        """Slopes in log-log of ratios (..., h)."""
+    def _log_slopes(self, ratios: F64) -> F64:
+        """Log-log slopes of ratios (..., h) over the horizons."""
         x = np.log(self.horizons) - np.log(self.horizons).mean()
         return np.log(ratios) @ x / (x @ x)
 
@@ -98,10 +98,10 @@ def curves(process: Process, horizons: Sequence[int], draws: int) -> Iterator[Cu
 
 
 def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
-    """Return error, gap and bound by the learner's theorem of each policy (B, H, S), (3, B).
+    """Return error, gap and bound, (3, B), of each policy (B, H, S) by the learner's theorem.
 
-    cloning: error in the expert's states, Theorem 8.1; DAgger: in the policy's own, Theorem 8.2. The gap is what the
-    policy's wrong actions cost in the states that it visits (the performance difference lemma).
+    cloning: error in the expert's states, Theorem 8.1; DAgger: in the policy's own, Theorem 8.2. The gap is the cost of
+    the policy's wrong actions in the states that it visits (the performance difference lemma).
     """
     horizon, own = policies.shape[1], process.visits(policies) * policies
     gaps = (own * process.wrong_costs(horizon)).sum(axis=(1, 2))
@@ -112,17 +112,17 @@ def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
 
 
 def clone(process: Process, seen: NDArray[np.bool_]) -> F64:
-    """Return policies (..., H, S) fitted to labels of the states seen (..., H, S): right there, wrong elsewhere.
+    """Return policies (..., H, S) fitted to labels in the seen states (..., H, S): right there, wrong elsewhere.
 
-    Where no action is worse than the expert's, as after a fall, it does as the expert.
+    In states in which no action is worse than the expert's, such as after a fall, they act as the expert.
     """
     return np.where(seen | (process.wrong_costs(seen.shape[-2]) <= 0), 0.0, 1.0)
 
 
 def dagger(process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.random.Generator]) -> F64:
-    """Return DAgger's policies (B, H, S), of `count` trajectories a round: the best of all rounds (Definition 8.2).
+    """Return DAgger's policies (B, H, S), with `count` trajectories per round: the best of all rounds (Definition 8.2).
 
-    seen: states (B, H, S) with labels of the expert's own trajectories, to begin with. rngs: see `Process.seen`.
+    seen: whether states (B, H, S) have labels from the expert's own trajectories. rngs: see `Process.seen`.
     """
     best, least = np.empty(seen.shape), np.full(len(seen), np.inf)
     for round_ in range(ROUNDS + 1):
@@ -136,7 +136,7 @@ def dagger(process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.
 
 
 def _fitted(process: Process, horizon: int, draws: int) -> dict[Learner, F64]:
-    """Policies of cloning and of DAgger on as many trajectories, which leave a share of about `ERROR` / H unseen."""
+    """Cloning's and DAgger's policies for equally many trajectories, which leave a share of about ERROR / H unseen."""
     rngs = [rng_for(draw, f"trajectories of {horizon} steps, {process.name}") for draw in range(draws)]
     count = int(np.ceil(PLACES * np.log(horizon / ERROR)))
     first = round(count / (1 + ROUNDS / MORE))

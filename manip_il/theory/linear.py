@@ -1,10 +1,10 @@
-"""Cloning where actions are continuous: linear systems, told apart by what becomes of an error that nobody corrects.
+"""Cloning with continuous actions, on linear systems that differ in how an uncorrected error develops.
 
-x' = a x + u + w. The expert u = -k x brings every state back by half in a step. Its demonstrations hold little of what
-lies beside them, so a clone has no feedback there, and an error goes the way of the open loop: it dies out where that
-is stable, as in an arm whose servos hold joint targets, and grows exponentially where it is not. Simchowitz et al.
-(2025) prove the latter for smooth deterministic imitators in general; that noise on the demonstrations shows the
-expert's corrections is DART (Laskey et al. 2017).
+x' = a x + u + w. The expert u = -k x halves the state in every step. Its demonstrations cover few states beside its
+path, so a clone has no feedback there, and an error develops as in the open loop: it decays if the open loop is stable,
+as for an arm whose servos hold joint targets, and grows exponentially otherwise. Simchowitz et al. (2025) prove the
+latter for smooth deterministic imitators in general. Noise on the demonstrations, which makes the expert show
+corrections, is DART (Laskey et al. 2017).
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from numpy.typing import NDArray
 from manip_il.seeding import rng_for
 
 F64 = NDArray[np.float64]
-OPEN_LOOPS = {0.8: "stable", 1.0: "marginal", 1.25: "unstable"}  # a: what becomes of an error that nobody corrects
+OPEN_LOOPS = {0.8: "stable", 1.0: "marginal", 1.25: "unstable"}  # names of the poles a
 STEPS, DEMONSTRATIONS, ROLLOUTS = 40, 50, 500
-BACK = 0.5  # what the expert leaves of a state in one step
-GUST = 1e-3  # standard deviation of what disturbs a rollout, each step
-NOISE = 0.1  # standard deviation of the noise on the expert's actions in demonstrations, as DART adds
-_LATE = 10  # steps over which the growth is measured, the last ones
+BACK = 0.5  # factor by which the expert shrinks the state in one step
+GUST = 1e-3  # standard deviation of a rollout's disturbance in each step
+NOISE = 0.1  # standard deviation of DART's noise on the expert's actions in demonstrations
+_LATE = 10  # the growth is measured over this many final steps
 
 
 @dataclass(frozen=True)
 class Drift:
-    """Distance of a clone from where the expert would be. pole: a; noise: on the actions of its demonstrations.
+    """Distance between a clone's and the expert's states. pole: a; noise: on the demonstrated actions.
 
-    error: of its actions in the expert's states, root mean square; apart: from the expert's states after each step,
-    root mean square, (STEPS,).
+    error: root mean square error of its actions in the expert's states; apart: root mean square distance from the
+    expert's states after each step, (STEPS,).
     """
 
     pole: float
@@ -41,21 +41,21 @@ class Drift:
 
     @property
     def growth(self) -> float:
-        """Factor by which the clone is farther off after one more step, at the end."""
+        """Factor by which the distance grows per step, at the end."""
         return float((self.apart[-1] / self.apart[-1 - _LATE]) ** (1 / _LATE))
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything for a file."""
+        """Return the drift as JSON."""
         return asdict(self) | {"growth": self.growth, "open_loop": OPEN_LOOPS[self.pole]}
 
 
 def drifts() -> list[Drift]:
-    """Return what becomes of a clone on every system, from clean demonstrations and from noisy ones."""
+    """Return the drift of a clone on every system, for clean and for noisy demonstrations."""
     return [_drift(pole, noise) for pole in OPEN_LOOPS for noise in (0.0, NOISE)]
 
 
 def _drift(pole: float, noise: float) -> Drift:
-    """A clone has a policy for each step, as the theorems have them, linear between the nearest states shown there."""
+    """The drift of a clone that has one policy per step, as in the theorems, linear between demonstrated states."""
     rng = rng_for(0, f"linear scalar {pole} {noise}")
     now, shown = rng.uniform(-1, 1, DEMONSTRATIONS), list[F64]()
     for _ in range(STEPS):

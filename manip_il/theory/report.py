@@ -1,4 +1,4 @@
-"""The page and the file of `manip-il theory`."""
+"""The report and the JSON file of `manip-il theory`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from manip_il.theory.shift import WRONG, RoundShift, Shift
 
 FILE_NAME = "theory.json"
 _LOOKS = {"cloning": (CLONING, "o"), "DAgger": (DAGGER, "s")}
-_LEAST = 1e-7  # of a distance on a logarithmic axis
-_CLOUDS, _POINTS = 5, 1_500  # rounds whose clouds are shown, and points of a cloud
+_LEAST = 1e-7  # smallest distance on the logarithmic axis
+_CLOUDS, _POINTS = 5, 1_500  # most rounds shown as clouds, and most points per cloud
 _DATA = "#b9bfc6"
 
 
 @dataclass(frozen=True)
 class Theory:
-    """All that was found. shift: of a run, where one was given."""
+    """All results. shift: a run's distribution shift, if a run was given."""
 
     curves: tuple[Curve, ...]
     drifts: tuple[Drift, ...]
@@ -34,16 +34,16 @@ class Theory:
 
     @property
     def above(self) -> int:
-        """Number of policies whose gap is above its bound."""
+        """Number of policies whose gap exceeds its bound."""
         return sum(curve.above for curve in self.curves)
 
     @property
     def by_name(self) -> dict[tuple[str, str], Curve]:
-        """The curves by process and learner."""
+        """Curves by process and learner."""
         return {(curve.problem, curve.learner): curve for curve in self.curves}
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything for `theory.json`."""
+        """Return the content of `theory.json`."""
         return {
             "curves": [curve.to_json() for curve in self.curves],
             "above": self.above,
@@ -53,7 +53,7 @@ class Theory:
 
 
 def slope_table(theory: Theory) -> Table:
-    """Return the slopes, one row a process."""
+    """Return a table of the slopes, one row per process."""
     rows = []
     for process in PROCESSES:
         cloned, improved = (theory.by_name[process.name, learner] for learner in ("cloning", "DAgger"))
@@ -66,10 +66,10 @@ def slope_table(theory: Theory) -> Table:
 
 
 def theory_report(theory: Theory, command: str, config: Mapping[str, Any]) -> Report:
-    """Return the report of all that was found."""
+    """Return the report of all results."""
     sections = [_theorems(theory), _linear(theory)]
     facts = [
-        f"{sum(curve.gaps.size for curve in theory.curves):,} policies on three processes, every value by dynamic "
+        f"{sum(curve.gaps.size for curve in theory.curves):,} policies on three processes, all values by dynamic "
         f"programming: {theory.above or 'none'} above its bound.",
     ]
     if theory.shift is not None:
@@ -77,10 +77,10 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any]) -> Re
     slopes = {key: curve.slope for key, curve in theory.by_name.items()}
     walk, rope = PROCESSES[0].name, PROCESSES[1].name
     return Report(
-        title="What is proved of imitation, seen",
-        verdict="Where the expert mends a mistake, cloning's gap grows with the horizon to the power of "
-        f"{slopes[walk, 'cloning']:.1f} and DAgger's to the power of {slopes[walk, 'DAgger']:.1f}; on a {rope} both to "
-        f"{slopes[rope, 'DAgger']:.1f}.",
+        title="Theorems on imitation, compared with measurements",
+        verdict="If the expert can recover from a mistake, cloning's gap grows as the horizon to the power of "
+        f"{slopes[walk, 'cloning']:.1f} and DAgger's to the power of {slopes[walk, 'DAgger']:.1f}; on a {rope} both "
+        f"powers are {slopes[rope, 'DAgger']:.1f}.",
         facts=tuple(facts),
         command=command,
         config=config,
@@ -96,7 +96,7 @@ def _theorems(theory: Theory) -> Section:
     return Section(
         "Cloning and DAgger over the horizon",
         lead=(
-            "Three finite processes, solved exactly, on which the expert always acts right. A wrong action "
+            "Three finite processes, solved exactly, on which the expert never errs. A wrong action "
             + "; ".join(f"{process.words} ({process.name})" for process in PROCESSES)
             + ".",
         ),
@@ -107,18 +107,18 @@ def _theorems(theory: Theory) -> Section:
         figures=(_theorem_figure(theory.curves),),
         tables=(slope_table(theory),),
         notes=(
-            "Slopes of gap over error in log-log, with 95 % bootstrap intervals over the draws of data. u is what one "
-            "wrong step costs at most an expert who drives on. The chapter writes H ε and has u in its constant: where "
-            "nothing mends a mistake, as on the tightrope, u is H, and DAgger pays as cloning does (Ross et al. 2011; "
+            "Log-log slopes of gap over error, with 95 % bootstrap intervals over the draws of data. u is the largest "
+            "cost of one wrong step if the expert then drives. The chapter has H ε with u in its constant: if no "
+            "recovery is possible, as on the tightrope, u is H, and DAgger loses as much as cloning (Ross et al. 2011; "
             "Rajaraman et al. 2020).",
-            f"Points: {DRAWS} fits a horizon to trajectories that leave about {ERROR:g}/H of the states unseen; there "
-            "a fit takes the worst action that is left open.",
+            f"Points: {DRAWS} fits per horizon, to trajectories that leave about {ERROR:g}/H of the states unseen; in "
+            "those, a fit takes the worst action.",
         ),
     )
 
 
 def _theorem_figure(curves: Sequence[Curve]) -> Figure:
-    """Gap over error against the horizon: one panel a process, both learners, beside their bounds."""
+    """Gap over error against the horizon: one panel per process, with both learners and their bounds."""
     with drawing(len(PROCESSES), size=(3.2, 3.0)) as (drawn, axes):
         for axis, process in zip(axes[0], PROCESSES, strict=True):
             own = [curve for curve in curves if curve.problem == process.name]
@@ -149,26 +149,26 @@ def _linear(theory: Theory) -> Section:
         )
         for drift in theory.drifts
     ]
-    columns = ("system", "open loop", "noise", "error in the expert's states", "distance at the end", "growth a step")
+    columns = ("system", "open loop", "noise", "error in the expert's states", "final distance", "growth per step")
     return Section(
-        "Continuous control: what becomes of an error",
+        "Continuous control: how an error develops",
         lead=(
-            f"x' = a x + u + w, with gusts w of {GUST:g}; the expert halves every state. Its demonstrations hold "
-            "little of what lies beside them, so there a clone does not correct: an error dies out where the open loop "
-            "is stable, as under servos that hold joint targets, and grows by the open loop's factor a step where it "
-            "is not, however small the clone's error in the expert's states.",
+            f"x' = a x + u + w, with disturbances w of {GUST:g}; the expert halves the state in every step. Its "
+            "demonstrations cover few states beside its path, so a clone does not correct errors there: they decay if "
+            "the open loop is stable, as with servos that hold joint targets, and otherwise grow by the open loop's "
+            "factor per step, however small the clone's error in the expert's states.",
         ),
         figures=(_linear_figure(theory.drifts),),
         tables=(Table(columns, tuple(rows)),),
         notes=(
-            "Noise on the demonstrations (DART, dashed) shows the expert's corrections, and the clone learns them. For "
-            "smooth deterministic imitators in general the exponential growth is proved (Simchowitz et al. 2025).",
+            "Noise on the demonstrations (DART, dashed) makes the expert show corrections, and the clone learns them. "
+            "The exponential growth is proved for smooth deterministic imitators (Simchowitz et al. 2025).",
         ),
     )
 
 
 def _linear_figure(drifts: Sequence[Drift]) -> Figure:
-    """How far clones get from the expert, step by step."""
+    """Distance of clones from the expert over the steps."""
     with drawing(1, size=(5.4, 3.4)) as (drawn, axes):
         axis, poles = axes[0, 0], list(OPEN_LOOPS)
         for drift in drifts:
@@ -179,7 +179,7 @@ def _linear_figure(drifts: Sequence[Drift]) -> Figure:
         axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
         axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=(_LEAST, 100))
         drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-        return to_figure(drawn, "Distance of clones from the expert over the steps, of stable and unstable systems")
+        return to_figure(drawn, "Distance of clones from the expert over the steps, on stable and unstable systems")
 
 
 def _arm(shift: Shift) -> list[Section]:
@@ -204,26 +204,26 @@ def _arm(shift: Shift) -> list[Section]:
             f"The arm: {shift.env.robot} {shift.env.task}",
             tables=(Table(columns, tuple(rows)),),
             notes=(
-                f"An action is wrong if a joint is farther off the expert's label than {WRONG:g} of its largest step. "
-                "Distance: of the states that the policy visits to the nearest in the data it was fitted on, median; 1 "
-                "is that of the expert's own new episodes.",
-                f"Costs are control steps until solved, {shift.env.horizon} where it is not; the expert takes "
-                f"{shift.expert_cost:.1f}. u is the most that one wrong action was seen to cost the expert: "
-                f"{shift.u} steps, a lower bound. A bound above the horizon says nothing of this policy: the theorem "
-                "counts every wrong action as the worst one.",
+                f"An action is wrong if a joint is off the expert's label by more than {WRONG:g} of its largest step. "
+                "Distance: median distance of the policy's states to the nearest training state, relative to that of "
+                "the expert's states in new episodes.",
+                f"Costs are control steps until success, or {shift.env.horizon} without success; the expert takes "
+                f"{shift.expert_cost:.1f}. u is the largest observed cost of one wrong action for the expert, "
+                f"{shift.u} steps, a lower bound. A bound above the horizon says nothing about this policy: the "
+                "theorem counts every wrong action as the worst one.",
             ),
         ),
         Section(
-            "Distribution shift: where the hand was",
+            "Distribution shift: positions of the hand",
             figures=(_clouds_figure(shift.rounds),),
-            notes=("Grey: the data that the policy was fitted on. Colour: where it took the hand itself.",),
+            notes=("Grey: the policy's training data. Colour: the policy's own rollouts.",),
         ),
     ]
 
 
 def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
-    """Where the hand was, in the data and when the policy drove: from above and from the side, by round."""
-    if len(rounds) > _CLOUDS:  # the first ones closest together: there most changes
+    """Positions of the hand in the data and in the policy's rollouts, from above and from the side, by round."""
+    if len(rounds) > _CLOUDS:  # most of the early rounds, in which most changes
         rounds = [rounds[index] for index in (0, 1, 2, (len(rounds) + 2) // 2, len(rounds) - 1)]
     with drawing(len(rounds), 2, size=(9.0 / len(rounds), 2.2), share=True) as (drawn, axes):
         for column, one in enumerate(rounds):
@@ -238,4 +238,4 @@ def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
         axes[0, 0].invert_xaxis()
         axes[0, 0].set_ylabel("from above: x over y [m]", fontsize=8.5)
         axes[1, 0].set_ylabel("from the side: z over x [m]", fontsize=8.5)
-        return to_figure(drawn, "Places of the hand in the data and in the policy's rollouts, by round")
+        return to_figure(drawn, "Positions of the hand in the data and in the policy's rollouts, by round")

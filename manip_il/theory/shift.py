@@ -1,8 +1,8 @@
 """Distribution shift on an arm, measured for every round of a DAgger run.
 
-How often a round's policy errs in the expert's states and in its own; how far its own states lie from the data that it
-was fitted on; what it costs more than the expert, beside what Theorem 8.2 allows for as many errors.
-Costs are control steps until the task is solved, the horizon where it is not.
+For each round's policy: how often it errs in the expert's states and in its own, how far its own states are from its
+training data, and how much more it costs than the expert, compared with Theorem 8.2's bound.
+Costs are control steps until the task is solved, or the horizon if it is not.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from manip_il.seeding import rng_for, stream_seeds
 from manip_il.tasks.config import EnvConfig
 
 F64 = NDArray[np.float64]
-EPISODES = 50  # of the expert and of every round's policy
-WRONG = 0.25  # of the largest step: an action that is farther off the label, in any joint, is wrong
-MOST_STATES = 4_000  # of a kind, that are compared
+EPISODES = 50  # episodes of the expert and of each round's policy
+WRONG = 0.25  # an action is wrong if any joint is off the label by more than this share of its largest step
+MOST_STATES = 4_000  # training states that are compared
 _HAND = ("ee.x", "ee.y", "ee.z")
 _OBSERVED = (schema.STATE, schema.ENVIRONMENT_STATE)
 _COLUMNS = (*_OBSERVED, schema.ACTION, schema.EXECUTED_ACTION, schema.LABEL_VALID)
@@ -41,17 +41,17 @@ Columns = dict[str, NDArray[Any]]
 OnEpisode = Callable[[Episode], None]
 
 
-RoundData = tuple[int, Path, tuple[Path, ...]]  # number, `pretrained_model` folder, datasets that it was fitted on
+RoundData = tuple[int, Path, tuple[Path, ...]]  # number, `pretrained_model` folder, training datasets
 
 
 @dataclass(frozen=True)
 class RoundShift:
     """One round's policy. on_expert, on_own: share of the expert's states, and of its own, in which it is wrong.
 
-    on_expert: None for a policy on pictures. mistakes: wrong actions in an episode of its own, on average. distance: of
-    its states from the data, median to the nearest; of the expert's, in new episodes, it is 1. cost, gap: its own, and
-    above the expert's; bound: what Theorem 8.2 allows that to be, u times its mistakes [control steps]. data, hand:
-    where the hand was in the data and in its rollouts, (N, 3) [m].
+    on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode. distance: median
+    distance of its states to the nearest training state, relative to the expert's. cost, gap: mean cost, and its excess
+    over the expert's [control steps]; bound: Theorem 8.2's bound on the gap, u times `mistakes`. data, hand: positions
+    of the hand in the data and in its rollouts, (N, 3) [m].
     """
 
     round: int
@@ -72,7 +72,7 @@ class RoundShift:
         return "cloning (round 0)" if self.round == 0 else f"round {self.round}"
 
     def to_json(self) -> dict[str, Any]:
-        """Return all numbers but the places."""
+        """Return all numbers except the positions."""
         names = ("round", "on_expert", "on_own", "mistakes", "distance", "cost", "gap", "bound")
         success = {"success": self.success.rate, "interval": list(self.success.interval)}
         return {name: getattr(self, name) for name in names} | success
@@ -80,7 +80,7 @@ class RoundShift:
 
 @dataclass(frozen=True)
 class Shift:
-    """A whole run. expert_cost: [control steps]; u: the most that one wrong action was seen to cost [control steps]."""
+    """A run's rounds. expert_cost: [control steps]; u: largest observed cost of one wrong action [control steps]."""
 
     env: EnvConfig
     expert_cost: float
@@ -88,7 +88,7 @@ class Shift:
     rounds: tuple[RoundShift, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return all numbers but the places."""
+        """Return all numbers except the positions."""
         return {
             "robot": self.env.robot,
             "task": self.env.task,
@@ -100,7 +100,7 @@ class Shift:
 
 
 def find_rounds(run: Path) -> list[RoundData]:
-    """Return the rounds of a run that have a policy. Raises `ManipError` where there is none."""
+    """Return the rounds of a run that have a policy. Raises `ManipError` if there is none."""
     found, datasets = list[RoundData](), list[Path]()
     for folder in sorted(run.glob("round_[0-9][0-9][0-9]")):
         if (folder / "dataset" / "meta" / "info.json").is_file():
@@ -121,9 +121,9 @@ def measure_shift(
     episodes: int = EPISODES,
     on_episode: OnEpisode = lambda _: None,
 ) -> Shift:
-    """Run the expert and every round's policy on the same seeds, the expert asked in every state.
+    """Run the expert and every round's policy on the same seeds, and query the expert in every state.
 
-    u: of the expert on `env`, see `certify`.
+    u: the expert's recoverability on `env`, see `certify`.
     """
     seeds, scale = stream_seeds("theory", episodes), env_actions(env).scale
     spec, found = env_spec(env), list[RoundShift]()
@@ -131,9 +131,9 @@ def measure_shift(
     expert, expert_cost, _ = _run(engine, RolloutJob(env, hold=0), seeds, on_episode)
     for number, path, datasets in rounds:
         own, cost, success = _run(engine, RolloutJob(env, PolicyDriver((path,)), hold=0), seeds, on_episode)
-        policy, data = LearnedPolicy.load(path), _data(number, datasets)
-        wrong = _wrong(own[schema.EXECUTED_ACTION], own, scale)
-        on_expert = None if policy.cameras else float(_wrong(_retraced(policy, expert), expert, scale).mean())
+        policy, data = LearnedPolicy.load(path), _training_states(number, datasets)
+        wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)
+        on_expert = None if policy.cameras else float(_is_wrong(_actions_on(policy, expert), expert, scale).mean())
         mistakes = float(wrong.sum() / episodes)
         found.append(
             RoundShift(
@@ -156,7 +156,7 @@ def measure_shift(
 def _run(
     engine: Engine, job: RolloutJob, seeds: Sequence[int], on_episode: OnEpisode
 ) -> tuple[Columns, float, Proportion]:
-    """Columns of all episodes, in the order of their seeds, their mean cost, and how many succeeded."""
+    """Columns of all episodes in the order of their seeds, their mean cost, and their success rate."""
     found = list[Episode]()
     for episode in engine.run(job, seeds):
         found.append(episode.without_pictures())
@@ -168,8 +168,8 @@ def _run(
     return table, cost, Proportion.of([episode.success for episode in found])
 
 
-def _data(round_: int, datasets: Sequence[Path]) -> Columns:
-    """What a round's policy was fitted on, but states after success, which rollouts here end at."""
+def _training_states(round_: int, datasets: Sequence[Path]) -> Columns:
+    """States that a round's policy was fitted to, without those after success, because rollouts here end at success."""
     table = joined_columns(datasets, [*_OBSERVED, schema.SUCCESS])
     rows = np.flatnonzero(~table[schema.SUCCESS].ravel().astype(np.bool_))
     if len(rows) > MOST_STATES:
@@ -178,28 +178,28 @@ def _data(round_: int, datasets: Sequence[Path]) -> Columns:
 
 
 def _observed(table: Columns) -> F64:
-    """What a policy observes, (N, d)."""
+    """Observations of a policy, (N, d)."""
     return np.concatenate([table[key] for key in _OBSERVED], axis=1).astype(np.float64)
 
 
-def _retraced(policy: LearnedPolicy, table: Columns) -> F64:
-    """Actions of a policy in the states of episodes that somebody else drove, (N, n)."""
+def _actions_on(policy: LearnedPolicy, table: Columns) -> F64:
+    """Actions of a policy in the states of another driver's episodes, (N, n)."""
     found = np.empty(table[schema.ACTION].shape)
     for rows, actions in actions_along(policy, table):
         found[rows] = actions
     return found
 
 
-def _wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.bool_]:
-    """Whether each of the actions (N, n) is wrong, of those where the expert's label is sound."""
+def _is_wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.bool_]:
+    """Whether actions (N, n) are wrong, one entry for each frame with a valid label."""
     off = (np.abs(actions - table[schema.ACTION]) / scale).max(axis=1) > WRONG
     return off[table[schema.LABEL_VALID].ravel() != 0]
 
 
 def relative_distance(states: F64, data: F64, fresh: F64) -> float:
-    """Return the median distance of states (N, d) to their nearest in the data (M, d), 1 for the expert's new ones.
+    """Return the median distance of states (N, d) to their nearest in the data (M, d), relative to that of `fresh`.
 
-    fresh: those, (F, d). In standard deviations of the data's columns.
+    fresh: the expert's states in new episodes, (F, d). Columns are scaled by the data's standard deviations.
     """
     scale = np.maximum(data.std(axis=0), 1e-6)
     own, usual = (np.median(cdist(rows / scale, data / scale).min(axis=1)) for rows in (states, fresh))
