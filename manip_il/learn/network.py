@@ -6,7 +6,7 @@ importing LeRobot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -178,7 +178,10 @@ class MLPNetwork(nn.Module):
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
         """Return actions, (B, n), each the same bits whatever the other rows are."""
-        return _in_blocks(self.actions, inputs)
+        rows = len(inputs)  # filled up with zeros to whole blocks
+        padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
+        padded[:rows] = inputs
+        return torch.cat([self.actions(block) for block in padded.split(ROWS)])[:rows]
 
     def actions(self, inputs: Tensor) -> Tensor:
         """Return actions, (B, n), of all rows in one product, whose last bits depend on their number."""
@@ -202,14 +205,6 @@ def threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _in_blocks(function: Callable[[Tensor], Tensor], inputs: Tensor) -> Tensor:
-    """Apply a function to `ROWS` rows of inputs (B, d) at a time, the last ones filled up with zeros."""
-    rows = len(inputs)
-    padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
-    padded[:rows] = inputs
-    return torch.cat([function(block) for block in padded.split(ROWS)])[:rows]
 
 
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
