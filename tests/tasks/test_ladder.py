@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -52,14 +53,11 @@ class Placed:
     opening: float = OPEN
     edge: float = EDGE
     touching: bool = False
-    most_opening: float = OPEN
     around: tuple[tuple[float, float], ...] = ()
     reach: Reach = UPRIGHT
-    lowest: float = LOWEST
-    leans: bool = False
-    lopsided: bool = False
-    faces_ahead: bool = False
     resting: bool = False
+    gripper: ClassVar[Any] = SimpleNamespace(most=OPEN, lopsided=False, middle=lambda opening: 0.0)
+    robot: ClassVar[Any] = SimpleNamespace(ee=SimpleNamespace(lowest=LOWEST), leans=False, faces_ahead=False)
 
     @property
     def hand_yaw(self) -> float:
@@ -70,9 +68,6 @@ class Placed:
 
     def off_down(self, yaw: float) -> float:
         return angle_from_down(self.ee.rotation, yaw)
-
-    def middle(self, opening: float) -> float:
-        return 0.0
 
     def pose(self, name: str) -> Pose:
         return {"object": self.cube}[name]
