@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import functools
 import logging
 import multiprocessing
 import os
@@ -44,6 +46,8 @@ IMPORTED_ONCE = [
 forkserver.set_forkserver_preload(IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
 
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
+
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
 LONG = (
     "docs/test_commands.py",
@@ -76,6 +80,17 @@ def _take_back() -> None:
         with contextlib.suppress(OSError):  # it has ended
             if os.sched_getscheduler(int(thread)) != os.SCHED_OTHER:
                 os.sched_setscheduler(int(thread), os.SCHED_OTHER, os.sched_param(0))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory_goes_back(request: pytest.FixtureRequest) -> Iterator[None]:
+    """What a file keeps for its own tests is let go after them, and what the allocator holds of it given back."""
+    yield
+    for kept in list(vars(request.module).values()):
+        if isinstance(kept, functools._lru_cache_wrapper):
+            kept.cache_clear()
+    if _TRIM is not None:
+        _TRIM(0)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

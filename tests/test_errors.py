@@ -35,11 +35,6 @@ def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.Captur
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_a_mismatch_names_both_sides():
-    message = str(MismatchError("fps", "the dataset", 20, "the policy", 25))
-    assert message == "fps differs: the dataset has 20, the policy has 25"
-
-
 @pytest.mark.parametrize(
     ("code", "kinds"),
     [(1, (ManipError, MismatchError, NotFiniteError, RenderError)), (2, (UsageError, UnknownName, FolderExistsError))],

@@ -1,5 +1,3 @@
-from dataclasses import FrozenInstanceError
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -62,15 +60,3 @@ def test_an_episode_has_frames_and_columns_of_one_length():
         Episode(0, {"action": np.zeros((3, 2)), "actor": np.zeros((4, 1))}, False, False)
     with pytest.raises(ManipError, match="no frames"):
         Episode(5, {"action": np.zeros((0, 2))}, False, False)
-
-
-def test_a_state_cannot_be_changed():
-    state = State(np.zeros(2), np.zeros(3))
-    with pytest.raises(FrozenInstanceError):
-        state.step = 3  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_without_pictures_no_column_has_any():
-    columns = {"action": np.zeros((2, 2)), "observation.images.front": np.zeros((2, 4, 4, 3), np.uint8)}
-    plain = Episode(0, columns, True, True).without_pictures()
-    assert list(plain.columns) == ["action"]

@@ -6,9 +6,7 @@ import pytest
 
 from manip_il.algorithms.config import RunConfig, plan_of
 from manip_il.learn.fit_config import FitConfig
-from manip_il.sim.config import CameraConfig
 
-FRONT = CameraConfig(("front",))
 CNN = FitConfig({"type": "cnn"})
 ACT = FitConfig({"type": "act", "chunk_size": 8, "n_action_steps": 4})
 DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})

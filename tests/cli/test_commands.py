@@ -90,7 +90,7 @@ def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp
 
 @pytest.mark.slow
 def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
-    words = [sys.executable, "-m", "manip_il.cli.main", *record(tmp_path / "d", 60)]
+    words = [sys.executable, "-m", "manip_il.cli.main", *record(tmp_path / "d", 1_000)]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     while process.poll() is None and not list((tmp_path / "d.journals").glob("episode-*")):
         time.sleep(0.01)

@@ -26,7 +26,7 @@ def client_of(book: nbformat.NotebookNode, folder: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
-    return NotebookClient(book, timeout=SECONDS, resources={"metadata": {"path": str(folder)}})
+    return NotebookClient(book, timeout=SECONDS, startup_timeout=SECONDS, resources={"metadata": {"path": str(folder)}})
 
 
 def tag_of(cell: nbformat.NotebookNode) -> str:

@@ -11,7 +11,7 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.build import build, merge_datasets
+from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, read_journal
 from manip_il.data.lerobot_write import write_dataset
@@ -54,10 +54,3 @@ def test_journals_keep_the_text_and_build_the_same_dataset(tmp_path, told, spec,
     assert texts(tmp_path / "built") == TEXTS
     for name in (layout.TASKS, layout.INFO):
         assert (tmp_path / "built" / name).read_bytes() == (root / name).read_bytes()
-
-
-def test_merging_numbers_the_texts_anew(tmp_path, told, spec, root):
-    write_dataset(told[1:], tmp_path / "other", spec, repo_id="local/other", fingerprint={})
-    merge_datasets([tmp_path / "other", root], tmp_path / "merged", repo_id="local/merged")
-    assert texts(tmp_path / "merged") == [BLUE, RED, *TEXTS]
-    assert pq.read_table(tmp_path / "merged" / layout.TASKS)["task"].to_pylist() == [BLUE, RED]

@@ -60,7 +60,7 @@ LEROBOT: dict[str, Sizes] = {
     },
     "lerobot-eval": {"eval.n_episodes": 1, "eval.batch_size": 1, "eval.use_async_envs": "false"},
 }  # fmt: skip
-_SHORT = ("reach", "push", "stack")  # tasks of a study of many
+_SHORT = ("reach", "push")  # tasks of a study of many
 LEROBOT_ENV: Sizes = {"env.episode_length": 5, "env.render_mode": "none"}
 LEROBOT_EVALUATION: Sizes = {"eval.n_episodes": 1, "eval.batch_size": 1, "env_eval_freq": 2}
 
@@ -132,11 +132,12 @@ def _policy_in_config(words: Iterable[str]) -> str:
 
 
 def shrink_study(path: Path) -> None:
-    """Give every arm of a study small sizes, in place."""
+    """Leave a study two of its arms, of small sizes, in place; all of them are read in `tests/cli/test_study.py`."""
     study = yaml.safe_load(path.read_text(encoding="utf-8"))
     of_dagger = {option.name for option in options_of(load("dagger"))}
     if any("task.type" in arm for arm in study["arms"].values()):  # of tasks that take so few steps
-        study["arms"] = {name: arm for name, arm in study["arms"].items() if name in _SHORT}
+        study["arms"] = {name: study["arms"][name] for name in _SHORT}
+    study["arms"] = dict(list(study["arms"].items())[:2])
     learning = [arm for arm in study["arms"].values() if "algorithm" in arm]
     for arm in learning:
         of_command = {option.name for option in options_of(load(f"rl {arm['algorithm']}"))}

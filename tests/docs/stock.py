@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from pathlib import Path
 
-from manip_il.cli.main import main
-
 from ..robots.own import model_of, write
+from .ours import Ours
 from .pages import ROOT, command_of
 from .sizes import small_words
 
@@ -48,7 +46,7 @@ class Stock:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def bring(self, words: tuple[str, ...], target: Path) -> None:
+    def bring(self, words: tuple[str, ...], target: Path, ours: Ours) -> None:
         """Put what a line reads, and nobody has made there yet, into `target`."""
         given = inputs(words)
         for path in (*given, *(READ_BY[one] for one in given if one in READ_BY)):
@@ -59,18 +57,17 @@ class Stock:
             name = next((name for name in (*RECIPES, SAMPLE) if f"{path}/".startswith(f"{name}/")), None)
             if name is None or (target / name).exists():
                 continue
-            made = self._made(name)
+            made = self._made(name, ours)
             if made != target / name:
                 (shutil.copytree if made.is_dir() else shutil.copy)(made, target / name)
 
-    def _made(self, name: str) -> Path:
+    def _made(self, name: str, ours: Ours) -> Path:
         if name == SAMPLE:
             return ROOT / SAMPLE
         if not (self.folder / name).exists():
             words = tuple(RECIPES[name].split())
-            self.bring(("manip-il", *words), self.folder)
-            with contextlib.chdir(self.folder):
-                assert main(small_words(words)) == 0, f"nothing made {name}"
+            self.bring(("manip-il", *words), self.folder, ours)
+            ours.run(small_words(words), self.folder, f"to make {name}")
         return self.folder / name
 
 

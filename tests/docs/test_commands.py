@@ -9,13 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.main import load
-from manip_il.cli.parsing import parse
-from manip_il.evaluation import film
-
-from ..store.servers import TOKEN, Hub, hub_server, s3_server, talk_to
+from ..store.servers import TOKEN, Hub, hub_server, s3_server
 from ..warm import Warm
-from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, command_of, help_lines, page_lines
+from .ours import Ours
+from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, help_lines, page_lines
 from .sizes import shrink_study
 from .stock import Stock
 from .workplace import PROGRAM, RULES, LeRobot, Workplace
@@ -67,7 +64,7 @@ def workplace(
     running_hub: Hub,
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
-) -> Workplace:
+) -> Iterator[Workplace]:
     """A folder with the repository's configs, studies made small, and servers that answer for the Hub and S3."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     for study in (tmp_path / "configs" / "studies").glob("*.yaml"):
@@ -78,9 +75,8 @@ def workplace(
     for name, value in (servers | {"HF_TOKEN": TOKEN, "HF_ENDPOINT": running_hub.url}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(film, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the demo's time
-    talk_to(running_hub.url, monkeypatch.setattr)
-    return Workplace(tmp_path, stock, lerobot)
+    with Ours(tmp_path.parent / f"{tmp_path.name}.log", os.environ) as ours:
+        yield Workplace(tmp_path, ours, stock, lerobot)
 
 
 def _pages() -> list[object]:
@@ -122,22 +118,3 @@ def test_every_block_of_a_page_is_of_a_kind_that_the_tests_know(page: str):
         if block.language == "text":
             first_words = {line.split()[0] for line in block.text.splitlines() if line.split()}
             assert not first_words & {PROGRAM, *RULES}, f"{block.where}: commands belong into a block of `sh`"
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_every_line_is_one_that_the_command_line_takes(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    for one in ROOT.iterdir():
-        if one.name != "runs":
-            (tmp_path / one.name).symlink_to(one)
-    reward = tmp_path / "runs" / "irl" / "reward.json"  # read with the options, as it says what the task is
-    reward.parent.mkdir(parents=True)
-    reward.write_text('{"names": ["length"], "weights": [1.0]}')
-    monkeypatch.chdir(tmp_path)
-    for line in page_lines(page):
-        if line.words[0] == PROGRAM:
-            name, own = command_of(line.words[1:])
-            kind = load(name)
-            if "--help" not in own:
-                parse(kind, own)
-        else:
-            assert line.words[0] in RULES or line.words[0].startswith("lerobot-"), line

@@ -10,13 +10,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import yaml
 
-from manip_il.cli.main import load, main
+from manip_il.cli.main import load
 from manip_il.cli.parsing import parse
 
+from .ours import Ours
 from .pages import ROOT, Block, Line, command_of, shell_lines
 from .sizes import small_lerobot, small_words
 from .stock import RECIPES, Stock
@@ -29,10 +29,10 @@ LeRobot = Callable[[list[str], Path], None]
 
 
 class Workplace:
-    """Runs lines. A line that no rule covers is an error."""
+    """Runs lines. A line that no rule covers is an error. ours: runs commands and code in the process of the page."""
 
-    def __init__(self, folder: Path, stock: Stock, lerobot: LeRobot) -> None:
-        self.folder, self.stock, self.lerobot = folder, stock, lerobot
+    def __init__(self, folder: Path, ours: Ours, stock: Stock, lerobot: LeRobot) -> None:
+        self.folder, self.ours, self.stock, self.lerobot = folder, ours, stock, lerobot
 
     def run_block(self, block: Block) -> None:
         """Every command of a shell block, a Python block, or what a YAML block is for."""
@@ -52,10 +52,10 @@ class Workplace:
         first = line.words[0]
         words = tuple(_OF_A_CONTAINER.sub("", _named(word)) for word in line.words)
         if first == PROGRAM:
-            self.stock.bring(words, self.folder)
+            self.stock.bring(words, self.folder, self.ours)
             self._manip_il(words[1:], line)
         elif first.startswith("lerobot-"):
-            self.stock.bring(words, self.folder)
+            self.stock.bring(words, self.folder, self.ours)
             self.lerobot(small_lerobot(words), self.folder)
         else:
             rule = RULES.get(first)
@@ -65,16 +65,12 @@ class Workplace:
     def _manip_il(self, words: tuple[str, ...], line: Line) -> None:
         with contextlib.chdir(self.folder):
             small = small_words(words)
-            assert main(small) == 0, f"{line}\nas: {PROGRAM} {shlex.join(small)}"
+        self.ours.run(small, self.folder, str(line))
 
     def _python_block(self, block: Block) -> None:
-        self.stock.bring(("python", *(name for name in RECIPES if f'"{name}"' in block.text)), self.folder)
-        with contextlib.chdir(self.folder):
-            names: dict[str, Any] = {"__name__": "__main__"}
-            exec(compile(block.text, block.where, "exec"), names)
-        for one in names.values():
-            if isinstance(one, type) and one.__module__ == "__main__" and hasattr(one, "rungs"):
-                (self.folder / f"{one.name}.py").write_text(block.text)  # as the page asks
+        words = ("python", *(name for name in RECIPES if f'"{name}"' in block.text))
+        self.stock.bring(words, self.folder, self.ours)
+        self.ours.execute(block.text, self.folder, block.where)
 
     def _yaml_block(self, block: Block) -> None:
         """`# NAME.yaml` in its first line names a file for the lines that follow; else it is a job of Kubernetes."""

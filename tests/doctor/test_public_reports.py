@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from lerobot.datasets.dataset_tools import merge_datasets, modify_tasks, split_dataset
+from lerobot.datasets.dataset_tools import merge_datasets, modify_tasks
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.cli.main import main
@@ -52,12 +52,7 @@ def merged(root: Path) -> Path:
     return root.with_name("new")
 
 
-def split(root: Path) -> Path:
-    split_dataset(theirs(modified(root)), {"new": [1, 2, 3]}, output_dir=root.parent)
-    return root.with_name("new")
-
-
-@pytest.mark.parametrize("change", [index_without_a_name, modified, merged, split])
+@pytest.mark.parametrize("change", [index_without_a_name, merged])
 def test_a_dataset_that_lerobots_tools_changed_goes_through_every_command(change, tmp_path: Path, capsys):
     original = shutil.copytree(SAMPLE, tmp_path / "demos")
     root = change(original)

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.comparison import Comparison
@@ -52,13 +50,6 @@ def test_what_is_written_is_read_back_equal(tmp_path: Path):
     assert EvalResult.read(tmp_path / "deep" / "eval.json") == made
     assert EvalResult.read(tmp_path / "deep") == made
     assert [entry.name for entry in (tmp_path / "deep").iterdir()] == ["eval.json"]
-
-
-@given(st.lists(st.booleans(), min_size=1, max_size=30), st.floats(allow_nan=False, allow_infinity=False))
-def test_json_keeps_every_bit(outcomes: list[bool], ret: float):
-    made = result(outcomes)
-    made = replace(made, episodes=tuple(replace(e, ret=ret, detail={"push": [ret]}) for e in made.episodes))
-    assert EvalResult.from_json(json.loads(json.dumps(made.to_json()))) == made
 
 
 def test_success_is_split_by_condition_in_the_order_of_the_settings():

@@ -17,12 +17,22 @@ def run_command(words: Sequence[str], log: str, warm: bool = False) -> None:
     from manip_il.cli.main import main
 
     os.setsid()
+    say_into(log)
+    if warm:
+        fork_instead_of_spawning()
+    sys.exit(main(words))
+
+
+def say_into(log: str) -> None:
+    """Put what this process prints into a file."""
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
-    if warm:
-        util.spawnv_passfds = _fork_what_would_be_spawned  # pyright: ignore
-    sys.exit(main(words))
+
+
+def fork_instead_of_spawning() -> None:
+    """Have the workers of this process forked from it, with all that it has imported."""
+    util.spawnv_passfds = _fork_what_would_be_spawned  # pyright: ignore
 
 
 def living(session: int) -> list[int]:

@@ -67,14 +67,6 @@ def test_the_reward_of_airl_is_f_less_the_log_density():
     np.testing.assert_allclose(d.reward(steps, logs), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_in_the_absorbing_state_nothing_but_the_flag_is_seen():
-    d, _ = trained("gail")
-    states = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
-    states[:, -1] = 1.0
-    found = d.reward(Transitions(states, np.float32([[1, 0], [-1, 0]]), states))
-    assert found[0] == found[1]
-
-
 def test_the_penalty_holds_the_slope_near_one():
     slopes = []
     for penalty in (0.0, 10.0):

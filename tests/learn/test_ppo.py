@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from manip_il.learn.ppo import lent_generators
@@ -98,12 +97,3 @@ def test_what_was_saved_goes_on_to_the_same_bits(tmp_path):
     other.load(tmp_path, {})
     iterate(other, its_env, 1)
     assert all(torch.equal(value, other.policy.state_dict()[name]) for name, value in weights(one).items())
-
-
-def test_noise_of_exploration_is_as_wide_as_the_actors_and_within_the_range():
-    one, env = learner()
-    rows = Transitions(*(np.zeros((4000, width), np.float32) for width in (4, 2, 4)))
-    noisy = one.explored(rows, np.random.default_rng(0)).actions
-    assert noisy[:, 0].std() == pytest.approx(np.exp(-0.5), rel=0.05)
-    assert not noisy[:, 1].any()
-    assert noisy[:, 0].max() <= env.range.space.high[0]

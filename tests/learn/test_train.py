@@ -20,7 +20,7 @@ from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import check_same_sources, recorded_look, row_weights
+from manip_il.learn.sources import check_same_sources, row_weights
 from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import METRICS_FILE
 
@@ -271,14 +271,6 @@ def test_datasets_that_mean_other_things_are_refused_with_both_named(spec, write
         with pytest.raises(MismatchError, match=words):
             check_same_sources(*both, pictures=True, language=False)
     check_same_sources(*both, pictures=False, language=False)
-
-
-def test_a_datasets_light_is_that_of_its_last_rendering_else_the_default():
-    made = {"cameras_sha256": "0"}
-    look = {"shadows": True, "brightness": 0.5, "light_turn": 0.0}
-    assert recorded_look({"rendered": {"cameras": {"names": ["front"], "look": look}}}, made) == look
-    assert recorded_look({"driver": "expert"}, made) == {}
-    assert recorded_look({}, {}) is None
 
 
 # `torchrun --standalone --nproc_per_node=2`, with processes that need not import torch again

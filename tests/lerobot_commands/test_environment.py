@@ -51,13 +51,6 @@ def test_every_task_gives_what_its_features_say(task: str):
     assert envs.metadata["render_fps"] == config.fps == ours.control_hz
 
 
-def test_options_reach_the_simulation():
-    config = ManipILEnv(fps=25, episode_length=7, tolerance=0.3, success_steps=2)
-    env = vector_env(config, 1).envs[0].unwrapped
-    assert (env.config.control_hz, env.config.horizon) == (25, 7)
-    assert (env.config.tolerance, env.config.success_steps) == (0.3, 2)
-
-
 def test_success_in_the_step_that_ends_an_episode_is_told_although_the_next_one_has_begun():
     config = ManipILEnv(task="PandaReach-v0", episode_length=2, tolerance=0.99, success_steps=2)
     envs = vector_env(config, 2)
@@ -68,9 +61,3 @@ def test_success_in_the_step_that_ends_an_episode_is_told_although_the_next_one_
     assert truncated.all()
     assert last["final_info"]["is_success"].tolist() == [True, True]
     assert not last["is_success"].any()
-
-
-def test_a_task_takes_any_robot():
-    config = ManipILEnv(task="Reach-v0", robot="fetch")
-    assert vector_env(config, 1).envs[0].unwrapped.scene.robot.name == "fetch"
-    assert shapes(ManipILEnv(task="Reach-v0")) == shapes(ManipILEnv(task="PandaReach-v0"))

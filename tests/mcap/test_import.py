@@ -71,9 +71,6 @@ def test_pictures_come_in_pixel_for_pixel(tmp_path: Path) -> None:
             np.testing.assert_array_equal(row[name], picture(number))
 
 
-CAMERA = {"field": None, "dtype": "string", "video": False}
-
-
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)
 
 

@@ -14,12 +14,9 @@ from manip_il.errors import MismatchError
 from manip_il.learn.reward import (
     Compared,
     LearnedReward,
-    RewardNetwork,
     RewardShape,
     deal,
     fit_reward,
-    joints_of,
-    shape_for,
     ways_of,
     write_reward,
 )
@@ -87,22 +84,6 @@ def test_the_same_seed_gives_the_same_weights(fitted, clips, answers):
 def test_ways_are_the_triples_that_lead_from_one_thing_to_another(spec):
     names = ("ee.x", "goal_from_object.x", "goal_from_object.y", "goal_from_object.z", "object_from_ee.x")
     assert ways_of(replace(spec, environment_state_names=names)) == ((4, 5, 6), (4, 5))
-
-
-def test_joints_are_not_read_where_the_hands_pose_is_there(spec):
-    names = ("ee.x", "ee.y", "ee.z", "object.x")
-    n, k = len(spec.joint_names), 4
-    there = replace(spec, environment_state_names=names)
-    assert joints_of(there) == (*range(n - 1), *range(n + k, n + k + n - 1))
-    assert joints_of(replace(spec, environment_state_names=names[1:])) == ()
-    network = RewardNetwork(2 * n + k, shape_for(there, 3))
-    network.initialise(torch.Generator().manual_seed(0))
-    inputs = torch.zeros(2, 2 * n + k)
-    inputs[1, list(joints_of(there))] = 1.0
-    with torch.no_grad():
-        assert network(inputs)[0] == network(inputs)[1]
-        inputs[1, [n - 1, 2 * n + k - 1]] = 1.0  # how far the gripper is open, and its command
-        assert network(inputs)[0] != network(inputs)[1]
 
 
 def test_a_reward_that_does_not_say_what_it_leaves_unread_reads_everything(folder, tmp_path, clips):

@@ -21,9 +21,7 @@ from manip_il.tasks.envs import scene_of
 
 from ..scenes import drive, started, world_at_home
 from ..tables import every_robot
-from .own import ARM, JAWS, tree_of, write
-
-MODEL = ARM.replace("FINGERS", JAWS["slides"][0])
+from .own import tree_of, write
 
 
 def refusal(path: Path, task: str = "reach") -> str:

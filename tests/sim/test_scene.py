@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -66,19 +65,3 @@ def test_addresses_are_what_their_names_say(robot: str, task: str):
         assert scene.model.joint(name).dofadr[0] == one.v
         assert scene.model.geom(one.geom).bodyid[0] == one.body == scene.model.body(name).id
     assert len(scene.nominal) == PER_OBJECT * len(scene.objects) + WORLD_SIZE
-
-
-@every_robot
-def test_a_pedestal_stands_on_the_floor_and_reaches_to_the_robot(robot: str):
-    model = scene_of(robot, "reach").model
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    names = [model.geom(i).name for i in range(model.ngeom)]
-    if "pedestal" not in names:  # the robot stands on the floor itself
-        return
-    pedestal = names.index("pedestal")
-    middle, half = data.geom_xpos[pedestal, 2], model.geom_size[pedestal, 2]
-    assert middle - half == pytest.approx(float(model.geom("floor").pos[2]))
-    geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] and model.geom_contype[i]]
-    assert not any(mujoco.mj_geomDistance(model, data, pedestal, i, 0.005, None) < 0 for i in geoms)
-    assert any(mujoco.mj_geomDistance(model, data, pedestal, i, 0.05, None) < 0.02 for i in geoms)

@@ -16,21 +16,6 @@ from ..scenes import started
 from ..tables import LARGE, every_robot
 
 
-def ball(rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """A unit ball of about 4 rings^2 faces, wound outwards; the vertices of the poles and of the seam are doubled."""
-    up, around = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1), indexing="ij")
-    vertices = np.stack([np.sin(up) * np.cos(around), np.sin(up) * np.sin(around), np.cos(up)], axis=2).reshape(-1, 3)
-    corner = (np.arange(rings)[:, None] * (2 * rings + 1) + np.arange(2 * rings)).ravel()
-    right, below = corner + 1, corner + 2 * rings + 1
-    return vertices, np.vstack([np.stack([corner, below, right], 1), np.stack([right, below, below + 1], 1)])
-
-
-def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Enclosed by faces that are wound outwards."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return float((a * np.cross(b, c)).sum() / 6)
-
-
 @every_robot
 def test_a_view_has_the_physics_poses_and_at_most_12000_triangles(robot):
     scene = scene_of(robot, "pick_place")

@@ -6,11 +6,8 @@ import gymnasium
 import pytest
 
 from manip_il.errors import RenderError, UsageError
-from manip_il.sim import env as module
 from manip_il.sim.window import Clock
 from manip_il.tasks.envs import make_env
-
-from ..scenes import still
 
 
 def test_without_a_display_human_is_refused_in_one_line(monkeypatch):
@@ -22,30 +19,6 @@ def test_without_a_display_human_is_refused_in_one_line(monkeypatch):
         gymnasium.make("manip_il/PandaReach-v0", render_mode="human")
     with pytest.raises(UsageError, match=r"unknown render_mode 'humna' \(did you mean 'human'\?\)"):
         make_env(render_mode="humna")
-
-
-def test_the_window_shows_the_start_and_every_step_until_it_is_closed(monkeypatch):
-    shown: list[float] = []
-
-    class Window:
-        def __init__(self, scene, control_hz):
-            assert (scene.task.name, control_hz) == ("reach", 20)
-
-        def show(self, data, variation):
-            shown.append(data.time)
-
-        def close(self):
-            shown.append(-1.0)
-
-    monkeypatch.setattr(module, "require_display", lambda: None)
-    monkeypatch.setattr(module, "Window", Window)
-    env = make_env("panda", "reach", render_mode="human")
-    env.reset(seed=0)
-    for _ in range(2):
-        env.step(still(env))
-    env.close()
-    env.close()
-    assert shown == pytest.approx([0.0, 0.05, 0.1, -1.0])
 
 
 def test_a_clock_keeps_real_time_and_does_not_make_up_for_what_was_late(monkeypatch):

@@ -7,6 +7,7 @@ import getpass
 import hashlib
 import json
 import logging
+import os
 import secrets
 import socket
 import subprocess
@@ -207,6 +208,7 @@ def talk_to(url: str, set_attribute: Callable[[object, str, object], None] = set
     """Have huggingface_hub in this process know no other Hub."""
     given = {"ENDPOINT": url, "HUGGINGFACE_CO_URL_TEMPLATE": url + "/{repo_id}/resolve/{revision}/{filename}"}
     more = {"HF_HUB_DISABLE_XET": True, "HF_HUB_OFFLINE": False, "HF_TOKEN_PATH": "/no/token"}
+    more |= dict.fromkeys(("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT"), 600)  # on a machine that does much else
     for name, value in (given | more).items():
         set_attribute(constants, name, value)
 
@@ -259,9 +261,7 @@ def sshd_server(folder: Path) -> Iterator[Sshd]:
         raise RuntimeError(f"{SSHD} is missing: as root: .ci/system sshd")
     for name in ("host_key", "user_key"):
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(folder / name)], check=True)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = 20_000 + os.getpid() % 10_000  # below those that the kernel gives to whoever asks for any
     (folder / "sshd_config").write_text(SSHD_CONFIG.format(port=port, folder=folder))
     ssh = folder / "home" / ".ssh"
     ssh.mkdir(parents=True)

@@ -51,7 +51,10 @@ def test_a_killed_transfer(do: str, place: str, request: pytest.FixtureRequest, 
         time.sleep(float(rng.uniform(0, usual)))
         process.kill()
         process.join()
-        killed += process.exitcode == -9
+        if process.exitcode == -9:
+            killed += 1
+        else:  # it is faster now
+            usual *= 0.7
         if do == "push":
             pull(open_remote(place, quiet=True), folder)
             assert content(folder) in [content(run) for run in runs]

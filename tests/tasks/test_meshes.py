@@ -114,21 +114,6 @@ def test_a_side_that_is_too_wide_has_no_label_and_says_why(tmp_path):
     assert "0.008 m high, too low for the fingers" in Expert(plate.scene).label(plate.get_state()).reason
 
 
-def test_labels_are_those_of_another_process_and_order(folder):
-    config = make_config("panda", object=text(folder, "mug"))
-    [episode] = RolloutJob(config, hold=0).run([5])
-    env = make_env("panda", object=text(folder, "mug"))
-    env.reset(seed=5)
-    states = [env.get_state()]
-    for action in episode.columns["executed_action"][:20]:
-        env.step(action)
-        states.append(env.get_state())
-    one, other = Expert(env.scene), Expert(scene_of("panda", "pick_place", text(folder, "mug")))
-    backwards = [other.label(state).action for state in states[::-1]][::-1]
-    for state, action in zip(states, backwards, strict=True):
-        np.testing.assert_array_equal(one.label(state).action, action)
-
-
 def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
     config = make_config("panda", object=f"{text(folder, 'mug')}:0.06")
     before, spec = env_fingerprint(config), env_spec(config)

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from manip_il.cli.main import main
 from manip_il.collect.expert import Expert
-from manip_il.mdp import State
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
@@ -56,12 +51,6 @@ def test_the_expert_touches_nothing_on_its_way(robot: str, taste: str):
         assert len(carried(started(robot, f"carry:{taste}", seed))) > 3
 
 
-@pytest.mark.parametrize("shape", ["cylinder:0.04x0.08", "sphere:0.05", "box:0.08x0.03x0.04"])
-def test_other_objects_are_carried_past_things_too(shape: str):
-    for seed in STARTS[:3]:
-        carried(started("panda", "carry", seed, object=shape))
-
-
 def test_a_tastes_own_way_costs_it_less_than_anothers():
     costs = {taste: {other: 0.0 for other in TASTES} for taste in TASTES}
     for seed in range(SEED, SEED + 12):
@@ -87,22 +76,6 @@ def test_the_reward_is_the_states_and_not_observed():
     low.world.update()
     expert = Expert(careful.scene)
     assert (expert.label(careful.get_state()).action != expert.label(low.get_state()).action).any()
-
-
-def test_the_same_state_has_the_same_label_in_any_order():
-    env, states = make_env("panda", "carry"), []
-    expert = Expert(env.scene)
-    for seed in STARTS[:3]:
-        env.start(seed)
-        for _ in range(25):
-            states.append(env.get_state())
-            env.advance(expert.label(states[-1]).action)
-    labels = [expert.label(state) for state in states]
-    other = Expert(env.scene)
-    for number in np.random.default_rng(0).permutation(len(states)).tolist():
-        again = other.label(State.from_vector(states[number].to_vector()))
-        np.testing.assert_array_equal(again.action, labels[number].action)
-        assert again.phase == labels[number].phase
 
 
 def test_neighbouring_positions_head_alike():
@@ -184,16 +157,3 @@ def test_an_object_beside_a_low_thing_is_grasped_where_the_hand_fits():
     place(env.world, "laptop", np.array([0.545, -0.1, 0.0]))
     assert layout_of(env.world, OBJECT).room(env.world.pose(OBJECT).position[None])[0] < -0.012
     carried(env)
-
-
-def test_a_reward_of_a_file_drives_an_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    reward = {"names": ["length", "height"], "weights": [1.0, 3.0], "method": "max_entropy"}
-    (tmp_path / "reward.json").write_text(json.dumps(reward))
-    words = ["eval", "--policy.type=expert", "--eval.n_episodes=2", "--workers=1"]
-    assert main([*words, f"--task.type=carry:{tmp_path}/reward.json", f"--output_dir={tmp_path}/out"]) == 0
-    result = json.loads((tmp_path / "out" / "eval.json").read_text())
-    assert result["success_rate"] == 1.0
-    assert result["task"] == "carry:length=1,height=3"
-    (tmp_path / "reward.json").write_text(json.dumps(reward | {"names": ["length", "hight"]}))
-    assert main([*words, f"--task.type=carry:{tmp_path}/reward.json", f"--output_dir={tmp_path}/other"]) == 2
-    assert "unknown feature 'hight' (did you mean 'height'?)" in capsys.readouterr().err
