@@ -20,7 +20,8 @@ from manip_il.mdp import Actor, Episode
 
 pytestmark = pytest.mark.slow
 Run = Callable[..., list[Episode]]
-_UNANSWERED, _TRIES = "There is no status packet", 3  # LeRobot waits 50 ms, which a busy machine may take
+_TRIES = 3
+_UNANSWERED = ("There is no status packet", "motor check failed", "Could not connect")  # LeRobot waits 50 ms alone
 
 
 @pytest.fixture
@@ -34,8 +35,8 @@ def run(tmp_path: Path, start: Callable[..., ForkServerProcess]) -> Run:
         robot, teleop = [*robot, f"--robot.calibration_dir={root}"], [*teleop, f"--teleop.calibration_dir={root}"]
         options = [*(robot if "follower" in arms else []), *(teleop if "leader" in arms else []), *words]
         own = ["serve", "--task.type=lift", f"--output_dir={root}", f"--log={tmp_path}/log", *served]
-        code, said, tries = 1, _UNANSWERED, 0
-        while code != 0 and _UNANSWERED in said and tries < _TRIES:
+        code, said, tries = 1, _UNANSWERED[0], 0
+        while code != 0 and any(one in said for one in _UNANSWERED) and tries < _TRIES:
             for old in (folder for folder in tmp_path.iterdir() if folder.name != "arm"):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
             served_by = start(*own, "--", str(path), *options, log=tmp_path / "said")
@@ -59,8 +60,9 @@ def test_record_keeps_solved_episodes_with_the_frames_of_the_log(run: Run, tmp_p
     recorded = LeRobotDataset("local/t", root=tmp_path / "t")
     assert recorded.num_episodes == len(logged) == 2
     assert all(episode.success for episode in logged)
-    states = np.stack(recorded.hf_dataset["observation.state"])
-    assert np.abs(states[:10] - logged[0].columns["observation.state"][:10]).max() < 0.2  # a step of the encoder
+    first = np.stack(recorded.hf_dataset["observation.state"])[0]
+    assert np.abs(first - logged[0].columns["observation.state"][0]).max() < 0.2  # a step of the encoder
+    assert abs(len(recorded) - sum(map(len, logged))) <= 2
     assert main(["data", "build", f"{tmp_path}/log", f"{tmp_path}/ours"]) == 0
 
 
