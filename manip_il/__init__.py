@@ -1,8 +1,8 @@
 """Robot-arm imitation learning without a human at the controls.
 
-Importing the package registers its environments with gymnasium, as packages of environments do; that imports gymnasium,
-a fifth of a second. (Since 1.0 gymnasium loads no plugins by the entry point `gymnasium.envs`.) The OpenGL for pictures
-is chosen too, as mujoco reads MUJOCO_GL when it is imported, never after.
+Importing the package registers its environments with gymnasium, whose import takes a fifth of a second. (Since 1.0
+gymnasium no longer loads plugins from the entry point `gymnasium.envs`.) It also selects the OpenGL backend, because
+mujoco reads MUJOCO_GL only when it is imported.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ choose_backend()
 register_envs()
 
 __version__ = "0.1.0"
-_HOMES = {  # of the public names
+_HOMES = {  # public name -> module
     "CameraConfig": "sim.config",
     "Checkpoint": "learn.checkpoint",
     "Dataset": "data.dataset",
@@ -34,7 +34,7 @@ _HOMES = {  # of the public names
 
 
 def __getattr__(name: str) -> Any:
-    """Return what a user wants first, imported when it is asked for; `__init__.pyi` has the types."""
+    """Import a public name on first use; `__init__.pyi` has the types."""
     if name not in _HOMES:
         raise AttributeError(f"module 'manip_il' has no attribute {name!r}")
     return getattr(import_module(f"manip_il.{_HOMES[name]}"), name)

@@ -1,7 +1,7 @@
 """The commands as functions, for notebooks and scripts: record, train, dagger, evaluate.
 
-Their options are the fields of the classes that the commands use too, by name; those that are left out have the same
-defaults. Episodes run in `workers` processes: 1 is this one alone, None is one a core.
+Options are fields of the same classes that the commands use, with the same names and defaults. Episodes run in
+`workers` processes: 1 is this process alone, None is one per core.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ def record(
     workers: int | None = 1,
     **options: Any,
 ) -> Dataset:
-    """Record a dataset: successful demonstrations of the expert, or all rollouts of a policy, labelled by the expert.
+    """Record a dataset: the expert's successful demonstrations, or all rollouts of a policy with the expert's labels.
 
-    beta: the expert's share of a policy's steps. query: when the expert is asked, as the command `dagger` takes it.
-    options: the other fields of `RolloutJob`, such as `label` and `cameras`; a policy's `round` is 1 unless given.
-    Each frame holds the executed action and the expert's label. Raises `UsageError` for a folder that is there.
+    beta: share of a policy's steps that the expert drives. query: when the expert is queried, as `--query` of `dagger`.
+    options: other fields of `RolloutJob`, such as `label` and `cameras`; a policy's `round` is 1 by default.
+    Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder exists.
     """
     driver = PolicyDriver((_folder(policy),), beta) if policy is not None else RolloutJob.driver
     chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)} | options
     job, journals, name = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals"), "local/recorded"
     for folder in (root, journals):
         if folder.exists():
-            raise UsageError(f"{folder} exists already; give a folder that is not there yet")
+            raise UsageError(f"{folder} already exists; give a new folder")
     with Engine(workers) as engine:
         if policy is None:
             seeds = stream_seeds("demonstrations", MAX_TRIES * episodes, seed)
@@ -78,10 +78,10 @@ def train(
     on_log: Callable[[dict[str, Any]], None] | None = None,
     **options: Any,
 ) -> Checkpoint:
-    """Fit a policy to the labels of datasets; return its checkpoint.
+    """Fit a policy to the labels of one or more datasets; return its checkpoint.
 
     options: fields of `FitConfig`, such as `policy={"type": "mlp", "width": 128}`, `steps` and `batch_size`. on_log:
-    called after every step with its metrics, {} at a step without. Raises what `Trainer` raises.
+    called after every step with its metrics, or {} if there are none. Raises what `Trainer` raises.
     """
     from manip_il.learn.train import Trainer  # LeRobot's trainer takes seconds to import
 
@@ -100,10 +100,10 @@ def dagger(
     workers: int | None = 1,
     **options: Any,
 ) -> list[Result]:
-    """Run DAgger, or another `method`, in a folder; return every round's result, round 0 (cloning) first.
+    """Run DAgger, or another `method`, in a folder; return the results of all rounds, starting with 0 (cloning).
 
-    beta, query: as the command takes them, `"linear:5"` and `"probability:0.1"`. options: the other fields of
-    `RunConfig`. A folder with finished rounds is continued. Raises `UsageError` for options that do not fit together.
+    beta, query: as on the command line, `"linear:5"` and `"probability:0.1"`. options: other fields of `RunConfig`.
+    A folder with finished rounds is continued. Raises `UsageError` for options that contradict each other.
     """
     options |= {} if beta is None else {"beta": BetaSchedule.parse(beta)}
     options |= {} if query is None else {"query_rule": parse_query(query)}
@@ -123,16 +123,16 @@ def evaluate(
     workers: int | None = 1,
     **options: Any,
 ) -> EvalResult:
-    """Measure a policy, or the expert, on unseen seeds; return every episode's outcome.
+    """Evaluate a policy, or the expert, on unseen seeds; return the outcome of every episode.
 
-    env: by default the one that the policy was trained for. options: fields of `RolloutJob`, such as `conditions`.
-    Raises `UsageError` if there is neither a policy nor an environment, `MismatchError` if they do not fit.
+    env: by default the policy's training environment. options: fields of `RolloutJob`, such as `conditions`.
+    Raises `UsageError` without a policy or an environment, `MismatchError` if they do not fit.
     """
     path = None if policy is None else _folder(policy)
     if env is None:
         origin = None if path is None else Checkpoint.open(path).origin
         if origin is None:
-            raise UsageError("env is missing, and there is no policy of this program to take it from")
+            raise UsageError("env is missing, and the policy does not name one")
         env = make_config(origin.robot, origin.task, origin.fps, object=origin.object)
     driver = RolloutJob.driver if path is None else PolicyDriver((path,))
     chosen: dict[str, Any] = {"hold": episode_hold(env), "label": "last"} | options

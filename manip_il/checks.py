@@ -1,7 +1,7 @@
-"""Check what is read from outside (JSON, YAML, names that become paths, numbers, text) where its type is made.
+"""Check untrusted input: JSON, YAML, names that become paths, numbers and text.
 
-Every check returns the value with its declared type, or raises `ManipError` with one short line that names the thing,
-its value, shortened, and what was expected. `in_child` opens what arrives from outside.
+Every check returns the value with its declared type, or raises `ManipError` with one line that names the thing, its
+shortened value and what was expected. `in_child` opens untrusted files in a limited child process.
 """
 
 from __future__ import annotations
@@ -23,45 +23,45 @@ from manip_il.errors import ManipError, UsageError, shorten
 
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
-LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; an eval.json of half a million episodes
+LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; fits an eval.json of half a million episodes
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
 _NUMBERS = re.compile(r"\w+=[0-9.e+-]+(,\w+=[0-9.e+-]+)*", re.ASCII)
 _LONGEST_MESSAGE = 1_000  # [characters]
-_REFUSED = 3  # exit code of a child process
+_REFUSED = 3  # exit code of the child process
 
 
 def one_line(error: BaseException) -> str:
-    """Return a library's message in one line of at most 1,000 characters."""
+    """Return an error's message as one line of at most 1,000 characters."""
     return " ".join(str(error).split())[:_LONGEST_MESSAGE]
 
 
 def name(what: str, value: object) -> str:
-    """Return a name that may become part of a path: letters, digits and `_ . -`, at most 100 characters.
+    """Return a name that is safe in a path: letters, digits and `_ . -`, at most 100 characters.
 
-    A dot may not come first, and `..` nowhere.
+    It may not begin with a dot or contain `..`.
     """
     if not isinstance(value, str) or not _NAME.fullmatch(value) or len(value) > LONGEST_NAME or ".." in value:
         raise ManipError(
-            f"{what} is {shorten(value)}; expected a name of letters, digits and _ . - (no '..', no dot first, at most "
-            f"{LONGEST_NAME} characters)"
+            f"{what} is {shorten(value)}; expected a name of letters, digits and _ . - (no '..', no leading dot, at "
+            f"most {LONGEST_NAME} characters)"
         )
     return value
 
 
 def task_name(value: object) -> str:
-    """Return a task's name, as `name` has it; one of several has numbers behind a colon, `NAME:A=NUMBER,B=NUMBER`."""
+    """Return a task's name, checked as by `name`; a colon may precede numbers, `NAME:A=NUMBER,B=NUMBER`."""
     base, colon, numbers = text("task", value).partition(":")
     if colon and not _NUMBERS.fullmatch(numbers):
-        raise ManipError(f"task is {shorten(value)}; expected NAME=NUMBER,... behind the colon")
+        raise ManipError(f"task is {shorten(value)}; expected NAME=NUMBER,... after the colon")
     name("task", base)
     return f"{base}{colon}{numbers}"
 
 
 def repo_id(what: str, value: object) -> str:
-    """Return a dataset's or policy's id, `NAME` or `USER/NAME`, both parts as `name` has them."""
+    """Return the id of a dataset or policy, `NAME` or `USER/NAME`, both parts checked as by `name`."""
     user, slash, rest = text(what, value).partition("/")
     return f"{name(what, user)}/{name(what, rest)}" if slash else name(what, user)
 
@@ -74,7 +74,7 @@ def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
 
 
 def whole(what: str, value: object, low: int, high: int) -> int:
-    """Return an int within [low, high]; True and 3.0 are none."""
+    """Return an int within [low, high]; True and 3.0 are rejected."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise ManipError(f"{what} is {shorten(value)}; expected a whole number from {low} to {high}")
     return value
@@ -82,7 +82,7 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
     """Return a finite float within [low, high]."""
-    most = sys.float_info.max  # beyond it an int is no float
+    most = sys.float_info.max  # a larger int has no float
     if isinstance(value, int | float) and not isinstance(value, bool) and max(low, -most) <= value <= min(high, most):
         return float(value)
     limits = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
@@ -97,14 +97,14 @@ def array(what: str, value: object, longest: int = 1_000_000) -> list[Any]:
 
 
 def mapping(what: str, value: object) -> dict[str, Any]:
-    """Return a dict whose keys are text."""
+    """Return a dict with string keys."""
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise ManipError(f"{what} is {shorten(value)}; expected an object of named values")
     return value
 
 
 def parse_json(what: str, data: str | bytes) -> Any:
-    """Return what a JSON text holds, None for NaN and Infinity; broken or too deep, it is refused."""
+    """Return the value of a JSON text, None for NaN and Infinity. Raises `ManipError` if it is invalid or too deep."""
     try:
         return json.loads(data, parse_constant=lambda constant: None)
     except (RecursionError, ValueError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
@@ -112,22 +112,22 @@ def parse_json(what: str, data: str | bytes) -> Any:
 
 
 def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
-    """Return the object in a JSON file of at most `largest` bytes. what: the file should be, for the message."""
+    """Return the object in a JSON file of at most `largest` bytes. what: what is expected, for the message."""
     return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
 
 
 def parse_yaml(text: str) -> Any:
-    """Return what a YAML text holds, by the safe loader. Raises `ValueError`, in one line, for what is none."""
-    import yaml  # here, as most of what checks something reads no YAML
+    """Return the value of a YAML text, read by the safe loader. Raises a one-line `ValueError` if it is invalid."""
+    import yaml  # imported here because most checks read no YAML
 
     try:
         return yaml.safe_load(text)
-    except Exception as error:  # besides its own errors it raises whatever int() or datetime() do
+    except Exception as error:  # besides its own errors, it raises those of int() and datetime()
         raise ValueError(one_line(error)) from error
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """Return what is in a file; `UsageError` if it cannot be read. what: the file should be, for the message."""
+    """Return the value of a YAML file; `UsageError` if it cannot be read. what: what is expected, for the message."""
     try:
         return parse_yaml(read_bytes(path, what, LARGEST_JSON, UsageError).decode())
     except ValueError as error:  # UnicodeDecodeError is one
@@ -135,7 +135,7 @@ def read_yaml(path: Path, what: str) -> Any:
 
 
 def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
+    """Return a file's content; raises `refusal` if it cannot be read or has more than `largest` bytes."""
     try:
         with path.open("rb") as file:
             data = file.read(largest + 1)
@@ -147,16 +147,16 @@ def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = 
 
 
 def without_link(path: str, flags: int) -> int:
-    """Open a file to be written, as the `opener` of `open`; `OSError` for a link, which could lead to any file."""
+    """Open a file for writing, as the `opener` of `open`; `OSError` for a link, which could lead to any file."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 def in_child(what: str, function: Callable[..., object], *arguments: object, seconds: float = SECONDS_IN_CHILD) -> None:
-    """Call `function(*arguments)` in a child process, which may take 4 GB of memory and 120 s, or so long a file.
+    """Call `function(*arguments)` in a child process with at most 4 GB of memory and 120 s, or `seconds`.
 
-    Nothing but the text of its `ManipError` comes back, as what it opens may be from anyone. Raises that, and
-    `ManipError` if the child exceeds its limits or dies. what: the thing that is opened, for these messages; a function
-    that opens several calls `opening`.
+    Only the text of its `ManipError` comes back, because the file is untrusted. Raises that error, and `ManipError` if
+    the child exceeds its limits or dies. what: the thing that is opened, for these messages; a function that opens
+    several files calls `opening`.
     """
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
     done = subprocess.run(command, input=pickle.dumps((seconds, function, arguments)), capture_output=True, check=False)
@@ -171,18 +171,18 @@ def in_child(what: str, function: Callable[..., object], *arguments: object, sec
 
 
 def opening(name: str) -> None:
-    """Say in the child process which file is opened next, and give it as much time as there is for one."""
+    """Report from the child process which file is opened next, and restart the time limit for it."""
     print(" ".join(name.split()), flush=True)
     _, seconds = signal.getitimer(signal.ITIMER_REAL)
     signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
 
 
 def answer_parent() -> None:
-    """Run in the child process what `in_child` asks for."""
+    """Run the function of `in_child`, in the child process."""
     seconds, function, arguments = pickle.load(sys.stdin.buffer)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_IN_CHILD, MEMORY_IN_CHILD))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)  # ends the process; the interval is for `opening`
+    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)  # ends the process; `opening` reads the interval
     try:
         function(*arguments)
     except ManipError as error:

@@ -1,6 +1,6 @@
-"""Errors that explain themselves: the thing, its value, what was expected, what to do next.
+"""Error types, whose messages name the thing, its value, what was expected and what to do next.
 
-The command line turns every `ManipError` into one line on standard error and its `exit_code`.
+The command line prints a `ManipError` as one line on standard error and exits with its `exit_code`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import difflib
 import reprlib
 from collections.abc import Iterable, Sequence
 
-_FEW = 3  # names that an error offers
-_BEGINNING = 3  # characters of a name that tell it from others
+_MOST_OFFERED = 3  # names that an error suggests
+_SHORTEST_PREFIX = 3  # [characters]; shorter ones match too many names
 _LONGEST_PRINTED = 300  # [characters]
 _PRINTED = reprlib.Repr()
 _PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
@@ -27,95 +27,95 @@ class ManipError(Exception):
         return printable(super().__str__())
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle by the message: subclasses build theirs from other arguments, and a worker's error must come home."""
+        """Pickle the message: subclasses have other arguments, and a worker's errors must reach the main process."""
         return ManipError.__new__, (type(self), str(self))
 
 
 class UsageError(ManipError):
-    """The command line was invalid: an unknown name, option or value (exit code 2)."""
+    """The command line is invalid: an unknown name, option or value (exit code 2)."""
 
     exit_code = 2
 
 
 class UnknownName(UsageError):
-    """A name that is not in a table of names; says which names are, and the nearest."""
+    """A name is unknown; the message lists the known names and the nearest."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str], where: str = ""):
-        """Take the table's names, and for a long table what lists them; then the nearest few are named alone."""
+        """Take the known names. where: what lists them, if they are many; then only the nearest are named."""
         known = sorted(known)
-        near = did_you_mean(nearest_names(name, known, most=_FEW if where else 1))
+        near = did_you_mean(nearest_names(name, known, most=_MOST_OFFERED if where else 1))
         super().__init__(f"unknown {kind} {shorten(name)}{near}; {where or f'known: {", ".join(known)}'}")
 
 
 class MismatchError(ManipError):
-    """Two sides that must agree (dataset, policy, environment) do not; names both."""
+    """Two things that must agree (dataset, policy, environment) differ; the message names both."""
 
     def __init__(self, what: str, left: str, left_value: object, right: str, right_value: object):
         super().__init__(f"{what} differs: {left} has {left_value}, {right} has {right_value}")
 
 
 class OlderSchemaError(ManipError):
-    """Data of another version of our columns, which cannot be read as today's; says how to make them again."""
+    """The data have an older version of our columns, which cannot be read; the message says how to make them again."""
 
     def __init__(self, found: str, reads: int):
         super().__init__(
-            f"written with schema {found} of manip_il's columns, and this version reads {reads}; make it again, into "
+            f"written with schema {found} of manip_il's columns, but this version reads {reads}; make it again in "
             "another folder: manip-il record, train or dagger with the same options"
         )
 
 
 class NotFiniteError(ManipError):
-    """NaN or infinity where a number was needed."""
+    """A value is NaN or infinite."""
 
 
 class NothingToLearnError(ManipError):
-    """Rollouts that leave no label behind."""
+    """The rollouts produced no label."""
 
 
 class FolderExistsError(UsageError):
-    """An output folder that holds something already."""
+    """An output folder is not empty."""
 
     def __init__(self, folder: object):
-        ways = "--resume=true goes on where a command can, --overwrite=true replaces it"
-        super().__init__(f"{folder} exists already; {ways}; or choose another folder")
+        ways = "--resume=true continues it, if the command can, --overwrite=true replaces it"
+        super().__init__(f"{folder} already exists; {ways}; or choose another folder")
 
 
 class RenderError(ManipError):
-    """No working OpenGL for off-screen pictures."""
+    """OpenGL for off-screen rendering does not work."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ` (did you mean 'x'?)`, or nothing where no known name is near."""
+    """Return ` (did you mean 'x'?)`, or "" if no known name is near."""
     return did_you_mean(nearest_names(name, known, most=1))
 
 
-def nearest_names(name: str, known: Iterable[str], most: int = _FEW) -> list[str]:
-    """Return the known names that `name` may stand for, at most `most`: those that it begins, then the most alike."""
+def nearest_names(name: str, known: Iterable[str], most: int = _MOST_OFFERED) -> list[str]:
+    """Return at most `most` known names like `name`: those that begin with it, then the most similar."""
     known = list(known)
-    begun = [one for one in known if len(name) >= _BEGINNING and one.startswith(name)]
-    alike = difflib.get_close_matches(name, known, n=most, cutoff=0.6 if len(name) > _BEGINNING else 0.5)
-    return list(dict.fromkeys([*begun, *alike]))[:most]
+    longer = [one for one in known if len(name) >= _SHORTEST_PREFIX and one.startswith(name)]
+    similar = difflib.get_close_matches(name, known, n=most, cutoff=0.6 if len(name) > _SHORTEST_PREFIX else 0.5)
+    return list(dict.fromkeys([*longer, *similar]))[:most]
 
 
 def did_you_mean(names: Sequence[str]) -> str:
-    """Return ` (did you mean 'x', 'y' or 'z'?)`, or nothing without names."""
+    """Return ` (did you mean 'x', 'y' or 'z'?)`, or "" without names."""
     *others, last = map(repr, names) if names else ("",)
     return f" (did you mean {', '.join(others)}{' or ' if others else ''}{last}?)" if last else ""
 
 
 def printable(text: str) -> str:
-    """Return a text with its control characters escaped, as a terminal obeys them; line breaks and tabs stay."""
+    """Escape control characters, which a terminal would obey, except line breaks and tabs."""
     return "".join(one if one.isprintable() or one in "\n\t" else repr(one)[1:-1] for one in text)
 
 
 def shorten(value: object) -> str:
-    """Return `repr(value)` in at most 300 characters, whatever the value is."""
+    """Return `repr(value)`, shortened to at most 300 characters."""
     printed = _PRINTED.repr(value)
     return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
 
 
 def silence_ffmpeg_warning() -> None:
-    """Hide LeRobot's page of warning of missing FFmpeg libraries: pictures are read with PyAV, which has its own."""
-    import logging  # here, as help needs none
+    """Hide LeRobot's long warning about missing FFmpeg libraries: we read video with PyAV, which has its own."""
+    import logging  # imported here because help needs none
 
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

@@ -1,6 +1,6 @@
-"""States, observations, labels, transitions, episodes: the types that pass between the rooms.
+"""States, observations, labels, transitions and episodes: the types that all packages share.
 
-Every type is frozen and raises on construction when lengths disagree or a value is not finite. Numpy only. Vectors
+Every type is frozen, and raises on construction if lengths disagree or a value is not finite. Numpy only. Vectors
 over joints have length `n` = arm joints + 1: arm [rad], gripper opening [m].
 """
 
@@ -20,13 +20,13 @@ from manip_il.errors import ManipError, NotFiniteError
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
-KEYPOINTS = "privileged.keypoints."  # before a camera's name: a column that comes and goes with its pictures
-STATE_EXTRAS = 4  # numbers of a `sim_state` beside physics and variation
-LONGEST_EPISODE = 10_000  # control steps; eight minutes at 20 Hz
+KEYPOINTS = "privileged.keypoints."  # prefix of a camera's keypoint column, which is present if its pictures are
+STATE_EXTRAS = 4  # numbers in a `sim_state` besides physics and variation
+LONGEST_EPISODE = 10_000  # [control steps]; eight minutes at 20 Hz
 
 
 class Actor(IntEnum):
-    """Driver of the robot in a frame."""
+    """Who drives the robot in a frame."""
 
     EXPERT = 0
     LEARNER = 1
@@ -37,9 +37,9 @@ class Actor(IntEnum):
 class State:
     """The full, privileged state: enough to restore the simulator exactly.
 
-    physics: MuJoCo's integration state, (p,), goals and fixed furniture among it as mocap poses. variation: every model
-    parameter that was drawn for the episode, (v,). step: control steps since reset. streak: control steps in a row
-    within the tolerance. ever: whether the episode has succeeded at some step.
+    physics: MuJoCo's integration state, (p,), including goals and fixed furniture as mocap poses. variation: every
+    model parameter that was drawn for the episode, (v,). step: control steps since reset. streak: consecutive control
+    steps within the tolerance. ever: whether the episode has succeeded at some step.
     """
 
     physics: F64
@@ -59,7 +59,7 @@ class State:
 
     @classmethod
     def from_vector(cls, vector: F64) -> State:
-        """Return the inverse of `to_vector` of (p + v + 4,), bit for bit."""
+        """Return the state of a vector (p + v + 4,) from `to_vector`, bit for bit."""
         vector = np.array(vector, dtype=np.float64)
         end = len(vector) - STATE_EXTRAS
         count, step, streak, ever = (int(one) for one in vector[end:])
@@ -68,10 +68,10 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """An observation for a learner. state: (n,); environment_state: (k,), privileged, for state-based policies.
+    """What a policy observes. state: (n,); environment_state: (k,), privileged, for state-based policies.
 
-    instruction: what the episode is about, for policies that read language. keypoints: where named points of the scene
-    are in each picture, across and down from 0 to 1, and 1 where that is within it; privileged.
+    instruction: the task in words, for policies that read language. keypoints: image coordinates of named points of the
+    scene, across and down in [0, 1], and 1 if the point is within the picture, else 0; privileged.
     """
 
     state: F32
@@ -87,11 +87,11 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """The expert's answer in one state.
+    """The expert's label of one state.
 
     action: joint targets [rad] and gripper command [m], (n,). phase: number of the task's phase, 0 for none. residual:
-    what the step leaves of the hand's pose error, in [0, 1] of the error before it. Where `valid` is false, `reason`
-    says why and `action` holds the arm still.
+    fraction of the hand's pose error that remains after the step, in [0, 1]. If `valid` is false, `reason` says why and
+    `action` holds the arm still.
     """
 
     action: F64
@@ -106,10 +106,10 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One control step of one episode: all of a dataset's frame.
+    """One control step of one episode: all content of a dataset's frame.
 
     `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from after it.
-    `success` is: within the tolerance for the required steps in a row, now. `done` marks the last frame.
+    `success`: within the tolerance for the required number of consecutive steps, now. `done` marks the last frame.
     """
 
     seed: int
@@ -127,12 +127,12 @@ class Transition:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """A finished episode as columns, keyed as the dataset is (without LeRobot's own index columns).
+    """A finished episode as columns, with the dataset's names (without LeRobot's own index columns).
 
-    columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required steps in a row
-    at some time. success_at_end: within the tolerance for the required steps at the last frame. instruction: its
-    text for policies that read language; empty if it is that of the task. drawn: how its world differed from the
-    nominal one, plain JSON values by the names of their ranges.
+    columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required number of
+    consecutive steps at some time. success_at_end: the same at the last frame. instruction: its text for policies that
+    read language; empty for the task's own. drawn: how its world differed from the nominal one: range name -> plain
+    JSON value.
     """
 
     seed: int
@@ -155,7 +155,7 @@ class Episode:
         return len(next(iter(self.columns.values())))
 
     def without_pictures(self) -> Episode:
-        """Return the same without its columns of pictures (T, height, width, 3) and of what is where in them."""
+        """Return the episode without its columns of pictures (T, height, width, 3) and their keypoints."""
         columns = {
             key: column for key, column in self.columns.items() if column.ndim < 4 and not key.startswith(KEYPOINTS)
         }
@@ -166,7 +166,7 @@ def require_finite(what: str, values: NDArray[np.generic]) -> None:
     """Raise `NotFiniteError` naming `what` and the first bad row of (T, ...), unless every value is finite."""
     if values.dtype.kind != "f":
         return
-    if values.ndim == 1 and math.isfinite(values.dot(values)):  # in a quarter of the time; it may overflow, no more
+    if values.ndim == 1 and math.isfinite(values.dot(values)):  # four times as fast; an overflow costs only time
         return
     if np.isfinite(values).all():
         return

@@ -1,4 +1,4 @@
-"""Settings that users may change: a dataclass's field with a line of help, which the command line shows."""
+"""Options for users: dataclass fields with a line of help, which the command line shows."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from manip_il.errors import UsageError
 
 
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
-    """Return a dataclass's field. default: a value, a class or function that makes one, or `MISSING` for none.
+    """Return a dataclass field. default: a value, a class or function that makes one, or `MISSING` for none.
 
-    metadata: `at_least` and `at_most` (see `check_bound`), and what else the command line is to know, see
-    `manip_il.cli.options.Option`.
+    metadata: `at_least` and `at_most` (see `check_bound`), and the keys of `manip_il.cli.options.Option`.
     """
     metadata = {"help": help_text, **metadata}
     if callable(default):
@@ -23,14 +22,14 @@ def option(default: Any, help_text: str, **metadata: Any) -> Any:
 
 
 def option_of(cls: type, name: str, default: Any = MISSING, help_text: str = "") -> Any:
-    """Return a field with the default and help of the field `name` of another dataclass, unless they are given."""
+    """Return a field like `name` of another dataclass. default, help_text: replace those of that field."""
     [theirs] = [one for one in fields(cls) if one.name == name]
     own = theirs.default if theirs.default_factory is MISSING else theirs.default_factory
     return option(own if default is MISSING else default, help_text or theirs.metadata["help"])
 
 
 def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
-    """Raise `UsageError` for a value, unless it is None, below `at_least` or above `at_most` in a field's metadata."""
+    """Raise `UsageError` if a value that is not None is below `at_least` or above `at_most` in a field's metadata."""
     if value is None or not {"at_least", "at_most"} & metadata.keys():
         return
     low, high = metadata.get("at_least", -math.inf), metadata.get("at_most", math.inf)
@@ -40,13 +39,13 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
 
 
 def check_bounds(options: Any, prefix: str = "") -> None:
-    """Raise `UsageError` for a field of a dataclass's instance that is out of the bounds in its metadata."""
+    """Raise `UsageError` if a field of a dataclass instance is outside the bounds in its metadata."""
     for one in fields(options):
         check_bound(prefix + one.name, getattr(options, one.name), one.metadata)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seeded:
-    """Options of whatever draws at random."""
+    """Options of everything that draws random numbers."""
 
-    seed: int = option(0, "shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
+    seed: int = option(0, "random seed, which shifts every random stream, 0 to 1000", at_least=0, at_most=1000)

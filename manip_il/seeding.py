@@ -1,9 +1,8 @@
-"""Named random streams that share no seed.
+"""Named random streams with disjoint seeds.
 
-An episode's seed is `base(stream) + index`. Each stream owns a block of `BLOCK` seeds, and each
-value of the user's `--seed` shifts all of them into a block of its own, so that demonstrations,
-every DAgger round, training, validation and the final test never share a seed, and none of them
-is LeRobot's 1000.
+An episode's seed is `stream_base(stream) + index`. Each stream has a block of `BLOCK` seeds, and each value of the
+user's `--seed` shifts all streams to other blocks, so that demonstrations, every DAgger round, training, validation
+and the final test never share a seed, and none of them is LeRobot's 1000.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def stream_base(stream: str, seed: int = 0) -> int:
 def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
     """Return the first `count` seeds of a named stream."""
     if not 0 <= count <= BLOCK:
-        raise UsageError(f"{count} seeds asked of stream {stream!r}; expected 0 to {BLOCK}")
+        raise UsageError(f"{count} seeds requested from stream {stream!r}; expected 0 to {BLOCK}")
     base = stream_base(stream, seed)
     return range(base, base + count)
 

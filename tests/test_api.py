@@ -25,7 +25,7 @@ def test_an_option_that_is_not_known_is_an_error(tmp_path: Path):
 
 
 def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         manip_il.record(tmp_path, manip_il.make_config("panda", "reach"), 1)
 
 

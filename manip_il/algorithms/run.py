@@ -40,7 +40,7 @@ from manip_il.algorithms.rounds import (
     round_scenes,
 )
 from manip_il.collect.drivers import Driver, PolicyDriver
-from manip_il.collect.edits import Source, Target, redraw_dataset
+from manip_il.collect.edits import EditSource, EditTarget, redraw_dataset
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Query
 from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
@@ -293,6 +293,6 @@ class Run:
             self._watch.on_stage("redraw", rollouts.round, len(scenes.numbers[::CHUNK]))
             workers = min(self._engine.workers or default_workers(), default_workers())
             with self._clock.timed("redraw"):
-                target = Target(root, workers, on_piece=self._watch.on_step)
-                redraw_dataset(Source(Dataset.open(dataset), self.config.env), scenes, target)
+                target = EditTarget(root, workers, on_piece=self._watch.on_step)
+                redraw_dataset(EditSource(Dataset.open(dataset), self.config.env), scenes, target)
         return root

@@ -1,4 +1,4 @@
-"""Options that several commands share, each declared once: groups, and classes that commands inherit from."""
+"""Options that several commands share: groups, and base classes of the commands' options."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
     from manip_il.learn.checkpoint import Origin
 
-OF_POLICY: Given = dict.fromkeys(("robot", "task", "control_hz", "object"))  # an environment is as a policy has it
-SMALL: Given = {"height": 96, "width": 96}  # of a picture that a policy learns from [pixels]
+OF_POLICY: Given = dict.fromkeys(("robot", "task", "control_hz", "object"))  # by default those of the policy
+SMALL: Given = {"height": 96, "width": 96}  # picture size for policies [pixels]
 _CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras view, clutter, late"
 
 DATASET = "a LeRobot v3.0 dataset"
 
 
 def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
-    """Return the environment of what was given, else of what a policy says of itself, else of the defaults.
+    """Return the environment: each value as given, else as in the policy's checkpoint, else the default.
 
-    Raises `UnknownName` for a robot or task, `UsageError` for another value.
+    Raises `UnknownName` for an unknown robot or task, `UsageError` for any other invalid value.
     """
     from manip_il.data.dataset import UNKNOWN_TASK
 
@@ -42,44 +42,44 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:
-    """Return the cameras that are taken if none are named: all, of a stock robot the first."""
+    """Return the cameras used if none are named: all, or the first one of a stock robot."""
     return (stock.ROBOTS[env.robot].cameras[:1] if env.robot in stock.ROBOTS else ()) or CAMERAS
 
 
 def start_policy(settings: Open) -> Open:
-    """Return `--policy.*` of what is fitted, with the `pretrained_model` folder that its `path` means."""
+    """Return the `--policy.*` options of a fit, with `path` resolved to its `pretrained_model` folder."""
     if "path" not in settings:
         return settings
     return settings | {"path": str(find_policy(Path(str(settings["path"])).expanduser()))}
 
 
 @dataclass(frozen=True)
-class Demonstrations:
-    """`--dataset.*` of what is learnt from."""
+class DatasetRoots:
+    """`--dataset.*`: the training data."""
 
     root: list[Path] = option(MISSING, DATASET, exists="datasets/", free=True)
 
 
 @dataclass(frozen=True)
 class OfDataset:
-    """Command on one dataset."""
+    """Options of a command on one dataset."""
 
     dataset: Path = option(MISSING, DATASET, exists="datasets/", positional=True)
 
 
 @dataclass(frozen=True)
 class PolicyGroup:
-    """`--policy.*` of what drives."""
+    """`--policy.*`: the policy that drives."""
 
     path: Path | None = option(None, "a checkpoint or a run")
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Workers that run episodes or edits."""
+    """Options of the worker processes."""
 
     workers: int | None = option(
-        None, "processes, or tasks at once on Ray; by default one per core", at_least=1, free=True
+        None, "processes, or concurrent tasks on Ray; by default one per core", at_least=1, free=True
     )
 
     def open(self) -> Engine:
@@ -91,10 +91,10 @@ class Workers:
 
 @dataclass(frozen=True)
 class EngineOptions(Workers):
-    """Workers of this machine, or of a Ray cluster."""
+    """Options of workers on this machine or a Ray cluster."""
 
     engine: Literal["local", "ray"] = option(
-        "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, or one started here)", free=True
+        "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else started here)", free=True
     )
 
     def open(self) -> Engine:
@@ -106,31 +106,31 @@ class EngineOptions(Workers):
 
 @dataclass(frozen=True)
 class TrialGroup:
-    """`--eval.*`: the episodes of a test."""
+    """`--eval.*`: the test episodes."""
 
     n_episodes: int | None = option(
-        None, "test episodes; by default 100 for eval, and with --until_width at most 10,000", at_least=1, grows=True
+        None, "test episodes; by default 100 in eval, or up to 10,000 with --until_width", at_least=1, grows=True
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tested:
-    """Command that runs under conditions."""
+    """Options of a command that tests under conditions."""
 
     suite: str = option(
         "nominal",
-        f"nominal, disturbed, randomised, all; one condition of {_CONDITIONS}; or a YAML of ranges",
+        f"nominal, disturbed, randomised, all; one of the conditions {_CONDITIONS}; or a YAML file of ranges",
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trusting:
-    """Command that loads checkpoints from anywhere."""
+    """Options of a command that loads checkpoints."""
 
     trust: bool = option(
         False,
-        "load models, and run code, that a checkpoint names (smolvla, pi0, groot, ...): only for sources that you "
-        "trust; only on the command line",
+        "load the models and run the code that a checkpoint names (smolvla, pi0, groot, ...): only for sources that "
+        "you trust; only on the command line",
         command_line_only=True,
         free=True,
     )
@@ -138,22 +138,22 @@ class Trusting:
 
 @dataclass(frozen=True, kw_only=True)
 class Pictured:
-    """Command that makes pictures."""
+    """Options of a command that renders pictures."""
 
     cameras: list[str] = option(
         list,
-        f"any of {', '.join(CAMERAS)}, of aloha top, angle, front_close, left_wrist, right_wrist, ...; "
-        "by default all for pictures, else none",
+        f"any of {', '.join(CAMERAS)}; for aloha top, angle, front_close, left_wrist, right_wrist, ...; "
+        "by default all if pictures are needed, else none",
     )
     image: Given = given(CameraConfig)
 
     def camera_config(self, env: EnvConfig, look: Look | None = None) -> CameraConfig:
-        """Return the cameras, by default those of `default_cameras`; `UsageError` for a wrong value."""
+        """Return the cameras, by default those of `default_cameras`; `UsageError` for an invalid value."""
         return CameraConfig(tuple(self.cameras) or default_cameras(env), **self.image, look=look or Look())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Varied(Pictured):
-    """Command that makes worlds that differ, and pictures of them."""
+    """Options of a command that randomises worlds and renders pictures."""
 
-    vary: list[str] = option(list, f"how worlds differ from one to the next: {_CONDITIONS}, or YAMLs of ranges")
+    vary: list[str] = option(list, f"what to randomise between worlds: {_CONDITIONS}, or YAML files of ranges")

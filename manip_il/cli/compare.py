@@ -1,4 +1,4 @@
-"""`manip-il compare`: two policies or runs on the same seeds and the confidence in their difference, or a study."""
+"""`manip-il compare`: two policies or runs on the same seeds, with the confidence in their difference, or a study."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from manip_il.evaluation.comparison import Study
     from manip_il.evaluation.runner import Trial
 
-EPISODES = 500  # of a test
+EPISODES = 500  # test episodes
 _YAML = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
 class CompareOptions(Tested, Seeded, Trusting):
-    """Compare two policies, runs, or folders of several training seeds, on the same test seeds; or run a whole study.
+    """Compare two policies, runs, or folders of several training seeds on the same test seeds; or run a whole study.
 
-    Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with such things named seed_0, seed_1
-    and so on. Two eval.json are compared as they are; all else is evaluated first. Writes compare.json and report.html.
+    Each side is an eval.json, a policy, a run of manip-il dagger, or a folder of these named seed_0, seed_1, ...
+    Two eval.json files are compared directly; other sides are evaluated first. Writes compare.json and report.html.
 
-    One YAML in place of two sides is a study: every arm is run with several training seeds, all are tested on the same
+    One YAML file instead of two sides is a study: every arm is run with several training seeds, tested on the same
     unseen seeds, and compared. It holds `common` and `arms` (options of manip-il dagger), training_seeds, eval,
     checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
     """
@@ -40,37 +40,37 @@ class CompareOptions(Tested, Seeded, Trusting):
     first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
         MISSING,
-        "two sides, each an eval.json, a policy or a run, or the YAML of a study",
+        "two sides, each an eval.json, a policy or a run; or the YAML file of a study",
         positional=True,
         exists="",
         free=True,
     )
-    checkpoint: Literal["best", "last"] = option("best", "of a run: best on validation, or the last round")
+    checkpoint: Literal["best", "last"] = option("best", "which round of a run: the best on validation, or the last")
     at: Literal["end", "labels", "episodes", "steps", "seconds"] = option(
         "end",
-        "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; "
-        "seconds of collecting and fitting)",
+        "which rounds of a run count: end (all), or those within the labels, episodes, steps or seconds (of collecting "
+        "and fitting) that every run reached",
     )
     eval: TrialGroup = group(TrialGroup(EPISODES))
     env: Given = given(EnvConfig, **OF_POLICY)
     training_seeds: int | None = option(
-        None, "of a study, in place of the file's; a resumed one may have more", at_least=1, free=True
+        None, "seeds of a study, instead of the file's; a resumed study may have more", at_least=1, free=True
     )
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")
 
     def run(self) -> None:
-        """Evaluate what is not evaluated yet, compare, print and write the answer."""
+        """Run the missing evaluations, compare, print and write the result."""
         match self.sides:
             case [file] if file.suffix in _YAML:
                 self._run_study(file)
             case [left, right]:
                 self._compare(left, right)
             case _:
-                raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML of one study")
+                raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML file of one study")
 
     def _run_study(self, path: Path) -> None:
-        from manip_il.cli.study import learn, learnt, read_plan
+        from manip_il.cli.study import read_arms, read_plan, run_arms
         from manip_il.evaluation.arm import select_rounds
         from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
@@ -78,13 +78,13 @@ class CompareOptions(Tested, Seeded, Trusting):
         plan = read_plan(path, self.training_seeds, self.trust)
         file = plan.file
         with self.output.open(file) as folder:
-            learn(plan, folder, self.engine)
-            rule, arms = select_rounds(Rule(file.checkpoint, file.at), learnt(plan, folder))
+            run_arms(plan, folder, self.engine)
+            rule, arms = select_rounds(Rule(file.checkpoint, file.at), read_arms(plan, folder))
             trials = [self._trial(plan.envs[arm.name], [arm], file.eval.n_episodes) for arm in arms]
             study = Study(self._measure(arms, trials, folder), plan.baseline, rule, file.target)
             result = study.arms[0].members[0].test
             what = f"{result.robot} {result.task}" if plan.baseline else result.robot
-            self._answer(study, folder, f"Study: {what}, {path.stem}", to_plain(file))
+            self._report(study, folder, f"Study: {what}, {path.stem}", to_plain(file))
 
     def _compare(self, left: Path, right: Path) -> None:
         from manip_il.data.fingerprint import compare_fingerprints
@@ -104,10 +104,10 @@ class CompareOptions(Tested, Seeded, Trusting):
         with self.output.open(self) as folder:
             measured = self._measure(both, [trial] * 2, folder) if trial else both
             study, test = Study(measured, measured[0].name, rule), measured[0].members[0].test
-            self._answer(study, folder, f"{left} against {right}: {test.robot} {test.task}", to_plain(self))
+            self._report(study, folder, f"{left} against {right}: {test.robot} {test.task}", to_plain(self))
 
     def _env(self, arms: Sequence[Arm]) -> EnvConfig:
-        """Return the environment that all are tested in: the runs' own, else that of the policies."""
+        """Return the test environment of all arms: that of the runs, else that of the policies."""
         from manip_il.evaluation.arm import require_same_env
         from manip_il.learn.checkpoint import Checkpoint
 
@@ -119,7 +119,7 @@ class CompareOptions(Tested, Seeded, Trusting):
         return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 
     def _trial(self, env: EnvConfig, arms: Sequence[Arm], n_episodes: int | None) -> Trial:
-        """Return the test of these arms; raises, before any episode runs, if one of their policies cannot take it."""
+        """Return the test of these arms; raises, before any episode runs, if a policy does not fit it."""
         from manip_il.cli.inputs import check_policies
         from manip_il.evaluation.runner import Trial
         from manip_il.seeding import stream_seeds
@@ -136,8 +136,8 @@ class CompareOptions(Tested, Seeded, Trusting):
             pairs = zip(arms, trials, strict=True)
             return tuple(arm.measure(trial, folder, engine, stages) for arm, trial in pairs)
 
-    def _answer(self, study: Study, folder: Path, title: str, config: Mapping[str, Any]) -> None:
-        """Write the result and the page, print the tables and the verdict."""
+    def _report(self, study: Study, folder: Path, title: str, config: Mapping[str, Any]) -> None:
+        """Write the result and the report, print the tables and the verdict."""
         from manip_il.evaluation.comparison import FILE_NAME
         from manip_il.evaluation.eval_report import compare_report
         from manip_il.evaluation.results import write_json

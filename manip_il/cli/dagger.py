@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, check_labels
-from manip_il.cli.common_options import SMALL, Demonstrations, EngineOptions, Trusting, Varied, env_config
+from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trusting, Varied, env_config
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
@@ -28,12 +28,12 @@ _OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr",
 
 @dataclass(frozen=True)
 class DaggerOptions(Varied, Trusting):
-    """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
+    """Roll out the policy, query the expert in every visited state, aggregate, refit, and repeat.
 
-    Round 0 is behaviour cloning on the expert's own demonstrations, or on those in --dataset.root. With --policy.path
-    it is that policy, and there are no demonstrations but those in --dataset.root. --policy.type is mlp, cnn or any
-    policy of LeRobot's; its options are those of `manip-il train`. OUTPUT_DIR/best holds the round with the highest
-    validation success.
+    Round 0 is behaviour cloning on new demonstrations of the expert, or on those in --dataset.root. With --policy.path
+    round 0 is that policy, and only the demonstrations in --dataset.root are used. --policy.type is mlp, cnn or any
+    LeRobot policy, with the options of `manip-il train`. OUTPUT_DIR/best holds the round with the highest validation
+    success.
     """
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
@@ -41,14 +41,14 @@ class DaggerOptions(Varied, Trusting):
     env: Given = given(EnvConfig)
     method: Method = option(
         "dagger",
-        "who drives after round 0: the learner, the expert, the expert with noise like the learner's errors",
+        "who drives after round 0: the learner, the expert, or the expert with noise like the learner's errors",
     )
-    dataset: Demonstrations = group(Demonstrations([]))
+    dataset: DatasetRoots = group(DatasetRoots([]))
     settings: Given = given(RunConfig, prefix="")
     query: str | None = option(
         None,
-        "when it is queried: every, one, probability:P, ensemble:BOUND or safety:BOUND; "
-        "by default every, for takeover one, for branch probability:1/STEPS",
+        "when the expert is queried: every, one, probability:P, ensemble:BOUND or safety:BOUND; "
+        "by default every, but one for takeover, and probability:1/STEPS for branch",
     )
     fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
     image: Given = given(CameraConfig, **SMALL)
@@ -56,7 +56,7 @@ class DaggerOptions(Varied, Trusting):
     output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")
 
     def run(self) -> None:
-        """Run, or go on with, all rounds."""
+        """Run all rounds, or continue them."""
         config = self.config()
         with self.output.open(self) as folder:
             kept = f"every finished episode and round, in {folder}"
@@ -66,14 +66,14 @@ class DaggerOptions(Varied, Trusting):
             self._report(config, results, folder)
         best = folder / "best" / "pretrained_model"
         if (folder / "dataset").is_dir():
-            say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
+            say(f"labels of all rounds as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
         say(f"next: manip-il eval --policy.path={best} --output_dir={folder}/test")
 
     def config(self) -> RunConfig:
-        """Return what `Run` takes; raises for what does not go together, or does not fit what is given."""
+        """Return the configuration of the run; raises if options contradict each other, or do not fit the inputs."""
         from manip_il.cli.inputs import check_given, round_policy
-        from manip_il.collect.query import parse_query  # which imports numpy
+        from manip_il.collect.query import parse_query  # imports numpy
         from manip_il.evaluation.suites import varied
         from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 
@@ -100,7 +100,7 @@ class DaggerOptions(Varied, Trusting):
         return config
 
     def _report(self, config: RunConfig, results: list[Result], folder: Path) -> None:
-        """Write the page of a run."""
+        """Write the report of a run."""
         from manip_il.algorithms.results import best_result
         from manip_il.evaluation.comparison import Comparison
         from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
@@ -115,7 +115,7 @@ class DaggerOptions(Varied, Trusting):
         success, facts = best.validation.success, tuple[str, ...]()
         if best.number > 0:
             comparison = Comparison(names[0], names[best.number], ((results[0].validation, best.validation),))
-            facts = (f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.",)
+            facts = (f"{comparison.verdict} The best round was chosen on these episodes, so its success is biased up.",)
         chosen = f"{names[best.number]} is chosen of {len(results)}"
         write_page(
             folder,
@@ -131,7 +131,7 @@ class DaggerOptions(Varied, Trusting):
 
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Result]:
-    """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
+    """Run all rounds in `folder`, with progress, and a printed line and a line of `metrics.jsonl` per round."""
     from manip_il.algorithms.run import Run
     from manip_il.collect.environments import env_fingerprint
     from manip_il.evaluation.results import write_json
@@ -141,7 +141,7 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     there = {record["round"] for record in read_lines(folder / METRICS_FILE)}
     for result in Run(config, folder, engine, stages.watch()).results():
         stages.close()
-        if result.number not in there:  # else from before an interruption, with the seconds of then
+        if result.number not in there:  # else written before an interruption, with its measured seconds
             append_line(folder / METRICS_FILE, result.to_json())
         results.append(result)
         success, took = f"validation success {result.validation.success}", f"{sum(result.seconds.values()):.0f} s"
@@ -151,9 +151,9 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
 
 
 def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, *films: Any, **parts: Any) -> None:
-    """Write the page in `folder` on policies of the rounds in `run`: a row each, success over costs, times.
+    """Write the report in `folder` on the policies of `run`: their table, success over costs, and times.
 
-    kind: name of the algorithm. films, parts: see `run_report`.
+    kind: the algorithm's name. films, parts: see `run_report`.
     """
     from manip_il.evaluation.eval_report import run_report
     from manip_il.evaluation.figures import Curve

@@ -1,4 +1,4 @@
-"""`manip-il data check`, `repair`, `score`: find what is wrong with a dataset, repair it, find its bad episodes."""
+"""`manip-il data check`, `repair`, `score`: find errors in a dataset, repair them, find bad episodes."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
     from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
 
-PROGRESS = "progress"  # in place of a reward
+PROGRESS = "progress"  # scores by true progress instead of a reward
 
 
 @dataclass(frozen=True)
 class CheckOptions(OfDataset):
-    """Check any LeRobot v3.0 dataset: files, rows, video frames, statistics, and why a policy would not learn from it.
+    """Check any LeRobot v3.0 dataset: files, rows, video frames, statistics, and whether a policy can learn from it.
 
-    One line per finding on standard output, with what to do; exit code 1 after errors, 0 after warnings alone.
+    Prints one line per finding, with what to do. The exit code is 1 if there are errors, 0 if only warnings.
     """
 
     example: ClassVar[str] = "manip-il data check datasets/demos"
 
     def run(self) -> None:
-        """Examine, and say the verdict; raises `NotWhole` after errors."""
+        """Check the dataset and print the verdict; raises `NotWhole` if there are errors."""
         self._say_verdict(self._examine())
 
     @property
     def _root(self) -> Path:
-        """The folder by its name: journals and copies beside it are named after it."""
+        """The folder as a path that ends in its name, after which journals and copies beside it are named."""
         return self.dataset if self.dataset.name not in ("", "..") else self.dataset.resolve()
 
     def _examine(self) -> list[Finding]:
-        """Examine the dataset and print every finding."""
+        """Check the dataset and print every finding."""
         from manip_il.doctor.examine import examine_folder
 
         findings = examine_folder(self._root, [check_robot])
@@ -49,7 +49,7 @@ class CheckOptions(OfDataset):
         return findings
 
     def _say_verdict(self, findings: list[Finding]) -> None:
-        """Print how much is whole; raises `NotWhole` with the numbers after errors."""
+        """Print how many episodes and frames are whole; raises `NotWhole` with the counts if there are errors."""
         from manip_il.data.dataset import Dataset
         from manip_il.doctor.finding import NotWhole
 
@@ -65,15 +65,15 @@ class CheckOptions(OfDataset):
 
 @dataclass(frozen=True)
 class RepairOptions(CheckOptions):
-    """Build a dataset again from its journals; without them compute counts and statistics, and move leftovers away.
+    """Rebuild a dataset from its journals; without them recompute counts and statistics, and move leftover files away.
 
-    What it replaces is kept in DATASET.before-repair. Then the dataset is checked again.
+    Replaced files are kept in DATASET.before-repair. Then the dataset is checked again.
     """
 
     example: ClassVar[str] = "manip-il data repair datasets/demos"
 
     def run(self) -> None:
-        """Examine, repair, examine again, and say the verdict; raises `NotWhole` if something stays wrong."""
+        """Check, repair, check again, and print the verdict; raises `NotWhole` if errors remain."""
         from manip_il.doctor.examine import repair
 
         findings = self._examine()
@@ -86,7 +86,7 @@ class RepairOptions(CheckOptions):
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
-    """Compare joints, observations and compiled model with those of the robot and task in this program."""
+    """Compare joints, observations and compiled model with those of the robot and task of this version."""
     from manip_il.cli.inputs import dataset_differences
     from manip_il.data.lerobot_layout import OURS
     from manip_il.doctor.finding import Finding, warning
@@ -95,7 +95,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
         return
     try:
         for text in dataset_differences("the dataset", own.spec, own.fingerprint):
-            yield warning(OURS, text, f"if labels should be of today: manip-il data relabel {dataset.root}")
+            yield warning(OURS, text, f"for labels of the current expert: manip-il data relabel {dataset.root}")
     except ManipError as error:
         yield Finding(OURS, str(error), "use the version of this program that recorded it, or record again")
 
@@ -105,12 +105,12 @@ class ScoreOptions(OfDataset):
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
     Writes scores.json and rabc.parquet: weights of frames, for manip-il train --weights= and for
-    lerobot-train --sample_weighting.progress_path=. Where the dataset says which episodes failed, it says how well the
-    score finds them.
+    lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, it also prints how well
+    the score finds them.
     """
 
     example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"
-    reward: str = option(MISSING, "folder of manip-il reward fit; progress: true progress")
+    reward: str = option(MISSING, "a folder of manip-il reward fit, or progress: the true progress")
     output: Output = group(Output(Path("runs/scores")), prefix="")
 
     def run(self) -> None:
@@ -129,7 +129,7 @@ class ScoreOptions(OfDataset):
         elif data.progress is not None:
             found = data.progress
         else:
-            raise ManipError(f"{self.dataset} has no column progress; give --reward=FOLDER")
+            raise ManipError(f"{self.dataset} has no progress column; give --reward=FOLDER")
         scores = scoring.Scores(str(self.dataset), self.reward, data, found)
         with self.output.open(self) as folder:
             write_json(folder / scoring.FILE_NAME, scores.to_json())

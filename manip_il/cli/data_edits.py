@@ -1,4 +1,4 @@
-"""`manip-il data render`, `redraw`, `relabel`, `build`, `merge`: a dataset out of one that is there."""
+"""`manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing ones."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from manip_il.option import Seeded, option
 from manip_il.sim.config import CameraConfig, Look
 
 if TYPE_CHECKING:
-    from manip_il.collect.edits import Source, Target
+    from manip_il.collect.edits import EditSource, EditTarget
 
-_RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
+_RUN = "dataset"  # folder of a DAgger run with the states of all rounds
 
 
 @dataclass(frozen=True)
 class BuildOptions(Replacing):
-    """Build the LeRobot dataset of a folder of journals.
+    """Build a LeRobot dataset from a folder of journals.
 
-    The same journals give the same bytes, those that record wrote.
+    The same journals give the same bytes as manip-il record.
     """
 
     example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
@@ -42,15 +42,15 @@ class BuildOptions(Replacing):
             require_replaceable(self.dataset, self.overwrite)
         with exclusive(self.dataset):
             info, failed = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
-        say(f"built {info.episodes:,} episodes, {info.frames:,} frames; left out: {failed}")
+        say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")
         say(f"dataset: {self.dataset}")
 
 
 @dataclass(frozen=True)
 class MergeOptions(Replacing):
-    """Merge the episodes of several datasets, in the order given, into one.
+    """Merge several datasets into one, with their episodes in the order given.
 
-    Refused if robot, task, rate or cameras differ. Provenance names the sources.
+    Robot, task, rate and cameras must agree. The new dataset's provenance names the sources.
     """
 
     example: ClassVar[str] = "manip-il data merge datasets/demos datasets/more --output=datasets/both"
@@ -58,7 +58,7 @@ class MergeOptions(Replacing):
     output: Path = option(MISSING, "folder of the new dataset")
 
     def run(self) -> None:
-        """Merge; the new dataset appears when it is whole."""
+        """Merge; the new dataset appears when it is complete."""
         from manip_il.data.build import local_id, merge_datasets
 
         with exclusive(self.output):
@@ -69,26 +69,28 @@ class MergeOptions(Replacing):
 
 @dataclass(frozen=True)
 class Edit(Replacing):
-    """Edit of a dataset's states."""
+    """Options of an edit of a dataset's states."""
 
-    source: Path = option(MISSING, "a dataset of this program, or of redraw a run", positional=True, exists="datasets/")
+    source: Path = option(MISSING, "a manip-il dataset; for redraw, also a run", positional=True, exists="datasets/")
     target: Path | None = option(
         None, "folder of the new dataset; by default SOURCE_rendered, _relabelled or _redrawn", positional=True
     )
-    robot: str | None = option(None, "its YAML, if the dataset's robot does not ship", flag="robot.type")
-    task: str | None = option(None, "its Python file, if the dataset's task does not ship", flag="task.type")
+    robot: str | None = option(None, "YAML file of the dataset's robot, if it is your own", flag="robot.type")
+    task: str | None = option(None, "Python file of the dataset's task, if it is your own", flag="task.type")
     object: str | None = option(
         None, "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh", flag="task.object"
     )
     processes: Workers = group(Workers(), prefix="")
 
     @contextmanager
-    def open(self, what: str, root: Path | None = None, pieces: int | None = None) -> Generator[tuple[Source, Target]]:
-        """Yield the dataset to read and the new one's folder to write, held, with the progress of its pieces.
+    def open(
+        self, what: str, root: Path | None = None, pieces: int | None = None
+    ) -> Generator[tuple[EditSource, EditTarget]]:
+        """Yield the dataset to read and the new dataset's locked folder, and show progress by pieces.
 
-        root: of the dataset, by default `source`. pieces: how many, by default one an episode. Then says where it is.
+        root: the dataset, by default `source`. pieces: their number, by default one per episode.
         """
-        from manip_il.collect.edits import Target, open_source
+        from manip_il.collect.edits import EditTarget, open_source
         from manip_il.collect.workers import default_workers
 
         root = root or self.source
@@ -98,19 +100,19 @@ class Edit(Replacing):
         source = open_source(root, self.robot, self.task, self.object)
         warn(*source.warnings)
         with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:
-            yield source, Target(folder, self.processes.workers or default_workers(), self.overwrite, bar.step)
+            yield source, EditTarget(folder, self.processes.workers or default_workers(), self.overwrite, bar.step)
         say(f"dataset: {folder}")
 
 
 @dataclass(frozen=True)
 class RenderOptions(Edit, Pictured):
-    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. Nothing is simulated."""
+    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. No simulation runs."""
 
     example: ClassVar[str] = "manip-il data render datasets/demos datasets/dim --cameras=front --look.brightness=0.6"
     look: Look = field(default_factory=Look)
 
     def run(self) -> None:
-        """Render every episode; TARGET appears when all are there."""
+        """Render every episode; TARGET appears when it is complete."""
         from manip_il.collect.edits import render_dataset
 
         with self.open("rendered") as (source, target):
@@ -120,17 +122,17 @@ class RenderOptions(Edit, Pictured):
 
 @dataclass(frozen=True)
 class RelabelOptions(Edit):
-    """Relabel every state of a dataset with the current expert, in place of recording again.
+    """Relabel every state of a dataset with the current expert, instead of recording again.
 
-    TARGET is SOURCE with other labels: what was executed, pictures and all else stay as they are. States in which the
-    expert was not asked are labelled, too. Says how many labels changed: by more than 1 % of a joint's longest step, in
-    phase, or in being sound.
+    TARGET is SOURCE with new labels; executed actions, pictures and all other columns stay the same. States in which
+    the expert was not queried get a label, too. Prints how many labels changed: by more than 1 % of a joint's longest
+    step, in phase, or in validity.
     """
 
     example: ClassVar[str] = "manip-il data relabel datasets/demos"
 
     def run(self) -> None:
-        """Label every state; TARGET appears when all are labelled."""
+        """Label every state; TARGET appears when it is complete."""
         from manip_il.collect.edits import relabel_dataset
 
         with self.open("relabelled") as (source, target):
@@ -140,22 +142,22 @@ class RelabelOptions(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class RedrawOptions(Edit, Varied, Seeded):
-    """Draw goals, untouched objects and looks anew in the states that were visited; the expert labels, cameras see.
+    """Randomise goals, untouched objects and looks in visited states; label and render each scene.
 
-    TARGET is a LeRobot dataset to train policies on pictures from, each frame an episode of its own. Scenes without a
-    sound label are left out. --vary takes view, clutter, object (its colour), or YAMLs of ranges.
+    TARGET is a LeRobot dataset for training policies on pictures; each frame is an episode. Scenes without a valid
+    label are left out. --vary takes view, clutter, object (its colour), or YAML files of ranges.
     """
 
     example: ClassVar[str] = "manip-il data redraw runs/dagger datasets/redrawn --frames=20000"
     frames: int = option(20_000, "scenes to draw", at_least=1)
-    scenes: bool = option(True, "draw goals and objects anew; false: states as they were visited")
+    scenes: bool = option(True, "draw new goals and objects; false: keep the visited states")
     branch_steps: int = option(
-        1, "control steps that the expert drives on from every scene, for act and diffusion", at_least=1
+        1, "control steps that the expert drives from every scene, for act and diffusion", at_least=1
     )
     image: Given = given(CameraConfig, **SMALL)
 
     def run(self) -> None:
-        """Draw all frames; TARGET appears when they are there."""
+        """Draw all scenes; TARGET appears when it is complete."""
         from manip_il.collect.edits import redraw_dataset
         from manip_il.collect.scenes import CHUNK, Scenes
         from manip_il.evaluation.suites import varied
@@ -167,7 +169,7 @@ class RedrawOptions(Edit, Varied, Seeded):
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)
             left, drawn = self.frames - info.episodes, f"{info.episodes:,} scenes, {info.frames:,} frames"
-            say(f"redrew {drawn}; {left:,} left out, without a sound label")
+            say(f"redrew {drawn}; {left:,} left out, without a valid label")
         policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
         train = f"manip-il train --dataset.root={target.root} --policy.type={policy}"
         say(f"next: {train} --output_dir=runs/{target.root.name}")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.report import Film
     from manip_il.evaluation.tables import PolicyRow
 
-RUN: Given = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # in place of `manip-il dagger`'s own
+RUN: Given = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # replace the defaults of dagger
 FIT: Given = {"steps": 3_000, "batch_size": 256}
 
 
@@ -32,8 +32,8 @@ class DemoOptions:
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
     Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
-    the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows it. The policy is an mlp: manip-il
-    train and manip-il dagger take every other.
+    the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows the result. The policy is an mlp; for
+    other policies use manip-il train and manip-il dagger.
     """
 
     example: ClassVar[str] = "manip-il demo --output_dir=runs/demo"
@@ -41,13 +41,13 @@ class DemoOptions:
     env: Given = given(EnvConfig)
     settings: Given = given(RunConfig, prefix="", only=(*RUN, "episodes_per_round", "disturbed_share", "seed"), **RUN)
     fit: Given = given(FitConfig, prefix="", only=("policy", *FIT), **FIT)
-    test_episodes: int = option(200, "unseen test episodes, used for no choice", at_least=1)
-    disturbed_episodes: int = option(100, "the first of them again, disturbed", at_least=1)
+    test_episodes: int = option(200, "unseen test episodes, which never select a policy", at_least=1)
+    disturbed_episodes: int = option(100, "test episodes that are also run disturbed", at_least=1)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/demo")), prefix="")
 
     def run(self) -> None:
-        """Run what is not there yet, print the table, write the report."""
+        """Run the missing steps, print the table, write the report."""
         from manip_il.evaluation.comparison import Comparison
         from manip_il.evaluation.rounds import format_seconds
         from manip_il.evaluation.tables import policy_table, print_table
@@ -70,8 +70,8 @@ class DemoOptions:
             *(f"Disturbed: {test.verdict}" for test in disturbed),
             f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.",
         )
-        about = f"Demo: {config.env.robot} {config.env.task}"
-        parts = {"title": about, "verdict": verdict, "facts": facts, "command": command_line("demo", self)}
+        title = f"Demo: {config.env.robot} {config.env.task}"
+        parts = {"title": title, "verdict": verdict, "facts": facts, "command": command_line("demo", self)}
         write_page(folder, folder / "dagger", rows, "DAgger", *films, config=to_plain(self), **parts)
         print_table(policy_table(rows), empty="-")
         say(verdict, *facts, f"took {format_seconds(time.monotonic() - began)} in all")
@@ -81,7 +81,7 @@ class DemoOptions:
     def _measure(
         self, config: RunConfig, folder: Path, engine: Engine, stages: Stages
     ) -> tuple[list[Path | None], list[PolicyRow]]:
-        """Run DAgger, clone from as many labels, and test both, their beginning and the expert (no policy)."""
+        """Run DAgger, clone from as many labels, and test both, round 0 and the expert (policy None)."""
         from manip_il.algorithms.cloning import clone_with_labels
         from manip_il.algorithms.results import best_result
         from manip_il.evaluation.runner import Trial
@@ -118,7 +118,7 @@ class DemoOptions:
 def _film(
     policies: Sequence[Path | None], rows: Sequence[PolicyRow], config: RunConfig, stages: Stages
 ) -> tuple[list[Film], str]:
-    """Film every policy on the first seed on which DAgger succeeds and cloning fails, else the first of all."""
+    """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on the first seed."""
     from manip_il.evaluation.film import Shot, film_shots, run_states
     from manip_il.evaluation.runner import Trial
 
@@ -135,7 +135,7 @@ def _film(
 
 
 def demo_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
-    """Return the report's first sentence; significant: whether DAgger differs from cloning with as many labels."""
+    """Return the report's first sentence. significant: whether DAgger differs from cloning with as many labels."""
     from manip_il.evaluation.intervals import format_percent
 
     _, cloned, more, dagger = rows
@@ -143,5 +143,5 @@ def demo_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
         f"DAgger solves {format_percent(dagger.success.rate)} of {dagger.success.n:,} unseen starts, "
         f"cloning {format_percent(more.success.rate)} with as many labels "
         f"and {format_percent(cloned.success.rate)} with the first demonstrations alone."
-        + ("" if significant else " So few starts show no difference between DAgger and cloning with as many labels.")
+        + ("" if significant else " With as many labels, cloning and DAgger do not differ significantly.")
     )

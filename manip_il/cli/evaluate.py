@@ -1,4 +1,4 @@
-"""`manip-il eval`: how often a policy succeeds on seeds that nothing was chosen on."""
+"""`manip-il eval`: how often a policy succeeds on unseen seeds."""
 
 from __future__ import annotations
 
@@ -26,60 +26,60 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EvalResult
 
 EPISODES, MOST_EPISODES = 100, 10_000
-NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing is loaded
+NO_FILES = ("expert", "random")  # drivers without a checkpoint
 
 
 @dataclass(frozen=True)
 class MeasuredPolicyGroup(PolicyGroup):
-    """`--policy.*` of what is measured."""
+    """`--policy.*`: the policy to evaluate."""
 
     type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
-    device: str = option("cpu", "where the checkpoint acts: cpu or cuda")
+    device: str = option("cpu", "where the policy runs: cpu or cuda")
 
 
 @dataclass(frozen=True)
 class EvalGroup(TrialGroup):
     """`--eval.*`: the episodes to run."""
 
-    first: int = option(0, "index of the first seed in the stream, for one part of a larger evaluation", at_least=0)
+    first: int = option(0, "index of the first seed in the stream, to run a large evaluation in parts", at_least=0)
     hold: int | None = option(
-        10, "control steps after success at which an episode ends; null: at the horizon", at_least=0
+        10, "control steps after success until an episode ends; null: it ends at the horizon", at_least=0
     )
     batch_size: int = option(
-        25, "episodes in lockstep that share a call of the policy; no result depends on it", at_least=1, free=True
+        25, "episodes that run in lockstep and share policy calls; does not change results", at_least=1, free=True
     )
-    stream: Literal["test", "validation"] = option("test", "which seeds; those of test were used for no choice")
-    films: int = option(2, "number of failures to film, and of successes", at_least=0, free=True)
+    stream: Literal["test", "validation"] = option("test", "which seeds; the test seeds never select a policy")
+    films: int = option(2, "failures to film, and as many successes", at_least=0, free=True)
 
 
 @dataclass(frozen=True)
 class EvalOptions(Tested, Seeded, Trusting):
     """Measure a policy's success on unseen seeds; writes eval.json and report.html.
 
-    With EVALUATION, an eval.json or its folder, nothing new is measured: --replay=SEED runs one of its episodes again,
-    alone, and films it; two or more are merged, as parts that several machines ran. --check draws a picture, and says
+    With EVALUATION, an eval.json or its folder, no policy is evaluated: --replay=SEED runs one of its episodes again
+    and films it; two or more, such as parts run on several machines, are merged. --check renders a picture and reports
     whether this machine or container can evaluate.
     """
 
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     first: ClassVar[str] = "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay resume"
     evaluation: list[Path] = option(
-        list, "evaluations: one, with --replay, or several to merge", positional=True, exists=""
+        list, "evaluations: one with --replay, or several to merge", positional=True, exists=""
     )
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     eval: EvalGroup = field(default_factory=EvalGroup)
     until_width: float | None = option(
-        None, "stop when the interval is this narrow; 0.02 is 2 points", at_least=0.0001, at_most=1
+        None, "stop when the confidence interval is this narrow; 0.02 is 2 points", at_least=0.0001, at_most=1
     )
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/eval")), prefix="")
-    replay: int | None = option(None, "seed of the episode of EVALUATION to run again", at_least=0, free=True)
-    video: Path | None = option(None, "an MP4 of it to write", free=True)
+    replay: int | None = option(None, "seed of the episode of EVALUATION to replay", at_least=0, free=True)
+    video: Path | None = option(None, "MP4 file for the replay", free=True)
     health: bool = option(False, "check that this machine can evaluate and render", flag="check", free=True)
 
     def run(self) -> None:
-        """Run the episodes, write `eval.json` and `report.html`, print the table; or do what is asked in its place."""
+        """Evaluate, write `eval.json` and `report.html`, print the table; or check, replay or merge."""
         match self.evaluation, self.replay:
             case _ if self.health:
                 say(f"healthy: {machine()}")
@@ -104,10 +104,10 @@ class EvalOptions(Tested, Seeded, Trusting):
         seeds = stream_seeds(self.eval.stream, end, self.seed)[self.eval.first :]
         name, engine = str(self.policy.type or self.policy.path), self.engine.open()
         if len(seeds) > 1:
-            engine.warm_up(learned=self.policy.path is not None)  # while the policy is checked here
+            engine.warm_up(learned=self.policy.path is not None)  # meanwhile this process checks the policy
         job, suite, width = self._job(), self.suite, self.until_width
         with self.output.open(self) as folder:
-            finished_episodes(folder, job, suite)  # refuses another policy before anything runs
+            finished_episodes(folder, job, suite)  # raises if they are another policy's
             with Stages(f"finished episodes, in {folder}") as stages, engine:
                 result = measure(engine, job, seeds, name, folder, stages, suite=suite, until_width=width)
                 films = film_outcomes(engine, job, result, self.eval.films, folder / "films", stages)
@@ -128,7 +128,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         return RolloutJob(env, driver, hold, label="last", conditions=conditions, batch=batch)
 
     def _report(self, result: EvalResult, folder: Path, films: Sequence[Film] = (), no_films: str = "") -> None:
-        """Write the result and its page, and print its tables."""
+        """Write the result and its report, and print its tables."""
         from manip_il.evaluation.eval_report import eval_report
         from manip_il.evaluation.results import FILE_NAME
         from manip_il.evaluation.tables import evaluation_table, print_table
@@ -139,13 +139,13 @@ class EvalOptions(Tested, Seeded, Trusting):
         print_table(evaluation_table(result))
         if result.failures:
             phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
-            say(f"failures by the phase that they ended in: {phases}")
+            say(f"failures by final phase: {phases}")
         if result.robot in ROBOTS:
             say(f"return: {mean(episode.ret for episode in result.episodes):.2f}")
         say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
 
     def _merge(self) -> None:
-        """Make one evaluation of parts; warns if they were made with different versions or models."""
+        """Merge evaluations; warn if they were made with different versions or models."""
         from manip_il.data.fingerprint import compare_fingerprints
         from manip_il.evaluation.results import EvalResult, merge_results
 
@@ -157,7 +157,7 @@ class EvalOptions(Tested, Seeded, Trusting):
             self._report(merged, folder)
 
     def _replay(self, file: Path, seed: int) -> None:
-        """Run one episode again with the same policy, seed and conditions; `ManipError` if its outcome differs."""
+        """Replay one episode with the same policy, seed and conditions; `ManipError` if its outcome differs."""
         from manip_il.evaluation.film import Shot, run_states
         from manip_il.evaluation.results import EvalResult
         from manip_il.evaluation.runner import episode_result, replay_differences
@@ -165,7 +165,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         result = EvalResult.read(file)
         by_seed = {episode.seed: episode for episode in result.episodes}
         if seed not in by_seed:
-            raise UsageError(f"--replay is {seed}; {file} has the seeds {min(by_seed)} to {max(by_seed)}")
+            raise UsageError(f"--replay is {seed}; {file} has seeds {min(by_seed)} to {max(by_seed)}")
         before, job = by_seed[seed], self._job_of(result, file)
         episode = run_states(job, seed)
         ended = "success" if before.success else f"failure in phase {before.phase_at_end}"
@@ -176,15 +176,15 @@ class EvalOptions(Tested, Seeded, Trusting):
             say(f"video: {self.video}")
         if differences := replay_differences(before, episode_result(job, episode)):
             raise ManipError(
-                f"the episode of seed {seed} differs from {file}: {'; '.join(differences)}; across "
-                "machines and versions success rates can be compared, single episodes cannot"
+                f"the episode of seed {seed} differs from {file}: {'; '.join(differences)}; compare success rates, "
+                "not single episodes, across machines and versions"
             )
         say(f"the same as in {file}")
 
     def _job_of(self, result: EvalResult, file: Path) -> RolloutJob:
-        """Return the rollouts of an evaluation; warn if policy or program have changed since.
+        """Return the rollout job of an evaluation; warn if the policy or this program has changed since.
 
-        `--task.*` are the files of its task and its object's mesh, if they do not ship.
+        A user's own task and mesh are given again by `--task.type` and `--task.object`.
         """
         from manip_il.cli.inputs import open_driver
         from manip_il.collect.environments import env_fingerprint, env_spec
@@ -208,7 +208,7 @@ class EvalOptions(Tested, Seeded, Trusting):
 
 
 def machine() -> str:
-    """Return renderer, PyTorch and cores in one line. Raises what an evaluation without them would raise."""
+    """Return renderer, PyTorch version and cores in one line. Raises what an evaluation here would raise."""
     import multiprocessing
     import tempfile
     from importlib import metadata
@@ -219,11 +219,11 @@ def machine() -> str:
     from manip_il.tasks.envs import make_env
 
     tempfile.TemporaryFile().close()
-    multiprocessing.get_context("spawn").Lock()  # which lies in /dev/shm
+    multiprocessing.get_context("spawn").Lock()  # needs /dev/shm
     env = make_env()
     env.start(0)
     render.pictures(env.scene, env.data, CameraConfig(CAMERAS))
-    from OpenGL import GL  # mujoco has chosen its platform
+    from OpenGL import GL  # after mujoco has chosen its platform
 
     names = (GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER))
     renderer = " ".join(name.decode(errors="replace") for name in names if name)

@@ -1,6 +1,6 @@
-"""Datasets, policies and rewards that a command is given, checked against this program.
+"""Checks of the datasets and policies that a command is given.
 
-Commands import this module when they run, as it imports the environment and the learner.
+Commands import this module only when they run, because it imports the environment and the learner.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
 
 def round_policy(settings: Open) -> tuple[Open, Path | None]:
-    """Return `--policy.*` of a run's later rounds, and the `pretrained_model` folder that it begins with, if any.
+    """Return the policy options of the later rounds, and the `pretrained_model` folder to start from, if any.
 
-    Of an mlp to begin with, the options are spelled out: those are asked for before LeRobot is imported.
+    The options of a starting mlp are listed explicitly, because they are needed before LeRobot is imported.
     """
     if "path" not in settings:
         return settings, None
@@ -46,13 +46,13 @@ def round_policy(settings: Open) -> tuple[Open, Path | None]:
 
 
 def check_given(config: RunConfig) -> None:
-    """Raise `MismatchError` unless the datasets and the policy that a run begins with fit its environment."""
+    """Raise `MismatchError` unless the datasets and the starting policy of a run fit its environment."""
     recorded = None if config.redraw else config.cameras
     here, run = env_spec(config.env, recorded), f"{config.env.robot} {config.env.task} of this run"
     for root in config.datasets:
         given = Dataset.open(root)
         if SIM_STATE not in given.features:
-            advice = "fit a policy to it by manip-il train, and begin with that: --policy.path=RUN"
+            advice = "train a policy on it with manip-il train, and start from that: --policy.path=RUN"
             raise ManipError(f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}")
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
         warn(*dataset_differences(str(root), given.spec, given.fingerprint))
@@ -61,16 +61,16 @@ def check_given(config: RunConfig) -> None:
 
 
 def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> list[str]:
-    """Return in what a dataset was made by other versions or another model than this machine has, a line each.
+    """Return a line for each difference between the versions and model that made a dataset and this machine's.
 
-    name: of the dataset. Raises `MismatchError` if its numbers mean something else. A dataset of a user's own arm or
-    task, whose name alone it holds, is not compared.
+    name: the dataset's name for messages. Raises `MismatchError` if joints or observations differ. A dataset of a
+    user's own arm or task holds only its name, and is not compared.
     """
     if not is_known(spec.robot, spec.task, spec.object):
         return []
     env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
     check_same_spec(name, spec, "this program", env_spec(env))
-    # Tolerance and horizon change nothing that is learnt, and a dataset does not hold them; nor are pictures compared.
+    # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are not compared, either.
     here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}
     theirs = {key: value for key, value in fingerprint.items() if key not in _NOT_COMPARED}
     return compare_fingerprints(name, theirs, "this machine", here)
@@ -79,10 +79,10 @@ def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str
 def open_driver(
     policy: Path | None, kind: str, env: Given | EnvConfig, *, trust: bool = False, device: str = "cpu"
 ) -> tuple[EnvConfig, Driver, CameraConfig | None]:
-    """Return what drives, checked, the environment that it drives, and the cameras whose pictures it takes.
+    """Return the environment, the checked driver and the cameras whose pictures it takes.
 
-    policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or what was given of it:
-    the rest is as the policy has it. device: of a checkpoint. Raises what `check_policy` raises.
+    policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or options, completed
+    from the policy. device: where a checkpoint runs. Raises what `check_policy` raises.
     """
     if policy is None:
         return env_config(env) if isinstance(env, dict) else env, driver_of(kind), None
@@ -92,9 +92,9 @@ def open_driver(
 
 
 def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False) -> CameraConfig | None:
-    """Return the cameras whose pictures the policy takes, if any; warn if it was trained on something else.
+    """Return the cameras whose pictures the policy takes, if any; warn if its task or model differs.
 
-    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if it names models to load without `trust`.
+    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if it needs `trust`.
     """
     path, origin, cameras = checkpoint.path, checkpoint.origin, policy_cameras(checkpoint.path)
     spec = env_spec(env, cameras)
@@ -102,7 +102,7 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
     checkpoint.require_trust(trust)
     if origin is None:
         warn(f"{path} was written by another tool and does not say which robot and task it is for")
-    elif origin.task != spec.task:  # and with it the model and its hash
+    elif origin.task != spec.task:  # the model and its hash differ, too
         warn(f"task differs: {path} has {origin.task}, the environment has {spec.task}")
     else:
         theirs = {name: value for name, value in origin.fingerprint.items() if cameras or name != "cameras_sha256"}
@@ -111,7 +111,7 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
 
 
 def check_policies(policies: Mapping[str, Path], trial: Trial) -> None:
-    """Raise, before any episode runs, if one of the policies (name -> folder) cannot take a test."""
+    """Raise if one of the policies (name -> folder) does not fit a test."""
     for name, policy in policies.items():
         checkpoint = Checkpoint.open(policy)
         if checkpoint.origin is not None and checkpoint.origin.task != trial.env.task:

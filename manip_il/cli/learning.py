@@ -1,4 +1,4 @@
-"""`manip-il rl gail`, `airl`, `ppo`: a policy by reinforcement learning, from demonstrations or a learnt reward."""
+"""`manip-il rl gail`, `airl`, `ppo`: reinforcement learning from demonstrations or a learnt reward."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.cli.common_options import Demonstrations, Workers
+from manip_il.cli.common_options import DatasetRoots, Workers
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
@@ -28,18 +28,18 @@ METRICS_FILE = "metrics.jsonl"
 
 @dataclass(frozen=True)
 class Learning:
-    """Run of a method, its progress and its page, as these commands share it."""
+    """Options, run, progress and report that these commands share."""
 
     method: ClassVar[str]
     first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"
-    init: Path | None = option(None, "a cloned mlp, or its run, to begin with; by default a new policy")
+    init: Path | None = option(None, "a cloned mlp, or its run, to start from; by default a new policy")
     settings: Given = given(LearningConfig, prefix="")
     ppo: PPOConfig = field(default_factory=PPOConfig)
     engine: Workers = group(Workers(1), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/rl")), prefix="")
 
     def run(self) -> None:
-        """Run, or go on with, all iterations, and write the report."""
+        """Run all iterations, or continue them, and write the report."""
         from manip_il.algorithms.results import learning_report, validations
 
         config = self.learning_config()
@@ -55,11 +55,11 @@ class Learning:
         say(f"next: manip-il eval --policy.path={best} --output_dir={folder}/test")
 
     def learning_config(self) -> LearningConfig:
-        """Return what the run takes; raises for what is wrong with datasets and policy together."""
+        """Return the configuration of the run; raises if datasets, policy and environment do not fit."""
         raise NotImplementedError
 
     def _config(self, spec: RobotTaskSpec | Origin, name: str, **more: Any) -> LearningConfig:
-        """Return the configuration in the environment of `spec`, which `name` is for; `UsageError` if none is known."""
+        """Return the configuration for the environment of `spec`, read from `name`; `UsageError` if it is unknown."""
         from manip_il.collect.environments import is_known
 
         if not is_known(spec.robot, spec.task, spec.object):
@@ -89,19 +89,19 @@ class Learning:
 class GailOptions(Learning):
     """Imitate demonstrations by generative adversarial imitation learning (GAIL).
 
-    A discriminator learns to tell the learner's steps from the demonstrations'; PPO is rewarded for being mistaken for
-    the expert. OUTPUT_DIR/best holds the policy with the highest validation success: an mlp like that of `manip-il
+    A discriminator learns to tell the learner's steps from the expert's; PPO is rewarded for steps that it takes for
+    the expert's. OUTPUT_DIR/best holds the policy with the highest validation success: an mlp like that of `manip-il
     train`.
     """
 
     method: ClassVar[str] = "gail"
     example: ClassVar[str] = "manip-il rl gail --dataset.root=datasets/demos --init=runs/cloned --output_dir=runs/gail"
-    dataset: Demonstrations
+    dataset: DatasetRoots
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     output: ResumableOutput = group(ResumableOutput(Path("runs/gail")), prefix="")
 
     def learning_config(self) -> LearningConfig:
-        """Return what the run takes; raises if the demonstrations are not all for one environment that is known."""
+        """Return the configuration of the run; raises if the demonstrations are not of one known environment."""
         from manip_il.cli.inputs import dataset_differences
         from manip_il.data.dataset import Dataset
         from manip_il.learn.sources import check_same_sources
@@ -128,24 +128,24 @@ class AirlOptions(GailOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class PpoOptions(Learning):
-    """Improve a cloned policy (--init) by PPO on a reward that was learnt from preferences.
+    """Improve a cloned policy (--init) by PPO with a reward learnt from preferences.
 
-    Episodes go on after success, as the reward says how good every state is. OUTPUT_DIR/best holds the policy with the
-    highest validation success, which may be the one that it began with.
+    Episodes continue after success, because the reward scores every state. OUTPUT_DIR/best holds the policy with the
+    highest validation success, which may be the initial one.
     """
 
     method: ClassVar[str] = "ppo"
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
-    reward: Path = option(MISSING, "the reward: a folder of manip-il reward fit", exists="")
+    reward: Path = option(MISSING, "the reward, a folder of manip-il reward fit", exists="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/ppo")), prefix="")
 
     def learning_config(self) -> LearningConfig:
-        """Return what the run takes; raises `MismatchError` if reward and environment do not fit."""
+        """Return the configuration of the run; raises `MismatchError` if the reward does not fit the environment."""
         from manip_il.collect.environments import env_spec
         from manip_il.learn.reward import LearnedReward
 
         if self.init is None:
-            raise UsageError("--init is missing; PPO improves a cloned policy, its path is expected")
+            raise UsageError("--init is missing; expected the path of a cloned policy for PPO to improve")
         reward = LearnedReward.load(found := find_policy(self.reward))
         config = self._config(reward.origin, str(self.reward), reward=found)
         reward.check_fits("the environment", env_spec(config.env))

@@ -1,6 +1,6 @@
-"""`manip-il COMMAND --option=value ...`: finds the command, answers for help and for errors.
+"""`manip-il COMMAND --option=value ...`: dispatch of commands, help, and error messages.
 
-Nothing heavy is imported before a command's options are read, so that help and a wrong name are answered at once.
+Nothing heavy is imported before a command's options are read, so that help and errors appear at once.
 """
 
 from __future__ import annotations
@@ -20,49 +20,49 @@ from manip_il.cli.parsing import check_paths, parse
 from manip_il.errors import ManipError, UnknownName, UsageError, printable
 
 PROGRAM = "manip-il"
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
 
 class Command(NamedTuple):
-    """target: `module:OptionsClass` in `manip_il.cli`, loaded when the command is called."""
+    """target: `module:OptionsClass` in `manip_il.cli`, imported when the command runs."""
 
     target: str
     summary: str
 
 
 COMMANDS = {
-    "demo": Command("demo:DemoOptions", "the whole story, small: record, clone, DAgger, report"),
+    "demo": Command("demo:DemoOptions", "run a small complete example: record, clone, DAgger, report"),
     "record": Command("record:RecordOptions", "record demonstrations of the expert as a dataset"),
     "train": Command("train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
     "dagger": Command("dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
     "eval": Command("evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
     "compare": Command("compare:CompareOptions", "compare policies, runs or whole studies on the same seeds"),
     "view": Command("view:ViewOptions", "watch a robot at its task, in a window or a browser"),
-    "serve": Command("serve:ServeOptions", "run a virtual SO-101 that LeRobot's own programs open"),
+    "serve": Command("serve:ServeOptions", "run a virtual SO-101 for LeRobot's own programs"),
     "push": Command("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
-    "pull": Command("transfer:PullOptions", "download a dataset or policy, every file verified"),
+    "pull": Command("transfer:PullOptions", "download a dataset or policy and verify every file"),
     "export": Command("transfer:ExportOptions", "export a policy as ONNX"),
     "theory": Command("theory:TheoryOptions", "compare the proven bounds with your own run"),
-    "data check": Command("data_check:CheckOptions", "find what is wrong with a dataset, of any origin"),
+    "data check": Command("data_check:CheckOptions", "find errors in any LeRobot dataset"),
     "data repair": Command("data_check:RepairOptions", "repair a dataset, from its journals or its own data"),
     "data render": Command("data_edits:RenderOptions", "render a dataset again, with other cameras, sizes or lights"),
-    "data redraw": Command("data_edits:RedrawOptions", "draw visited states anew, for policies on pictures"),
+    "data redraw": Command("data_edits:RedrawOptions", "randomise and render visited states, for picture policies"),
     "data relabel": Command("data_edits:RelabelOptions", "relabel a dataset with the current expert"),
     "data build": Command("data_edits:BuildOptions", "rebuild a dataset from its journals"),
     "data merge": Command("data_edits:MergeOptions", "merge datasets of one robot and task"),
     "data score": Command("data_check:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
     "data to-mcap": Command("transfer:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
-    "data from-mcap": Command("transfer:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
-    "robot new": Command("robot:RobotNewOptions", "write a first YAML for an arm's MJCF"),
+    "data from-mcap": Command("transfer:McapImportOptions", "convert MCAP files to a dataset with a mapping file"),
+    "robot new": Command("robot:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
     "robot check": Command("robot:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": Command("robot:CertifyOptions", "measure from which states the expert recovers"),
     "rl gail": Command("learning:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"),
-    "rl airl": Command("learning:AirlOptions", "imitate by AIRL, which learns a reward, too"),
-    "rl ppo": Command("learning:PpoOptions", "improve a cloned policy on a reward learnt from preferences"),
-    "reward irl": Command("reward:IrlOptions", "learn a reward from demonstrations of carry"),
+    "rl airl": Command("learning:AirlOptions", "imitate by AIRL, which also learns a reward"),
+    "rl ppo": Command("learning:PpoOptions", "improve a cloned policy with a reward learnt from preferences"),
+    "reward irl": Command("reward:IrlOptions", "learn a reward from demonstrations of the task carry"),
     "reward pairs": Command("reward:PairsOptions", "choose pairs of clips to compare"),
     "reward ask": Command("reward:AskOptions", "make a page that asks which clip is better"),
-    "reward answer": Command("reward:AnswerOptions", "answer pairs by a simulated teacher, who knows true progress"),
+    "reward answer": Command("reward:AnswerOptions", "let a simulated teacher answer pairs by true progress"),
     "reward fit": Command("reward:FitOptions", "learn a reward from answers"),
 }
 GROUPS = {
@@ -80,7 +80,7 @@ RENAMED = {
     "certify": "robot certify",
     "irl": "reward irl",
     "preferences": "reward",
-    "doctor": "data check, and manip-il data repair in place of --repair",
+    "doctor": "data check, or manip-il data repair instead of --repair",
     "mcap": "data to-mcap, and manip-il data from-mcap",
     **{name: f"rl {name}" for name in ("gail", "airl", "ppo")},
     **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
@@ -89,11 +89,11 @@ RENAMED = {
 HELP = ("--help", "-h", "--help=all")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
-  --quiet      no progress on standard error"""
+  --quiet      show no progress on standard error"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command. Returns 0 done, 1 the work failed, 2 the command line was invalid, 130 interrupted."""
+    """Run one command; return 0 (done), 1 (the work failed), 2 (invalid command line) or 130 (interrupted)."""
     given = list(sys.argv[1:] if argv is None else argv)
     words = [word for word in given if word not in ("--debug", "--quiet")]
     progress.set_quiet("--quiet" in given)
@@ -112,7 +112,7 @@ def script() -> NoReturn:
 
 
 def load(name: str) -> type:
-    """Return the dataclass of options of a command; `UnknownName` (exit code 2) names the known ones."""
+    """Return the dataclass of a command's options; `UnknownName` lists the known commands."""
     if name not in COMMANDS:
         raise UnknownName("command", name, COMMANDS)
     module, _, options_class = COMMANDS[name].target.partition(":")
@@ -144,24 +144,24 @@ def _run(name: str, words: list[str]) -> None:
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:
-    """A command's name, of one word or two, and the words behind it."""
-    name, of_two = words[0], " ".join(words[:2])
+    """Return a command's name, of one or two words, and the words after it."""
+    name, two_words = words[0], " ".join(words[:2])
     if name in RENAMED:
-        raise UsageError(f"{name!r} has a new name: {PROGRAM} {RENAMED[name]}")
+        raise UsageError(f"{name!r} was renamed: {PROGRAM} {RENAMED[name]}")
     if name not in GROUPS:
         return name, words[1:]
-    if of_two not in COMMANDS:
-        raise UnknownName("command", of_two, _inside(name))
-    return of_two, words[2:]
+    if two_words not in COMMANDS:
+        raise UnknownName("command", two_words, _commands_of(name))
+    return two_words, words[2:]
 
 
-def _inside(group: str) -> list[str]:
-    """The commands of two words that begin with this one."""
+def _commands_of(group: str) -> list[str]:
+    """Return the commands of a group."""
     return [name for name in COMMANDS if name.startswith(f"{group} ")]
 
 
 def _report(error: BaseException, words: list[str]) -> int:
-    """Say on standard error what happened, in one line; return the exit code."""
+    """Print an error as one line on standard error; return the exit code."""
     code = 1
     if isinstance(error, KeyboardInterrupt):
         text, code = f"interrupted{f'; {error}' if error.args else ''}", EXIT_INTERRUPTED
@@ -176,7 +176,7 @@ def _report(error: BaseException, words: list[str]) -> int:
 
 
 def _clean(text: str, words: list[str]) -> str:
-    """Without tokens, keys and passwords, which a word or a library's error may hold, and control characters."""
+    """Remove control characters, and tokens, keys and passwords, which words or a library's errors may contain."""
     from manip_il.store.errors import redact
 
     return printable(redact(text, words))
@@ -195,14 +195,14 @@ def _help() -> str:
 
 
 def _group_help(group: str) -> str:
-    rows = {name: COMMANDS[name].summary for name in _inside(group)}
+    rows = {name: COMMANDS[name].summary for name in _commands_of(group)}
     return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
-    """Help of one command: the options that people use first (`first`), or with `--help=all` every option.
+    """Return the help of one command: its most used options (`first`), or all with `--help=all`.
 
-    words: all that was given: `--policy.type=act` lists the options of that policy, too.
+    words: the command line: `--policy.type=act` also lists the options of that policy.
     """
     options = options_of(cls)
     first = () if "--help=all" in words else getattr(cls, "first", "").split()
@@ -210,9 +210,9 @@ def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
     places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
     rows = dict(_row(one) for one in options if not first or one.positional or one.name in first)
     rest = len(options) - len(rows)
-    rows["--config_path=FILE.yaml"] = "read options from YAML; those on the command line win"
+    rows["--config_path=FILE.yaml"] = "read options from YAML; the command line overrides them"
     if rest:
-        rows["--help=all"] = f"list the other {rest} options, too"
+        rows["--help=all"] = f"also list the other {rest} options"
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     more = ""
     if kind and any(one.is_open for one in options):
@@ -227,7 +227,7 @@ def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
 
 
 def _table(rows: Mapping[str, str]) -> str:
-    """Lines of help: a name, and what it means."""
+    """Return lines of help: a name and its meaning."""
     width = max(map(len, rows)) + 2
     return "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows.items())
 

@@ -1,9 +1,9 @@
-"""Options of commands: what a dataclass of options holds, which values a type accepts, and what help calls them.
+"""Options of commands: the fields of their dataclasses, the values that a type accepts, and their names in help.
 
 A field's type is int, float, bool, str, Path, a `Literal` of names, a list of those, one of those or None, a class with
-`parse` and `str` (`linear:5`), another dataclass (a group, `--dataset.root`), or `Open`: a group of which only another
-program knows the options (`--policy.*`), as a dict of whatever was given. `given(Config)` is a group of a class's own
-options, as a dict of those that were given: what makes the class, with what else it takes.
+`parse` and `str` (`linear:5`), another dataclass (a group, `--dataset.root`), or `Open`: a dict of a group whose
+options only another program knows (`--policy.*`). `given(Config)` is a dict of those options of `Config` that the user
+gave; the command makes a `Config` from them.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from typing import Any, Literal, Union
 
 from manip_il.checks import parse_yaml
 
-Open = dict[str, Any]  # option -> value as YAML reads it
+Open = dict[str, Any]  # option -> value as read by YAML
 Given = dict[str, Any]  # field -> value
 _EXPECTED = {int: "a whole number", float: "a number", bool: "true or false", Path: "a path", Any: "YAML"}
 _METAVARS = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH"}
 
 
 def group(default: Any, prefix: str | None = None) -> Any:
-    """Return a field of nested options. prefix: before their names, in place of the field's own name and a dot."""
+    """Return a field of nested options. prefix: of their names, by default the field's name and a dot."""
     metadata = {} if prefix is None else {"prefix": prefix}
     return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
 
 
 def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **own: Any) -> Any:
-    """Return a `Given` field: every option of `cls`, declared there.
+    """Return a `Given` field: the options that `cls` declares.
 
-    only: fields, if not all. own: values in place of the defaults of `cls`, which are held, too.
+    only: names of fields, by default all. own: defaults that replace those of `cls`, always in the dict.
     """
     metadata = {"given": cls, "only": only}
     names = {} if prefix is None else {"prefix": prefix}
@@ -46,12 +46,11 @@ def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **ow
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a command. `default` is `MISSING` if the user must give a value.
+    """One option of a command. default: `MISSING` if the user must give a value.
 
-    path: the attributes and keys that lead from the command's options to its value. metadata: of its field: `help`, one
-    line; `positional` for a value without a name; `command_line_only` for one that no file may set; `exists` for a path
-    to read: what it is on the Hub (`datasets/`); `flag`, its whole name; `at_least` and `at_most`. home: the class that
-    declares it.
+    path: attributes and keys from the command's options to its value. metadata: `help`, one line; `positional` for a
+    value without a name; `command_line_only` for an option that no file may set; `exists` for a path to read: its
+    prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`. home: the class that declares it.
     """
 
     name: str  # dotted: `dataset.root`
@@ -63,12 +62,12 @@ class Option:
 
     @property
     def positional(self) -> bool:
-        """Whether its value stands without a name."""
+        """Whether its value is given without a name."""
         return self.metadata.get("positional", False)
 
     @property
     def label(self) -> str:
-        """Name as the user writes it."""
+        """The name as the user writes it."""
         if self.positional:
             return f"{self.name.upper()}..." if self.is_list else self.name.upper()
         return f"--{self.name}.NAME" if self.is_open else f"--{self.name}"
@@ -80,18 +79,18 @@ class Option:
 
     @property
     def is_open(self) -> bool:
-        """Whether it stands for any number of options, of which only another program knows the names."""
+        """Whether it is a group of options whose names only another program knows."""
         return typing.get_origin(self.type) in (dict, Mapping)
 
     def value(self, options: Any) -> Any:
-        """Return its value in a command's options."""
+        """Return the option's value in a command's options."""
         for key in self.path:
             options = options.get(key, self.default) if isinstance(options, dict) else getattr(options, key)
         return {} if self.is_open and options in (None, MISSING) else options
 
 
 def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()) -> list[Option]:
-    """Return every option of a dataclass, groups resolved, those that classes share last. base: has the defaults."""
+    """Return all options of a dataclass, groups expanded, shared options last. base: instance with the defaults."""
     found: list[Option] = []
     for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
         inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
@@ -118,13 +117,13 @@ def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
 
 
 def declared(cls: type, one: dataclasses.Field[Any]) -> tuple[type, Any]:
-    """Return the class that declares a field, and the field's type; others' may be known to type checkers alone."""
+    """Return the class that declares a field, and the field's type."""
     home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
     return home, eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
 
 
 def to_plain(options: Any) -> dict[str, Any]:
-    """Return a command's options as a tree of dicts, lists, text, numbers, booleans and None, by their names."""
+    """Return a command's options as a tree of plain YAML values, keyed by option names."""
     tree: dict[str, Any] = {}
     for one in options_of(type(options)):
         if not one.metadata.get("command_line_only"):
@@ -143,7 +142,7 @@ def _plain(value: Any) -> Any:
 
 
 def command_line(name: str, options: Any) -> str:
-    """Return the command with every option that is not its default, to copy."""
+    """Return the command line, with every option that differs from its default, to copy."""
     words = ["manip-il", *name.split()]
     for one in options_of(type(options)):
         value = one.value(options)
@@ -158,7 +157,7 @@ def command_line(name: str, options: Any) -> str:
 
 
 def word(value: Any) -> str:
-    """Return a value as it stands on the command line."""
+    """Return a value as written on the command line."""
     plain = _plain(value)
     if isinstance(plain, list):
         return ",".join(map(str, plain))
@@ -166,7 +165,7 @@ def word(value: Any) -> str:
 
 
 def metavar(option_type: Any) -> str:
-    """Return what stands for the value in the help: `INT`, `PATH`, `mse|l1`, `FLOAT,...`."""
+    """Return the placeholder of a value in help: `INT`, `PATH`, `mse|l1`, `FLOAT,...`."""
     option_type = without_none(option_type)
     if typing.get_origin(option_type) is list:
         return f"{metavar(typing.get_args(option_type)[0])},..."
@@ -174,7 +173,7 @@ def metavar(option_type: Any) -> str:
 
 
 def expected(option_type: Any) -> str:
-    """Return what an error message asks for."""
+    """Return the expected value, for an error message."""
     if (some := without_none(option_type)) is not option_type:
         return f"{expected(some)} or null"
     if typing.get_origin(option_type) is list:
@@ -184,7 +183,7 @@ def expected(option_type: Any) -> str:
 
 
 def from_word(option_type: Any, word: str) -> Any:
-    """Return a word of the command line as YAML would give it: `null`, and commas of a list, have a meaning."""
+    """Return a word of the command line as YAML would read it, with `null` and comma-separated lists."""
     if (some := without_none(option_type)) is not option_type:
         return None if word.lower() in ("null", "none") else from_word(some, word)
     if typing.get_origin(option_type) is not list:
@@ -194,11 +193,11 @@ def from_word(option_type: Any, word: str) -> Any:
 
 
 def decode(option_type: Any, value: Any) -> Any:
-    """Return `value`, as YAML gives it or as text, as the declared type; raises one of several errors if it is none.
+    """Return `value`, read by YAML or text, as the declared type; raises one of several errors if it is invalid.
 
-    Draccus takes a boolean for a number or text, NaN for a number and nothing for the current folder, which is refused.
+    Unlike draccus, refuses a boolean as a number or text, NaN as a number, and "" as a path (the current folder).
     """
-    import draccus  # here, as help needs no YAML
+    import draccus  # imported here because help needs no YAML
 
     some = without_none(option_type)
     if option_type is Any:
@@ -214,7 +213,7 @@ def decode(option_type: Any, value: Any) -> Any:
 
 
 def _expand(value: Any) -> Any:
-    return value.expanduser() if isinstance(value, Path) else value  # a shell leaves the tilde of `--root=~/x` alone
+    return value.expanduser() if isinstance(value, Path) else value  # shells do not expand the tilde in `--root=~/x`
 
 
 def without_none(option_type: Any) -> Any:
@@ -225,6 +224,6 @@ def without_none(option_type: Any) -> Any:
 
 
 def choices(option_type: Any) -> tuple[str, ...]:
-    """Return the names of a `Literal`, also of one or None; none for any other type."""
+    """Return the names of a `Literal` or `Literal | None`; () for any other type."""
     option_type = without_none(option_type)
     return typing.get_args(option_type) if typing.get_origin(option_type) is Literal else ()

@@ -1,4 +1,4 @@
-"""Output folders: what a command may begin to write to, what it may replace, and the options that are kept there."""
+"""Output folders: which ones a command may write to or replace, and the options stored in them."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from manip_il.errors import FolderExistsError, MismatchError, UsageError
 from manip_il.option import option
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
-# Files by which a folder of ours is known. Any LeRobot dataset has meta/info.json; only ours has both actions.
+# Files that identify a folder of ours. Any LeRobot dataset has meta/info.json; only ours has both actions.
 _MARKS = {CONFIG_FILE: CONFIG_HEADER, "meta/info.json": '"executed_action"', "eval.json": '"fingerprint"'}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replacing:
-    """Options of writing to a place where something may be."""
+    """Options of a command that can replace its output."""
 
-    overwrite: bool = option(False, "replace what is there", free=True)
+    overwrite: bool = option(False, "replace existing output", free=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resumable(Replacing):
-    """Options of what can be continued."""
+    """Options of a command that can be resumed."""
 
-    resume: bool = option(False, "continue what was interrupted", free=True)
+    resume: bool = option(False, "continue an interrupted run", free=True)
 
 
 @dataclass(frozen=True)
 class Output(Replacing):
-    """Folder that a command writes to."""
+    """The output folder of a command."""
 
-    output_dir: Path = option(MISSING, "folder of what is written", free=True)
+    output_dir: Path = option(MISSING, "output folder", free=True)
 
     @contextmanager
     def open(self, options: Any) -> Generator[Path]:
-        """Hold and prepare the folder, with the command's options in `config.yaml`; a resumed run must have the same.
+        """Lock and prepare the folder, and write the options to `config.yaml`; a resumed run must have the same ones.
 
         Raises what `prepare_output` and `check_same_options` raise.
         """
@@ -57,56 +57,56 @@ class Output(Replacing):
 
 @dataclass(frozen=True)
 class ResumableOutput(Output, Resumable):
-    """Folder of a command that can be continued."""
+    """The output folder of a command that can be resumed."""
 
 
 @dataclass(frozen=True)
 class OutputFile(Replacing):
-    """File that a command writes."""
+    """The output file of a command."""
 
-    output: Path = option(MISSING, "the file")
+    output: Path = option(MISSING, "output file")
 
     def check(self) -> None:
-        """Raise `UsageError` if something is there that may not be replaced."""
+        """Raise `UsageError` if the file exists and may not be replaced."""
         if self.output.is_dir() or (self.output.exists() and not self.overwrite):
-            raise UsageError(f"{self.output} exists already; choose another --output, or give --overwrite=true")
+            raise UsageError(f"{self.output} already exists; choose another --output, or give --overwrite=true")
 
 
 def prepare_output(
     folder: Path, *, resume: bool = False, overwrite: bool = False, sources: Sequence[Path] = ()
 ) -> None:
-    """Make sure that `folder` may be written to; on return it is absent or empty, unless `resume`.
+    """Prepare `folder` for writing: on return it is absent or empty, unless `resume`.
 
-    sources: what is read, which is not replaced. Raises what `require_replaceable` raises.
+    sources: input paths, which must not be replaced. Raises what `require_replaceable` raises.
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
     if resume:
-        for left in folder.rglob(f".*{PARTIAL}"):  # what a killed writer left of a file; folders have locks
+        for left in folder.rglob(f".*{PARTIAL}"):  # partial files of a killed writer; folders have locks
             if left.is_file():
                 left.unlink()
     elif folder.exists() and any(folder.iterdir()):
         require_replaceable(folder, overwrite, sources)
-        for path in folder.iterdir():  # not the folder: it may be a mount
+        for path in folder.iterdir():  # keep the folder itself, which may be a mount point
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] = ()) -> None:
-    """Raise `UsageError` if `folder` may not be replaced: without `overwrite`, or if this program did not make it."""
+    """Raise `UsageError` unless `overwrite` is set and `folder` is this program's output."""
     if not overwrite:
         raise FolderExistsError(folder)
     if source := next((one for one in sources if one.resolve().is_relative_to(folder.resolve())), None):
-        raise UsageError(f"{folder} overlaps {source}; expected a folder of its own")
+        raise UsageError(f"{folder} overlaps {source}; expected a separate folder")
     real = folder.resolve()
     if folder.is_symlink():
-        raise UsageError(f"{folder} is a link to {real}; --overwrite=true follows no links, name the folder itself")
+        raise UsageError(f"{folder} is a link to {real}; --overwrite=true follows no links, give the folder itself")
     if any(kept.resolve().is_relative_to(real) for kept in (Path.home(), Path.cwd())) or any(real.rglob(".git")):
         raise UsageError(f"{folder} holds your home or current folder, or a git checkout; it will not be deleted")
     files = {folder / name: mark.encode() for name, mark in _MARKS.items() if (folder / name).is_file()}
     if not any(mark in path.read_bytes() for path, mark in files.items()):
         raise UsageError(
-            f"{folder} holds something that manip-il did not make (no config.yaml, meta/info.json or eval.json of its "
-            "own); choose another folder, or delete it by hand"
+            f"{folder} holds files that manip-il did not make (it has no config.yaml, meta/info.json or eval.json of "
+            "ours); choose another folder, or delete it by hand"
         )
 
 
@@ -116,13 +116,13 @@ def save_options(folder: Path, options: Any) -> None:
 
 
 def check_same_options(folder: Path, options: Any) -> None:
-    """Raise `MismatchError` naming the option unless the run in `folder` was started with the same options.
+    """Raise `MismatchError` naming the option, unless the run in `folder` was started with the same options.
 
-    Options with `free` in their metadata may differ, with `grows` be larger than they were. A folder that is not there
-    or empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
+    Options with `free` in their metadata may differ, those with `grows` may increase. A missing or empty folder is
+    accepted; one without `config.yaml` is not ours (`UsageError`).
     """
     path = folder / CONFIG_FILE
-    # A run that was killed at once leaves at most half a file, under a hidden name.
+    # A run that was killed at the start leaves at most a partial file with a hidden name.
     if not folder.is_dir() or all(path.name.startswith(".") for path in folder.iterdir()):
         return
     before = from_yaml(path, type(options))

@@ -1,7 +1,7 @@
-"""Options from the command line (`--a.b=c`) and from YAML, in LeRobot's style; words beat YAML beats defaults.
+"""Options from the command line (`--a.b=c`) and YAML, in LeRobot's style; the command line overrides YAML.
 
-Draccus reads the values (see `options.decode`). What is around them is our own, as its parser exits through argparse,
-turns a range error of a nested dataclass into a decoding error, and knows no open groups.
+Draccus decodes the values (see `options.decode`). Its parser is not used because it exits through argparse, turns a
+range error of a nested dataclass into a decoding error, and has no open groups.
 """
 
 from __future__ import annotations
@@ -32,67 +32,67 @@ from manip_il.evaluation.policy_folder import hub_hint
 from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
-CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
-# What has taken an option's place; files may still hold it empty.
+CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
+# Removed option -> its replacement; old files may still have it, if it is empty.
 MOVED = {
     "task.reward": "--task.type=carry:REWARD",
     "within": "read off the page's curves",
     "expert": "measured by manip-il eval --policy.type=expert",
 }
-_FEW = 3
+_MOST_OFFERED = 3  # names that an error suggests
 type Known = Mapping[str, Option]
 
 
-class _Said(NamedTuple):
-    """A value as the user gave it, and its origin, for the error message: `--NAME`, or which file's key."""
+class _RawValue(NamedTuple):
+    """A value as the user gave it. origin: `--NAME`, or the file and key, for error messages."""
 
     value: Any
     origin: str
 
 
 def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
-    """Read options from the command line; `UsageError` for an unknown name, a bad or a missing value.
+    """Read options from the command line; `UsageError` for an unknown name, or an invalid or missing value.
 
-    command: whose options they are, for the message.
+    command: its name, for error messages.
     """
     known = _known(cls)
-    said, paths = _read_words(words, known, command)
+    raw, paths = _read_words(words, known, command)
     trees = [(str(path), read_yaml(path, "a YAML file of options")) for path in map(Path, paths)]
-    return from_layers(cls, trees, said)
+    return from_layers(cls, trees, raw)
 
 
 def from_yaml[T](path: Path, cls: type[T]) -> T:
-    """Read options from a YAML file of differences, or from one that `dump_yaml` wrote."""
+    """Read options from a YAML file, with defaults for the others."""
     return from_layers(cls, [(str(path), read_yaml(path, "a YAML file of options"))])
 
 
-def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Said] | None = None) -> T:
-    """Read options from trees of differences, as YAML gives them; a later tree wins, and words of the command line.
+def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _RawValue] | None = None) -> T:
+    """Read options from trees that YAML gave; later trees override earlier ones, and `words` override all.
 
-    layers: the origin of a tree, for error messages, and the tree. `UsageError` as from a YAML file.
+    layers: pairs of a tree's origin, for error messages, and the tree. Raises `UsageError` as `parse` does.
     """
-    known, said = _known(cls), dict[str, _Said]()
+    known, raw = _known(cls), dict[str, _RawValue]()
     for origin, tree in layers:
-        said |= _read_tree(tree, known, origin)
-    said |= words or {}
+        raw |= _read_tree(tree, known, origin)
+    raw |= words or {}
     values: dict[tuple[str, ...], Any] = {}
     for option in known.values():
         if option.is_open:
-            inside = {name: one for name, one in said.items() if name.startswith(f"{option.name}.")}
+            inside = {name: one for name, one in raw.items() if name.startswith(f"{option.name}.")}
             for name, one in inside.items():
                 held = values.setdefault(option.path, dict(option.default))
-                held[name.removeprefix(f"{option.name}.")] = _decode_said(option, one)
-        elif option.name in said:
-            one = said[option.name]
-            if one.value is not None or without_none(option.type) is not option.type:  # else it was not given
-                values[option.path] = _decode_said(option, one)
+                held[name.removeprefix(f"{option.name}.")] = _decode_raw(option, one)
+        elif option.name in raw:
+            one = raw[option.name]
+            if one.value is not None or without_none(option.type) is not option.type:  # else null: the default is used
+                values[option.path] = _decode_raw(option, one)
         elif option.default is MISSING:
             raise UsageError(f"{option.label} is missing; expected {expected(option.type)}")
     return _build(cls, values)
 
 
 def check_paths(options: Any) -> None:
-    """Raise `UsageError` for a path that is to be read, if nothing is there."""
+    """Raise `UsageError` if a path to read does not exist."""
     for one in options_of(type(options)):
         value = one.value(options) if "exists" in one.metadata else None
         for path in value if isinstance(value, list) else [value]:
@@ -103,7 +103,7 @@ def check_paths(options: Any) -> None:
 
 
 def dump_yaml(options: Any) -> str:
-    """Return the resolved options as YAML: `from_yaml` gives them back equal."""
+    """Return the resolved options as YAML, which `from_yaml` reads back."""
     import yaml
 
     header = f"{CONFIG_HEADER} {__version__}: resolved options ({type(options).__name__})\n"
@@ -114,27 +114,27 @@ def _known(cls: type) -> Known:
     return {option.name: option for option in options_of(cls)}
 
 
-def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[str, _Said], list[str]]:
-    """Return what was said of each option, and the YAML files that are to be read."""
-    said: dict[str, _Said] = {}
+def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[str, _RawValue], list[str]]:
+    """Return each option's value as given, and the YAML files to read."""
+    raw: dict[str, _RawValue] = {}
     config_paths: list[str] = []
     places = [option for option in known.values() if option.positional]
     rest = list(words)
     while rest:
         word = rest.pop(0)
-        if word == "--" and places and places[-1].is_list:  # what follows belongs to another program
-            said[places[-1].name] = _Said(rest, places[-1].label)
+        if word == "--" and places and places[-1].is_list:  # the rest is another program's command line
+            raw[places[-1].name] = _RawValue(rest, places[-1].label)
             break
         if not word.startswith("--"):
             if not places or word.startswith("-"):
-                wanted = f"options are written --name=value, manip-il {command} --help=all lists all"
+                wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
                 raise UsageError(f"unexpected {shorten(word)}; {wanted}")
             option = places[0] if places[0].is_list else places.pop(0)
-            before = said[option.name].value if option.is_list and option.name in said else []
-            said[option.name] = _Said([*before, word] if option.is_list else word, option.label)
+            before = raw[option.name].value if option.is_list and option.name in raw else []
+            raw[option.name] = _RawValue([*before, word] if option.is_list else word, option.label)
             continue
         name, equals, value = word[2:].partition("=")
-        if (ours := name.replace("-", "_")) in known:  # as other programs write it
+        if (ours := name.replace("-", "_")) in known:  # accept --output-dir
             name = ours
         kind = Path if name == CONFIG_PATH else _type_of(name, known, command)
         if not equals and kind is bool and (not rest or rest[0] not in ("true", "false")):
@@ -146,12 +146,12 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
         if name == CONFIG_PATH:
             config_paths.append(value)
         else:
-            said[name] = _Said(from_word(kind, value), f"--{name}")
-    return said, config_paths
+            raw[name] = _RawValue(from_word(kind, value), f"--{name}")
+    return raw, config_paths
 
 
 def _type_of(name: str, known: Known, command: str) -> Any:
-    """Return the type of an option that is given by its name, `Any` of one in an open group."""
+    """Return the type of a named option, `Any` for an option of an open group."""
     if _is_inside(name, known):
         return Any
     if name not in known or known[name].positional or known[name].is_open:
@@ -164,33 +164,33 @@ def _is_inside(name: str, known: Known) -> bool:
     return name not in known and any(one.is_open and name.startswith(f"{one.name}.") for one in known.values())
 
 
-def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _Said]:
-    """Return what a tree of options says of each."""
+def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _RawValue]:
+    """Return each option's value in a tree."""
     if not isinstance(tree, dict | None):
         where = f"{origin}: {prefix[:-1]}" if prefix else origin
         raise UsageError(f"{where}: expected a mapping of options, got {shorten(tree)}")
-    said: dict[str, _Said] = {}
+    raw: dict[str, _RawValue] = {}
     for key, value in typing.cast(dict[Any, Any], tree or {}).items():
         name = f"{prefix}{key}"
         if (name in known and not known[name].is_open) or _is_inside(name, known):
-            said[name] = _Said(value, f"{origin}: {name}")
+            raw[name] = _RawValue(value, f"{origin}: {name}")
             if value is not None and name in known and known[name].metadata.get("command_line_only"):
-                raise UsageError(f"{origin}: {name}: this can only be set on the command line; give --{name}=...")
+                raise UsageError(f"{origin}: {name} can only be set on the command line; give --{name}=...")
         elif any(option == name or option.startswith(f"{name}.") for option in known):
-            said |= _read_tree(value, known, origin, f"{name}.")
+            raw |= _read_tree(value, known, origin, f"{name}.")
         elif name not in MOVED or value:
             raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
-    return said
+    return raw
 
 
 def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, path: tuple[str, ...] = ()) -> Any:
-    """Return an instance of `cls` of the values by their paths, else of `base`'s, else of the defaults."""
+    """Return an instance of `cls`. values: by path; others are those of `base`, else the defaults."""
     arguments: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
         here, (_, kind), default = (*path, field.name), declared(cls, field), default_of(field, base)
         if "given" in field.metadata:
-            said = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
-            arguments[field.name] = default | said
+            raw = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
+            arguments[field.name] = default | raw
         elif dataclasses.is_dataclass(kind):
             arguments[field.name] = _build(kind, values, None if default is MISSING else default, here)
         else:
@@ -198,27 +198,27 @@ def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, pa
     return cls(**arguments)
 
 
-def _decode_said(option: Option, said: _Said) -> Any:
-    kind, is_word = Any if option.is_open else option.type, said.origin.startswith("--")
+def _decode_raw(option: Option, raw: _RawValue) -> Any:
+    kind, is_word = Any if option.is_open else option.type, raw.origin.startswith("--")
     if option.is_open and not is_word:
-        return said.value
+        return raw.value
     try:
-        value = decode(kind, said.value)
+        value = decode(kind, raw.value)
     except ManipError:  # of a class that parses itself
         raise
-    except Exception:  # draccus raises bare ones, too
-        hint = nearest(said.value, choices(kind)) if isinstance(said.value, str) else ""
+    except Exception:  # draccus also raises plain Exception
+        hint = nearest(raw.value, choices(kind)) if isinstance(raw.value, str) else ""
         quotes = "; YAML needs quotes around text like this" if kind is str and not is_word else ""
-        text = f"{said.origin}: expected {expected(kind)}, got {shorten(said.value)}{hint}{quotes}"
+        text = f"{raw.origin}: expected {expected(kind)}, got {shorten(raw.value)}{hint}{quotes}"
         raise UsageError(text) from None
-    check_bound(said.origin, value, option.metadata)
+    check_bound(raw.origin, value, option.metadata)
     return value
 
 
 def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
-    """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
+    """Return the error for an unknown option or key, with the nearest names and the command that lists all.
 
-    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or which file's key. dashes: before the names.
+    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or the file's key. dashes: prefix of the names.
     """
     if name in MOVED:
         return UsageError(f"{dashes}{name} is now {MOVED[name]}")
@@ -228,5 +228,5 @@ def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: st
     leaf, leaves = name.rpartition(".")[2], {one.rpartition(".")[2] for one in named}
     like = [leaf] if leaf in leaves else nearest_names(leaf, sorted(leaves))
     near = [*(one for last in like for one in named if one.rpartition(".")[2] == last), *nearest_names(name, named)]
-    offered = did_you_mean([dashes + one for one in list(dict.fromkeys(near))[:_FEW]])
+    offered = did_you_mean([dashes + one for one in list(dict.fromkeys(near))[:_MOST_OFFERED]])
     return UsageError(f"unknown {kind} {shorten(dashes + name)}{offered}; manip-il {command} --help=all lists all")

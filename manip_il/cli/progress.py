@@ -1,4 +1,4 @@
-"""Output of commands: lines, warnings, and progress (a bar on a terminal, else a line every few seconds)."""
+"""Output of commands: lines, warnings, and progress (a bar on a terminal, else a line every 5 seconds)."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
     from manip_il.mdp import Episode
 
 INTERVAL = 5.0  # [s] between plain lines
-_STOPPING = b"\nstopping after the step in hand (Ctrl-C again to stop at once)\n"
+_STOPPING = b"\nstopping after the current step (press Ctrl-C again to stop at once)\n"
 
 _quiet = False
 
 
 def set_quiet(quiet: bool) -> None:
-    """Switch progress off (or on again) for this process; `say` is not affected."""
+    """Switch progress off or on for this process; `say` is not affected."""
     global _quiet
     _quiet = quiet
 
 
 def has_bars() -> bool:
-    """Return whether bars may be shown: on a terminal, unless progress is switched off."""
+    """Return whether to show bars: on a terminal, unless progress is switched off."""
     return sys.stderr.isatty() and not _quiet
 
 
 def say(*lines: str) -> None:
-    """Print lines of normal output, on standard output."""
+    """Print lines on standard output."""
     for line in lines:
         print(printable(line), flush=True)
 
@@ -48,11 +48,11 @@ def warn(*lines: str) -> None:
 
 
 class Stages:
-    """Progress of work in stages of so many steps; use as a context manager.
+    """Progress of work in stages, each a number of steps; use as a context manager.
 
-    A bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing if progress is switched off. The
-    first Ctrl-C or SIGTERM stops the work after the step in hand, the second at once. kept: what is safe on disk and
-    can be resumed, for the message to the user, also if the work fails.
+    Shows a bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing if progress is switched
+    off. The first Ctrl-C or SIGTERM stops the work after the current step, the second at once. kept: what is saved and
+    can be resumed, for the message if the work is interrupted or fails.
     """
 
     def __init__(self, kept: str = ""):
@@ -73,17 +73,17 @@ class Stages:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         if self.kept and isinstance(error, ManipError | KeyboardInterrupt) and not isinstance(error, UsageError):
-            said = f"{error}; " if error.args else ""
-            error.args = (f"{said}kept: {self.kept}; continue with --resume=true",)
+            prefix = f"{error}; " if error.args else ""
+            error.args = (f"{prefix}kept: {self.kept}; continue with --resume=true",)
 
     def _stop(self, *_: object) -> None:
         if self._stopping:
             raise KeyboardInterrupt
         self._stopping = True
-        os.write(2, _STOPPING)  # print() may not be entered twice, and a signal can come inside one
+        os.write(2, _STOPPING)  # print() is not reentrant, and a signal can interrupt one
 
     def start(self, description: str, total: int | None) -> None:
-        """Close the bar of the stage before and open one of `total` episodes or steps, None if that is unknown."""
+        """Close the previous stage's bar and open a new one. total: number of steps, None if unknown."""
         from rich import progress
         from rich.console import Console
 
@@ -96,7 +96,7 @@ class Stages:
             progress.TimeRemainingColumn(),
             progress.TextColumn("{task.fields[details]}", markup=False),
         )
-        # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
+        # Redirection would send output to standard error with the bar, and `manip-il ... > file` would lose it.
         redirect, hidden = sys.stdout.isatty(), total == 0 or not has_bars()
         self._bar = progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=redirect, disable=hidden)
         self._bar.add_task(description, total=total, details="")
@@ -125,7 +125,7 @@ class Stages:
             print(f"{task.description}: {count} ({details})", file=sys.stderr, flush=True)
 
     def step(self, n: int = 1, **fields: object) -> None:
-        """Count `n` steps that are done; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
+        """Count `n` finished steps; `fields` (loss=0.12, success=0.9) update the displayed ones."""
         if self._bar is not None:
             self._fields |= fields
             texts = {name: f"{one:.4g}" if isinstance(one, float) else one for name, one in self._fields.items()}
@@ -135,16 +135,16 @@ class Stages:
         self.check()
 
     def episode(self, episode: Episode | EpisodeResult) -> None:
-        """Count an episode that has ended."""
+        """Count a finished episode."""
         self._solved += episode.success
         self.step(success=self._solved / (self._done + 1))
 
     def reach(self, step: int, **fields: object) -> None:
-        """Show that a stage has reached a step, and what `fields` say of it."""
+        """Show that a stage has reached a step, with `fields`."""
         self.step(step - self._done, **fields)
 
     def log(self, record: dict[str, Any]) -> None:
-        """Show a fit's metrics at a step; {} if there are none."""
+        """Show a fit's metrics at a step. record: {} if there are none."""
         if record:
             self.reach(record["step"], loss=record["loss"])
         self.check()
@@ -155,7 +155,7 @@ class Stages:
             raise KeyboardInterrupt
 
     def watch(self) -> Watch:
-        """Return the callbacks that a run of an algorithm reports to."""
+        """Return the callbacks for a run of an algorithm."""
         from manip_il.algorithms.results import Watch
 
         def start(stage: str, round_: int, total: int) -> None:
@@ -166,7 +166,7 @@ class Stages:
 
 @contextmanager
 def progress(total: int | None, description: str) -> Generator[Stages]:
-    """Yield the progress of work of one stage, see `Stages.start`."""
+    """Yield the progress of a single stage, see `Stages.start`."""
     with Stages() as stages:
         stages.start(description, total)
         yield stages

@@ -19,16 +19,16 @@ from manip_il.tasks.config import EnvConfig
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
 
-HOLD = 10  # control steps that a demonstration goes on for after success
+HOLD = 10  # control steps that a demonstration continues after success
 
 
 @dataclass(frozen=True)
 class DatasetGroup:
-    """`--dataset.*` of what is recorded."""
+    """`--dataset.*`: the recorded dataset."""
 
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default local/ROBOT_TASK", free=True)
     root: Path | None = option(None, "folder of the dataset; by default datasets/NAME", free=True)
-    num_episodes: int = option(50, "successful episodes", at_least=1, grows=True)
+    num_episodes: int = option(50, "number of successful episodes", at_least=1, grows=True)
     rgb_encoder: Given = given(VideoConfig)
 
 
@@ -36,8 +36,8 @@ class DatasetGroup:
 class RecordOptions(Varied, Seeded, Resumable):
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
-    Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded. With
-    --resume=true it goes on, also to more episodes.
+    Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
+    --resume=true continues a recording, also to more episodes.
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
@@ -47,7 +47,7 @@ class RecordOptions(Varied, Seeded, Resumable):
     engine: EngineOptions = group(EngineOptions(), prefix="")
 
     def run(self) -> None:
-        """Record; the dataset is written as the episodes come."""
+        """Record; the dataset is written while episodes arrive."""
         from manip_il.collect.environments import env_spec
         from manip_il.collect.job import RolloutJob
         from manip_il.data.video import try_encoder
@@ -58,7 +58,7 @@ class RecordOptions(Varied, Seeded, Resumable):
         job = RolloutJob(env, hold=HOLD, cameras=cameras, conditions=varied(self.vary, env, sees=cameras is not None))
         if cameras:
             try_encoder(VideoConfig(**self.dataset.rgb_encoder), cameras.size, env.control_hz)
-        env_spec(env, cameras)  # refuses what no scene can be made of, before anything is written
+        env_spec(env, cameras)  # raises, before anything is written, if no scene can be made
         repo_id = checks.repo_id("repo_id", self.dataset.repo_id or f"local/{env.name}")
         root = self.dataset.root or Path("datasets") / repo_id.rpartition("/")[2]
         journals = root.with_name(f"{root.name}.journals")
@@ -90,4 +90,4 @@ class RecordOptions(Varied, Seeded, Resumable):
         say(
             f"recorded {info.episodes:,} successful episodes, {info.frames:,} frames; demonstrations left out: {failed}"
         )
-        say(f"dataset: {root} (its episodes one by one, to open in Foxglove: {journals})")
+        say(f"dataset: {root} (single episodes, to open in Foxglove: {journals})")

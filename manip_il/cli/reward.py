@@ -1,4 +1,4 @@
-"""`manip-il reward irl|pairs|ask|answer|fit`: rewards from demonstrations and from preferences."""
+"""`manip-il reward irl|pairs|ask|answer|fit`: rewards from demonstrations and preferences."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from manip_il.option import Seeded, option
 
 @dataclass(frozen=True)
 class OfPairs:
-    """Command on pairs of clips."""
+    """Options of a command on pairs of clips."""
 
     pairs: Path = option(MISSING, "pairs.json of manip-il reward pairs", positional=True, exists="")
 
 
 @dataclass(frozen=True)
 class IrlOptions(OfDataset, Seeded):
-    """Learn what the demonstrations of a dataset of carry care about: the weights of a reward.
+    """Learn the weights of a reward from a dataset of demonstrations of the task carry.
 
-    Writes reward.json, which --task.type=carry:FILE takes, and report.html: the weights, and the cost over the table.
+    Writes reward.json, for --task.type=carry:FILE, and report.html: the weights and the cost over the table.
     """
 
     example: ClassVar[str] = "manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl"
-    method: Literal["max_margin", "bayesian", "max_entropy"] = option("max_entropy", "how the weights are found")
+    method: Literal["max_margin", "bayesian", "max_entropy"] = option("max_entropy", "algorithm")
     output: Output = group(Output(Path("runs/irl")), prefix="")
 
     def run(self) -> None:
-        """Read, learn, write the reward and the page, print the weights."""
+        """Read, learn, write the reward and the report, print the weights."""
         from manip_il.algorithms import inverse
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
@@ -59,17 +59,17 @@ class IrlOptions(OfDataset, Seeded):
 
 @dataclass(frozen=True)
 class PairsOptions(Seeded):
-    """Choose pairs of clips of one task's datasets, to be compared by people (ask) or simulated teachers (answer).
+    """Choose pairs of clips from datasets of one task, for comparison by people (ask) or simulated teachers (answer).
 
-    A SOURCE is a dataset or a run: each round's dataset of a DAgger run is a source. Every source is in as many pairs
-    as any other. Clips are whole: episodes that are shorter than --clip are left out.
+    A SOURCE is a dataset or a run; each round of a DAgger run is one source. All sources are in equally many pairs.
+    Episodes shorter than --clip are left out.
     """
 
     example: ClassVar[str] = "manip-il reward pairs runs/dagger --count=200 --output=pairs.json"
-    sources: list[Path] = option(MISSING, "LeRobot datasets with our columns, or runs", positional=True)
+    sources: list[Path] = option(MISSING, "manip-il datasets, or runs", positional=True)
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
-    reward: Path | None = option(None, "choose those about which this reward's networks disagree most", exists="")
+    reward: Path | None = option(None, "choose pairs on which this reward's networks disagree most", exists="")
     file: OutputFile = group(OutputFile(Path("pairs.json")), prefix="")
 
     def run(self) -> None:
@@ -86,22 +86,22 @@ class PairsOptions(Seeded):
         clips = choose_pairs(find_datasets(self.sources), self.clip, self.count, self.seed, rng, reward)
         write_json(self.file.output, clips.pairs.to_json())
         if clips.too_short:
-            warn(f"{clips.too_short:,} episodes are shorter than {self.clip} control steps: no clip is from them")
+            warn(f"{clips.too_short:,} episodes are shorter than {self.clip} control steps and are left out")
         say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {self.file.output}")
         say(f"next: manip-il reward ask {self.file.output} --output=ask.html")
 
 
 @dataclass(frozen=True)
 class AskOptions(OfPairs):
-    """Write one page that shows the pairs as films and asks which is better: offline, on a phone too.
+    """Write a page that shows the pairs as films and asks which is better; it works offline and on a phone.
 
-    Keys: left and right arrow, down for equal, S to skip, U to undo. The answers stay in the browser until they are
-    saved as preferences.json.
+    Keys: left and right arrow, down for equal, S to skip, U to undo. The browser keeps the answers until they are saved
+    as preferences.json.
     """
 
     example: ClassVar[str] = "manip-il reward ask pairs.json --output=ask.html"
     file: OutputFile = group(OutputFile(Path("ask.html")), prefix="")
-    robot: Path | None = option(None, "the YAML of the sources' robot, if that does not ship")
+    robot: Path | None = option(None, "YAML file of the sources' robot, if it is your own")
 
     def run(self) -> None:
         """Render the films and write the page."""
@@ -121,10 +121,10 @@ class AskOptions(OfPairs):
 
 @dataclass(frozen=True)
 class AnswerOptions(OfPairs, Seeded):
-    """Answer pairs by a simulated teacher, who compares the clips' true progress (B-Pref, Lee et al. 2021).
+    """Let a simulated teacher answer pairs by the clips' true progress (B-Pref, Lee et al. 2021).
 
-    perfect; boltzmann:TEMPERATURE, who is less sure where returns are near; mistaken:EPSILON, the wrong way round in a
-    share of the pairs. A clip's return is the sum of progress over its steps.
+    Teachers: perfect; boltzmann:TEMPERATURE, less certain if returns are close; mistaken:EPSILON, wrong on that share
+    of the pairs. A clip's return is the sum of progress over its steps.
     """
 
     example: ClassVar[str] = "manip-il reward answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
@@ -152,16 +152,16 @@ class AnswerOptions(OfPairs, Seeded):
 
 @dataclass(frozen=True)
 class FitOptions(OfPairs, Seeded):
-    """Learn a reward of state and action from answers about pairs (Bradley-Terry): an ensemble of small networks.
+    """Fit a reward of state and action to answers about pairs (Bradley-Terry), as an ensemble of small networks.
 
-    Every pair is held out by one network; agreement on those is in fit.json. ANSWERS are files of ask or answer, of one
-    person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
+    Every pair is held out from one network; fit.json holds the agreement on these. ANSWERS are files of ask or answer,
+    by one person or several, about PAIRS or --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
     """
 
     example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
     answers: list[Path] = option(MISSING, "preferences.json of ask or answer", positional=True, exists="")
-    more_pairs: list[Path] = option(list, "further files of pairs of the same task and length of clip", exists="")
-    members: int = option(8, "networks of the ensemble, and folds of the pairs", at_least=3, at_most=64)
+    more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length", exists="")
+    members: int = option(8, "networks in the ensemble, and folds of the pairs", at_least=3, at_most=64)
     output: Output = group(Output(Path("runs/reward")), prefix="")
 
     def run(self) -> None:
@@ -190,5 +190,5 @@ class FitOptions(OfPairs, Seeded):
             write_json(folder / "fit.json", found.to_json())
         say(*summary_lines(found, answers))
         if answers.contradictory:
-            warn(f"{answers.contradictory:,} pairs are answered left and right: both answers count")
+            warn(f"{answers.contradictory:,} pairs have contradictory answers; both count")
         say(f"next: manip-il data score DATASET --reward={folder} --output_dir=runs/scores")

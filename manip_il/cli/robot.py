@@ -1,4 +1,4 @@
-"""`manip-il robot new`, `check`, `certify`: a YAML for an arm of one's own, and what that arm and its expert can do."""
+"""`manip-il robot new`, `check`, `certify`: a YAML file for your own arm, and what the arm and its expert can do."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ PAGE = "check.html"
 
 @dataclass(frozen=True)
 class RobotNewOptions(Replacing):
-    """Write a first YAML for an arm's MJCF: hand, fingers and workspace as they look on the model.
+    """Write a first YAML file for an arm's MJCF, with hand, fingers and workspace as suggested by the model.
 
-    Every line says what it means. What it leaves out (joints, home, gains, the hand's frame) is found on the model, and
-    can be said in it. Then checks the robot, as `robot check --episodes=0` does, and says what to change. Exits with 1
-    if it can do no task yet.
+    A comment explains every line. Omitted values (joints, home, gains, the hand's frame) are taken from the model, and
+    can be added. Then checks the robot, like `robot check --episodes=0`, and prints what to change. The exit code is 1
+    if the robot cannot do any task yet.
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"
     model: Path = option(MISSING, "the arm's MJCF", positional=True, exists="")
-    gripper: Path | None = option(None, "the gripper's MJCF, if that is another file", exists="")
-    output: Path | None = option(None, "the YAML; by default beside the model, with its name")
+    gripper: Path | None = option(None, "the gripper's MJCF, if it is a separate file", exists="")
+    output: Path | None = option(None, "the YAML file; by default next to the model, with its name")
 
     def run(self) -> None:
-        """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
+        """Write the YAML file, check the robot, print what is left to do. Raises `ManipError` if it can do no task."""
         from manip_il.collect.workers import Engine
         from manip_il.data.atomic import write_file
         from manip_il.evaluation.robot_check import advice, check_robot, verdict
         from manip_il.robots.suggest import suggest, yaml_of
 
         target = self.output or self.model.with_suffix(".yaml")
-        checks.name(f"the name of {target}, which will be the robot's,", target.stem)
+        checks.name(f"the name of {target}, which becomes the robot's,", target.stem)
         OutputFile(target, overwrite=self.overwrite).check()
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
         found = suggest(self.model, self.gripper)
@@ -51,32 +51,32 @@ class RobotNewOptions(Replacing):
             with Engine(None) as engine:
                 checked = check_robot(str(target), list(NAMES), 0, engine, lambda _: None)
         except ManipError as error:
-            raise ManipError(f"wrote {target}, which cannot be used yet: {error}") from None
+            raise ManipError(f"wrote {target}, but it cannot be used yet: {error}") from None
         say(f"wrote {target}. {verdict(checked)}")
         say(*(f"change: {line}" for line in advice(checked)))
         if len(checked.failed) == len(NAMES):
-            raise ManipError(f"wrote {target}, with which no task can be done yet; see above")
+            raise ManipError(f"wrote {target}, but the robot cannot do any task yet; see above")
         say(f"look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
 
 
 @dataclass(frozen=True)
 class RobotCheckOptions:
-    """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
+    """Measure what an arm can do, before recording; writes check.html and check.json.
 
-    Pictures of the arm with its frame and cameras, where it reaches, and the expert at every task, as it is and with a
-    tenth of the steps random; and what to change if something does not work. Exits with 1 if a task cannot be done.
+    Shows the arm with its frame and cameras, its reach, the expert's success at every task, also with a tenth of the
+    actions random, and what to change if something does not work. The exit code is 1 if a task cannot be done.
     """
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
-    robot: str = option(MISSING, "its YAML, or the name of one that ships", positional=True)
-    tasks: list[str] = option(list, f"of {', '.join(NAMES)}; by default all")
+    robot: str = option(MISSING, "the robot's YAML file, or the name of a built-in robot", positional=True)
+    tasks: list[str] = option(list, f"any of {', '.join(NAMES)}; by default all")
     episodes: int = option(
-        50, "of the expert at each task, and as many with random actions; 0 for none", at_least=0, at_most=1_000_000
+        50, "expert episodes per task, and as many with random actions; 0 for none", at_least=0, at_most=1_000_000
     )
     output: Output = group(Output(Path("runs/robot_check")), prefix="")
 
     def run(self) -> None:
-        """Measure, print the tables, write the page. Raises `ManipError` if a task cannot be done."""
+        """Measure, print the tables, write the report. Raises `ManipError` if a task cannot be done."""
         from manip_il.collect.workers import Engine
         from manip_il.evaluation import robot_check
         from manip_il.evaluation.results import write_json
@@ -85,7 +85,7 @@ class RobotCheckOptions:
         from manip_il.robots.table import get_robot
         from manip_il.tasks.table import get_task
 
-        sweep(get_robot(self.robot))  # refuses a robot that cannot be used before anything is written
+        sweep(get_robot(self.robot))  # raises, before anything is written, if the robot cannot be used
         tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
         for task in tasks:
             get_task(task)

@@ -12,27 +12,27 @@ from manip_il.option import option
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.tasks.config import EnvConfig
 
-SERVO = "servo"  # among the ways in which worlds differ
+SERVO = "servo"  # a value of --vary
 
 
 @dataclass(frozen=True)
 class ServeOptions(Varied):
-    """Run a simulated SO-101 behind serial ports that LeRobot's own programs open as a real one's.
+    """Run a simulated SO-101 behind serial ports, which LeRobot's own programs open like those of a real arm.
 
-    It prints both ports, the cameras, and a line to copy. With `-- COMMAND ...` it runs that program against them and
+    Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that program on them and
     presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded again.
-    --vary takes servo, too.
+    --vary also takes servo.
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
     first: ClassVar[str] = "task.type cameras servo log output_dir"
-    command: list[str] = option(list, "a program of LeRobot's and its options, after `--`", positional=True)
+    command: list[str] = option(list, "a LeRobot program and its options, after `--`", positional=True)
     env: Given = given(EnvConfig, robot="so101")
     session: Given = given(SessionConfig, prefix="")
     servos: ServoConfig = field(default_factory=ServoConfig)
 
     def run(self) -> None:
-        """Serve until the program ends, or Ctrl-C."""
+        """Serve until the program ends or the user presses Ctrl-C."""
         from manip_il.data.atomic import exclusive
         from manip_il.evaluation.suites import varied
         from manip_il.serve.session import serve

@@ -1,6 +1,6 @@
-"""A study of `manip-il compare`: the same runs for several arms and training seeds, tested.
+"""A study of `manip-il compare`: runs of several arms with the same training seeds, and their tests.
 
-An arm is `manip-il dagger`, or an algorithm that begins with what round 0 of such an arm made.
+An arm is `manip-il dagger`, or an algorithm that starts from round 0 of such an arm.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from manip_il import checks
-from manip_il.cli.common_options import Demonstrations, EngineOptions, TrialGroup
+from manip_il.cli.common_options import DatasetRoots, EngineOptions, TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.learning import AirlOptions, GailOptions, PpoOptions
 from manip_il.cli.options import Open, group
@@ -28,11 +28,11 @@ from manip_il.seeding import MAX_SEED
 from manip_il.tasks.config import EnvConfig
 
 ROUND_0 = "round_000"
-ALGORITHM = "algorithm"  # the key of an arm that names one of these
+ALGORITHM = "algorithm"  # the key of an arm that names one of ALGORITHMS
 ALGORITHMS = {"gail": GailOptions, "airl": AirlOptions, "ppo": PpoOptions}
 ArmOptions = DaggerOptions | GailOptions | PpoOptions  # an AirlOptions is a GailOptions
-OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study itself sets
-EPISODES = 500  # of a test
+OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
+EPISODES = 500  # test episodes
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class StudyFile:
     """Content of a study's YAML file.
 
     common: options of `manip-il dagger` that all its arms share. arms: name -> options in which an arm differs; with
-    `algorithm: gail`, `airl` or `ppo` those of that command, where `dataset.root` and `init` name another arm. If
+    `algorithm: gail`, `airl` or `ppo` those of that command, in which `dataset.root` and `init` name another arm. If
     tasks differ, nothing is compared.
     """
 
@@ -50,16 +50,16 @@ class StudyFile:
     eval: TrialGroup = group(TrialGroup(EPISODES))
     checkpoint: Literal["best", "last"] = "best"
     at: At = "end"
-    baseline: str | None = option(None, "the arm that others are compared with; by default the first")
-    target: float = option(TARGET, "validation success whose cost is reported", at_least=0.0, at_most=1.0)
+    baseline: str | None = option(None, "the arm to compare others with; by default the first")
+    target: float = option(TARGET, "validation success for which the cost is reported", at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A checked file: the options of every arm are valid.
+class StudyPlan:
+    """A checked study: the options of every arm are valid.
 
-    starts: arm -> the arm whose round 0 it begins with, itself for its own. envs: arm -> its environment, the same for
-    all where there is a baseline.
+    starts: arm -> the arm whose round 0 it starts from, which may be itself. envs: arm -> its environment, the same for
+    all if there is a baseline.
     """
 
     file: StudyFile
@@ -69,10 +69,10 @@ class Plan:
     envs: Mapping[str, EnvConfig]
 
 
-def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
-    """Return the study in `path`; training_seeds: in place of the file's. trust: of its runs.
+def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> StudyPlan:
+    """Return the study in `path`. training_seeds: replaces the file's. trust: option of its runs.
 
-    Raises `UsageError` in one line for what is not sound.
+    Raises a one-line `UsageError` if something is invalid.
     """
     file = from_yaml(path, StudyFile)
     if training_seeds is not None:
@@ -93,17 +93,17 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
         except ManipError as error:
             raise UsageError(f"{path}: arm {name!r}: {error}") from error
         arms[name] = options
-    return Plan(file, arms, starts, _baseline(file, envs), envs)
+    return StudyPlan(file, arms, starts, _baseline(file, envs), envs)
 
 
 def read_arm(common: Mapping[str, Any], own: Any) -> ArmOptions:
-    """Return an arm's options. common: of `manip-il dagger` alone.
+    """Return an arm's options. common: options of `manip-il dagger` only.
 
-    Raises `UsageError` for an option that is none, or that the study sets; `UnknownName` for an algorithm.
+    Raises `UsageError` for an option that is unknown or set by the study; `UnknownName` for an unknown algorithm.
     """
     layers = [("common", common), ("its options", own)]
     if set_here := next((name for name in OWN for _, tree in layers if isinstance(tree, dict) and name in tree), None):
-        raise UsageError(f"{set_here} is set by the study itself, for every run; take it out")
+        raise UsageError(f"{set_here} is set by the study for every run; remove it")
     if not isinstance(own, dict) or ALGORITHM not in own:
         return from_layers(DaggerOptions, layers)
     name = str(own[ALGORITHM])
@@ -113,22 +113,22 @@ def read_arm(common: Mapping[str, Any], own: Any) -> ArmOptions:
 
 
 def _first_arm(options: GailOptions | PpoOptions, known: list[str]) -> str:
-    """Return the arm that a learning one begins with, which `dataset.root` and `init` name in place of a path.
+    """Return the arm that an arm with an algorithm starts from, which `dataset.root` and `init` name instead of a path.
 
-    known: arms of `manip-il dagger` before it. Raises `UsageError` for another.
+    known: earlier arms of `manip-il dagger`. Raises `UsageError` for any other.
     """
     roots = options.dataset.root if isinstance(options, GailOptions) else []
     named = {str(path) for path in (*roots, options.init) if path is not None}
     if len(named) != 1 or not named <= {*known}:
         raise UsageError(
-            f"dataset.root and init are {', '.join(sorted(named)) or 'not given'}; expected the name of one arm of "
-            f"manip-il dagger before it, whose demonstrations and policy it begins with: {', '.join(known) or 'none'}"
+            f"dataset.root and init are {', '.join(sorted(named)) or 'not given'}; expected the name of one earlier "
+            f"arm of manip-il dagger, to start from its demonstrations and policy: {', '.join(known) or 'none'}"
         )
     return named.pop()
 
 
 def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
-    """The arm that others are compared with; None if tasks differ and none is named."""
+    """Return the arm to compare others with; None if tasks differ and none is named."""
     if file.baseline is None and len({env.task for env in envs.values()}) > 1:
         return None
     require_same_env(envs)
@@ -137,36 +137,34 @@ def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
     return file.baseline or next(iter(envs))
 
 
-def learn(plan: Plan, root: Path, engine: EngineOptions) -> None:
-    """Run what is not there yet, seed by seed, so that a study that is stopped early has all arms."""
+def run_arms(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
+    """Run missing runs, seed by seed, so that a study that is stopped early has all arms."""
     runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
     for number, (name, seed) in enumerate(runs, start=1):
         folder = _folder(root, name, seed)
-        if not (folder / REPORT_FILE).is_file():  # which is what a run writes last
+        if not (folder / REPORT_FILE).is_file():  # a run's last file
             say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
             options = with_start_policy(plan.arms[name], _folder(root, plan.starts[name], seed) / ROUND_0)
             settings, output = options.settings | {"seed": seed}, ResumableOutput(folder, resume=True)
             replace(options, settings=settings, output=output, engine=engine).run()
 
 
-def learnt(plan: Plan, root: Path) -> tuple[Arm, ...]:
+def read_arms(plan: StudyPlan, root: Path) -> tuple[Arm, ...]:
     """Return the runs of every arm."""
     seeds = range(plan.file.training_seeds)
     return tuple(Arm(name, tuple(_member(plan, root, name, seed) for seed in seeds)) for name in plan.arms)
 
 
 def with_start_policy(options: ArmOptions, start: Path) -> ArmOptions:
-    """Return a learning arm's options with the demonstrations and policy of round 0, `start`, for its arm's name."""
+    """Return an arm's options with the demonstrations and policy of round 0, `start`, instead of an arm's name."""
     if isinstance(options, DaggerOptions):
         return options
     options = replace(options, init=options.init and start / "policy")
-    return (
-        replace(options, dataset=Demonstrations([start / "dataset"])) if isinstance(options, GailOptions) else options
-    )
+    return replace(options, dataset=DatasetRoots([start / "dataset"])) if isinstance(options, GailOptions) else options
 
 
 def with_start_cost(options: ArmOptions, own: Member, run: Path) -> Member:
-    """Return a learning arm's member with the costs of what it begins with: round 0 in `run`, its fit with `init`."""
+    """Return an arm's member with the costs of its start: round 0 in `run`, including its fit if `init` is given."""
     if isinstance(options, DaggerOptions):
         return own
     records = read_lines(run / METRICS_FILE)
@@ -175,7 +173,7 @@ def with_start_cost(options: ArmOptions, own: Member, run: Path) -> Member:
     return replace(own, history=tuple(one.after(start, fitted=fitted) for one in own.history))
 
 
-def _member(plan: Plan, root: Path, name: str, seed: int) -> Member:
+def _member(plan: StudyPlan, root: Path, name: str, seed: int) -> Member:
     run = replace(read_member(_folder(root, name, seed)), training_seed=seed)
     return with_start_cost(plan.arms[name], run, _folder(root, plan.starts[name], seed))
 

@@ -1,4 +1,4 @@
-"""`manip-il theory`: the proven bounds of cloning and DAgger, on small processes and on the rounds of a run."""
+"""`manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a run."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TheoryOptions:
-    """Compare the proven bounds of cloning and DAgger with processes solved exactly, linear systems and the arm.
+    """Compare the proven bounds of cloning and DAgger with exactly solved MDPs, linear systems and the arm.
 
-    Writes report.html and theory.json. SOURCE is the folder of a run of `manip-il dagger`: its distribution shift,
-    round by round, beside the theorem's bound.
+    Writes report.html and theory.json. SOURCE is a run of `manip-il dagger`, whose distribution shift is compared round
+    by round with the theorem's bound.
     """
 
     example: ClassVar[str] = "manip-il theory runs/dagger --output_dir=runs/theory"
-    source: Path | None = option(None, "a run of manip-il dagger, to look at its rounds", positional=True, exists="")
-    episodes: int = option(50, "of the expert and of every round's policy", at_least=2)
-    cases: int = option(30, "wrong actions of each kind, to find what one costs the expert", at_least=1)
+    source: Path | None = option(None, "a run of manip-il dagger, to measure its rounds", positional=True, exists="")
+    episodes: int = option(50, "episodes of the expert and of every round's policy", at_least=2)
+    cases: int = option(30, "wrong actions of each kind, to measure the cost of one to the expert", at_least=1)
     engine: Workers = group(Workers(), prefix="")
     output: Output = group(Output(Path("runs/theory")), prefix="")
 
     def run(self) -> None:
-        """Compute, measure, write the page and the file, print the slopes."""
+        """Compute, measure, write the report and the file, print the slopes."""
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
         from manip_il.theory.bounds import all_curves

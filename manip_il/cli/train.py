@@ -1,4 +1,4 @@
-"""`manip-il train`: behaviour cloning on datasets, with any policy that LeRobot knows."""
+"""`manip-il train`: behaviour cloning on datasets, with our policies and LeRobot's."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli.common_options import Demonstrations, Trusting, start_policy
+from manip_il.cli.common_options import DatasetRoots, Trusting, start_policy
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
 from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
@@ -20,14 +20,14 @@ from manip_il.option import Seeded, option
 if TYPE_CHECKING:  # the learner takes a second to import
     from manip_il.data.dataset import Dataset
 
-RANK = "RANK"  # the variable by which processes that were started together know their place
+RANK = "RANK"  # environment variable with the process's index in distributed training
 
 
 @dataclass(frozen=True)
-class SourceGroup(Demonstrations):
-    """`--dataset.*` of what is learnt from."""
+class SourceGroup(DatasetRoots):
+    """`--dataset.*`: the training data and its weights."""
 
-    weights: list[float] = option(list, "share of the samples drawn from each of several; by default by its frames")
+    weights: list[float] = option(list, "share of the samples from each dataset; by default its share of frames")
 
     def __post_init__(self) -> None:
         wrong = not all(0 < weight < math.inf for weight in self.weights)
@@ -38,11 +38,11 @@ class SourceGroup(Demonstrations):
 
 @dataclass(frozen=True)
 class TrainOptions(Seeded, Trusting):
-    """Fit a policy to the labels of a dataset, or of several of one robot (behaviour cloning).
+    """Fit a policy to the labels of one or more datasets of one robot (behaviour cloning).
 
-    --policy.type is mlp, cnn or any policy of LeRobot's (act, diffusion, vqbet, ...); its options have LeRobot's names:
-    manip-il train --policy.type=act --help lists them. The checkpoint is LeRobot's:
-    OUTPUT_DIR/checkpoints/last/pretrained_model.
+    --policy.type is mlp, cnn or any LeRobot policy (act, diffusion, vqbet, ...); its options have LeRobot's names:
+    manip-il train --policy.type=act --help lists them. OUTPUT_DIR/checkpoints/last/pretrained_model is a LeRobot
+    checkpoint.
     """
 
     example: ClassVar[str] = (
@@ -51,22 +51,22 @@ class TrainOptions(Seeded, Trusting):
     first: ClassVar[str] = "dataset.root policy observation action_space steps batch_size output_dir resume"
     dataset: SourceGroup
     weights: Path | None = option(
-        None, "rabc.parquet of manip-il data score: how often frames are drawn, as by LeRobot's RA-BC", exists=""
+        None, "rabc.parquet of manip-il data score: sampling weights of frames, as in LeRobot's RA-BC", exists=""
     )
     fit: Given = given(FitConfig, prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/train")), prefix="")
 
     def run(self) -> None:
-        """Read the datasets, fit, and say where the checkpoint is."""
+        """Read the datasets, fit, and print the checkpoint's path."""
         from manip_il.learn.lerobot_config import lerobot_options
         from manip_il.learn.samples import rabc_weights
         from manip_il.learn.train import Trainer
 
-        writes = os.environ.get(RANK, "0") == "0"  # whether this is the one of several processes that does
+        writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
         if not writes:
             set_quiet(True)
         config, folder = self.config(), self.output.output_dir
-        options, _ = lerobot_options(config)  # refuses what LeRobot would, before anything is written
+        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         datasets, weights = self._datasets(config), None
         if self.weights is not None:
             first = datasets[0]
@@ -94,7 +94,7 @@ class TrainOptions(Seeded, Trusting):
             say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path} --output_dir={folder}/eval")
 
     def config(self) -> FitConfig:
-        """Return what the trainer takes; `UsageError` for what does not go together."""
+        """Return the trainer's configuration; `UsageError` if options contradict each other."""
         from manip_il.seeding import stream_base
 
         if self.weights is not None and len(self.dataset.root) > 1:
@@ -103,7 +103,7 @@ class TrainOptions(Seeded, Trusting):
         return FitConfig(**dict(self.fit, policy=policy, seed=seed, trust=self.trust))
 
     def _datasets(self, config: FitConfig) -> list[Dataset]:
-        """Return the datasets, which must agree with the first and have what the policy looks at."""
+        """Return the datasets; raises unless they agree with each other and have the policy's inputs."""
         from manip_il.cli.inputs import dataset_differences
         from manip_il.data.dataset import Dataset
         from manip_il.learn.names import PLAIN

@@ -1,4 +1,4 @@
-"""`manip-il push`, `pull`, `export`, `data to-mcap`, `from-mcap`: datasets and policies to other places and forms."""
+"""`manip-il push`, `pull`, `export`, `data to-mcap`, `from-mcap`: move and convert datasets and policies."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ EXPORTABLE = ("mlp", "cnn")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Transfer:
-    """Command that moves files."""
+class DryRun:
+    """Options of a command that moves files."""
 
-    dry_run: bool = option(False, "only list what would be done")
+    dry_run: bool = option(False, "only list what the command would do")
 
 
 @dataclass(frozen=True)
-class PushOptions(Transfer):
+class PushOptions(DryRun):
     """Push a dataset, or a policy with its run, to the Hugging Face Hub, an object store, another machine or a folder.
 
     A dataset is checked first, as by manip-il data check, and refused if it has errors. Only changes are uploaded.
-    Readers see the old version until the new one is complete. After an interruption run the same command again: what
-    has arrived is not sent twice.
+    Readers see the old version until the new one is complete. After an interruption, run the same command again: files
+    that have arrived are not sent again.
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
@@ -45,7 +45,7 @@ class PushOptions(Transfer):
     private: bool = option(False, "make a new repository on the Hub private")
 
     def run(self) -> None:
-        """Examine, list, upload, switch over; print what was done."""
+        """Check, list, upload, switch to the new version; print what was done."""
         from rich import filesize
 
         from manip_il.store.transfer import open_remote, push
@@ -63,20 +63,20 @@ class PushOptions(Transfer):
 
 
 @dataclass(frozen=True)
-class PullOptions(Transfer, Replacing):
+class PullOptions(DryRun, Replacing):
     """Pull a dataset or a policy from the Hugging Face Hub, an object store, another machine or a folder.
 
-    Every file is verified by its hash, and every file of a dataset opened once, before the folder appears. Paths that
-    leave the folder, links, pickles and code are refused; nothing that is pulled is executed.
+    Before the folder appears, every file is verified by its hash, and every file of a dataset is opened once. Paths
+    outside the folder, links, pickles and code are refused; nothing that is pulled is executed.
     """
 
     example: ClassVar[str] = "manip-il pull hf://datasets/me/demos datasets/demos"
-    remote: str = option(MISSING, "what manip-il push was given, or any repo of the Hub", positional=True)
-    target: Path = option(MISSING, "new folder for it", positional=True)
-    revision: str | None = option(None, "branch, tag or commit of a repo on the Hub")
+    remote: str = option(MISSING, "the address given to manip-il push, or any Hub repository", positional=True)
+    target: Path = option(MISSING, "the new folder", positional=True)
+    revision: str | None = option(None, "branch, tag or commit of a Hub repository")
 
     def run(self) -> None:
-        """Fetch, verify, rename; print what was pulled."""
+        """Download, verify, rename; print what was pulled."""
         from rich import filesize
 
         from manip_il.store.transfer import open_remote, pull
@@ -96,15 +96,15 @@ class PullOptions(Transfer, Replacing):
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Write an mlp or cnn policy as one file that runs without this package.
+    """Export an mlp or cnn policy as one file that runs without this package.
 
-    Observations go in raw, by LeRobot's names; joint targets [rad] and the gripper command [m] come out. The file is
-    run and compared with the checkpoint before it is written. docs/export.md shows how to run it.
+    Inputs are raw observations with LeRobot's names; outputs are joint targets [rad] and the gripper command [m]. The
+    model is run and compared with the checkpoint before it is written. docs/export.md shows how to run it.
     """
 
     example: ClassVar[str] = "manip-il export runs/dagger --output=policy.onnx"
     policy: Path = option(MISSING, "a run, a checkpoint or its pretrained_model", positional=True, exists="")
-    format: Literal["onnx"] = option("onnx", "for onnxruntime and others")
+    format: Literal["onnx"] = option("onnx", "file format")
     file: OutputFile = group(OutputFile(Path("policy.onnx")), prefix="")
 
     def run(self) -> None:
@@ -122,7 +122,7 @@ class ExportOptions:
             raise ManipError(f"an ONNX file needs {error.name}: pip install 'manip_il[export]'") from error
         write_file(self.file.output, exported.data)
         if "robot" not in exported.metadata:
-            warn(f"{path} was written by another tool: the file does not say robot, task, control rate and names")
+            warn(f"{path} was written by another tool: the file does not hold robot, task, control rate and names")
         say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
         for direction in ("inputs", "outputs"):
             for one in exported.metadata[direction]:
@@ -135,14 +135,14 @@ class ExportOptions:
 class McapExportOptions(OfDataset, Replacing):
     """Write a LeRobot v3.0 dataset as MCAP, which Foxglove opens: one file per episode, one topic per column.
 
-    With it, mapping.yaml, from which `manip-il data from-mcap` makes the same dataset again.
+    Also writes mapping.yaml, with which `manip-il data from-mcap` makes the same dataset again.
     """
 
     example: ClassVar[str] = "manip-il data to-mcap datasets/demos demos_mcap"
     out: Path = option(MISSING, "folder for the files", positional=True)
 
     def run(self) -> None:
-        """Export every episode; the folder appears when it is whole."""
+        """Export every episode; the folder appears when it is complete."""
         from manip_il.data.dataset import Dataset
         from manip_il.mcap.export import MAPPING, export_dataset, left_out
 
@@ -153,26 +153,26 @@ class McapExportOptions(OfDataset, Replacing):
                 bar.step()
             save_options(folder, self)
         if missing := left_out(dataset.info):
-            say(f"left out, as MCAP has no place for them: {', '.join(missing)}")
+            say(f"left out, because MCAP cannot hold them: {', '.join(missing)}")
         say(f"exported {dataset.info.episodes:,} episodes to {self.out}")
-        say(f"back to a dataset: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
+        say(f"to convert back: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
 
 
 @dataclass(frozen=True)
 class McapImportOptions:
-    """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in the order of their names.
+    """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in order of file names.
 
-    The mapping names the topic and the field of every column, and how its messages are resampled to the dataset's rate:
-    nearest or previous, with a tolerance in seconds. A gap beyond it is an error.
+    The mapping names the topic and field of every column, and how its messages are resampled to the dataset's rate:
+    nearest or previous, with a tolerance in seconds. A longer gap is an error.
     """
 
     example: ClassVar[str] = "manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
     source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True, exists="")
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
-    mapping: Path = option(MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)", exists="")
+    mapping: Path = option(MISSING, "YAML file: the topic of every column (see configs/mcap/panda.yaml)", exists="")
 
     def run(self) -> None:
-        """Import every file; the dataset appears when it is whole."""
+        """Import every file; the dataset appears when it is complete."""
         from manip_il.mcap.importing import import_files, list_files
         from manip_il.mcap.mapping import load_mapping
         from manip_il.mcap.read import read_topics
@@ -184,5 +184,5 @@ class McapImportOptions:
                 frames += count
         wanted = {source.topic for source in mapping.sources.values()}
         if rest := sorted({topic for path in paths for topic in read_topics(path)} - wanted):
-            say(f"topics that the mapping does not name: {', '.join(rest)}")
+            say(f"topics not in the mapping: {', '.join(rest)}")
         say(f"imported {len(paths):,} episodes, {frames:,} frames to {self.dataset}")

@@ -1,4 +1,4 @@
-"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun where there is no display."""
+"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no display."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ if TYPE_CHECKING:
     from manip_il.collect.rollout import Environment
     from manip_il.evaluation.watch import RerunLog, WindowScreen
 
-HOLD = 10  # control steps that an episode goes on for after success
-IN_A_FILE = 3  # episodes, if nobody says how many
-SIZE = {"height": 240, "width": 320}  # of pictures that no policy looks at [pixels]
+HOLD = 10  # control steps that an episode continues after success
+IN_A_FILE = 3  # episodes written to a file by default
+SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
 
 
 @dataclass(frozen=True)
 class WatchedPolicyGroup(PolicyGroup):
-    """`--policy.*` of what drives."""
+    """`--policy.*`: the policy that drives."""
 
     type: Literal["expert", "random", "sliders"] | None = option(
-        None, "instead of a checkpoint; sliders: those of the window; by default expert"
+        None, "instead of a checkpoint, by default expert; sliders: those of the window"
     )
 
 
 @dataclass(frozen=True)
 class ViewOptions(Tested, Seeded, Trusting):
-    """Watch a robot at its task: in MuJoCo's viewer, without a display in a browser (Rerun), or from a file.
+    """Watch a robot at its task in MuJoCo's viewer, or without a display in a browser (Rerun) or from a file.
 
-    Shows episodes in real time until the window is closed, Ctrl-C, or so many. Without a display it serves the pictures
-    of the cameras, joints, actions, phase and progress to a browser; `--output` writes them to a file for `rerun
-    FILE.rrd`, on any machine, as fast as they come.
+    Shows --n_episodes in real time, or until the window is closed or Ctrl-C. Without a display it serves pictures,
+    joints, actions, phase and progress to a browser; `--output` writes them as fast as possible to a file, which `rerun
+    FILE.rrd` opens on any machine.
     """
 
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
     first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
-    n_episodes: int | None = option(None, f"episodes; by default without end, {IN_A_FILE} in a file", at_least=1)
-    output: Path | None = option(None, "write a file of Rerun's, FILE.rrd, in place of showing anything")
+    n_episodes: int | None = option(None, f"episodes; by default unlimited, {IN_A_FILE} in a file", at_least=1)
+    output: Path | None = option(None, "write a Rerun file, FILE.rrd, instead of showing episodes")
 
     def run(self) -> None:
         """Run episodes and show them."""
@@ -67,10 +67,10 @@ class ViewOptions(Tested, Seeded, Trusting):
             raise UsageError("--policy.type=sliders needs a window: a DISPLAY, and no --output")
         env, driver, cameras = open_driver(self.policy.path, self.policy.type or "expert", self.env, trust=self.trust)
         in_window = in_window and env.robot not in STOCK
-        if cameras is None and not in_window:  # pictures for people, with shadows if nobody waits
+        if cameras is None and not in_window:  # for people; shadows only in files, which need not be real time
             cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if self.output else Look())
         if sliders and not self.env.get("horizon"):
-            env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
+            env = replace(env, horizon=LONGEST_EPISODE)  # people are slower than the expert
         conditions = suite_conditions(self.suite, env, sees=cameras is not None)
         job = RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
         world = make_env(env, observed_cameras(job), conditions)

@@ -1,7 +1,7 @@
-"""Who drives a rollout: the expert, an expert with noise, a policy, a mixture of policy and expert, or chance.
+"""Drivers of rollouts: the expert, the expert with noise, a policy, a mixture of policy and expert, random actions.
 
-A driver is a small picklable object that a job carries to its worker. There `start` makes it act: it returns a function
-from the turns of a step to each turn's action (n,) and who chose it.
+A driver is a small picklable object that a job sends to its worker. There `start` returns a function from the turns of
+a step to each turn's action (n,) and actor.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ F32, F64 = NDArray[np.float32], NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Setting:
-    """Circumstances of a driver or a query rule.
+    """What a driver or query rule knows about its rollouts.
 
-    actions: of the robot. horizon: control steps of an episode. policies: those that the driver names, loaded.
+    actions: the robot's action space. horizon: control steps per episode. policies: the driver's loaded policies.
     """
 
     actions: ActionSpace
@@ -39,10 +39,9 @@ class Setting:
 
 
 class Driver:
-    """Base of all drivers. They must pickle.
+    """Base class of drivers. They must be picklable.
 
-    beta: the expert's share of the steps. policies: checkpoints that it needs, `pretrained_model` folders; the first
-    one drives.
+    beta: share of the steps that the expert drives. policies: `pretrained_model` folders; the first policy drives.
     """
 
     kind: ClassVar[str]
@@ -51,11 +50,11 @@ class Driver:
 
     @property
     def name(self) -> str:
-        """Name in datasets."""
+        """The driver's name in datasets."""
         return "mixture" if self.policies and self.beta > 0 else self.kind
 
     def start(self, setting: Setting) -> Act:
-        """Return the driver at work, for the episodes of one process."""
+        """Return the function that acts, for the episodes of one process."""
         raise NotImplementedError
 
 
@@ -73,7 +72,7 @@ class ExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class NoisyExpertDriver(Driver):
-    """Executes the label with Gaussian noise: DART (Laskey et al. 2017). covariance: (n, n), of actions."""
+    """Executes the label with Gaussian noise: DART (Laskey et al. 2017). covariance: of the actions, (n, n)."""
 
     covariance: tuple[tuple[float, ...], ...]
     kind = "noisy_expert"
@@ -92,7 +91,7 @@ class NoisyExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class RandomDriver(Driver):
-    """Joint targets drawn evenly within the longest step of the measured joints, any gripper opening."""
+    """Draws joint targets uniformly within the longest step of the measured joints, and any gripper opening."""
 
     kind = "random"
 
@@ -104,10 +103,10 @@ class RandomDriver(Driver):
 
 @dataclass(frozen=True)
 class PolicyDriver(Driver):
-    """Executes a policy's action, and with probability beta the expert's: pi_i = beta pi* + (1 - beta) pi_hat.
+    """Executes the policy's action, or with probability beta the expert's: pi_i = beta pi* + (1 - beta) pi_hat.
 
-    policies: the first drives, the others answer with it where a query wants their disagreement. trust: whether models
-    that the checkpoints name may be loaded. device: of torch, on which they act. (Ross et al. 2011)
+    policies: the first one drives; a query rule may compare the others with it. trust: whether models that the
+    checkpoints name may be loaded. device: torch device of the policies. (Ross et al. 2011)
     """
 
     kind = "policy"
@@ -131,17 +130,17 @@ class PolicyDriver(Driver):
 
 
 def driver_of(name: str | None) -> Driver:
-    """Return the driver without a policy that is called `expert` or `random`; the expert for None."""
+    """Return the driver named `expert` or `random`; the expert for None."""
     return RandomDriver() if name == "random" else ExpertDriver()
 
 
 def expert_actions(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-    """Return the expert's label (n,) of every turn."""
+    """Return the expert's action (n,) in every turn."""
     return [(turn.query().action, Actor.EXPERT) for turn in turns]
 
 
 def policy_actions(policy: LearnedPolicy, turns: Sequence[Turn]) -> F64:
-    """Return a policy's action in every turn, (B, n); one with a memory begins anew where an episode does."""
+    """Return a policy's action in every turn, (B, n); its memory is reset when an episode starts."""
     if started := [turn.seed for turn in turns if turn.step == 0]:
         policy.reset(started)
         policy.instruct({turn.seed: turn.observation.instruction for turn in turns if turn.step == 0})

@@ -1,6 +1,6 @@
-"""Another dataset made of the stored states of one: with other labels, other pictures, or other scenes.
+"""Make a new dataset from the stored states of another, with new labels, pictures or scenes.
 
-All three work on the source by pieces, in processes of this machine, and write a dataset that appears when it is whole.
+All three edits process the source in pieces, in local processes, and write a dataset that appears when it is complete.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from manip_il.tasks.stock.table import ROBOTS as STOCK
 from manip_il.tasks.table import get_task, is_task
 
 Columns = dict[str, NDArray[Any]]
-_DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that what is made of a state depends on
-SERVED = "lerobot"  # `driver` of datasets that LeRobot's programs recorded behind servos
-NOTICEABLE = 0.01  # of a joint's longest step, or of the gripper's whole opening: a label that differs by less is none
+_COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
+SERVED = "lerobot"  # `driver` of datasets recorded by LeRobot's programs from our servos
+NOTICEABLE = 0.01  # smallest change of a label, relative to a joint's longest step or the gripper's opening
 
 
 @dataclass(frozen=True)
-class Source:
-    """A dataset whose states can be restored, and the environment that they fit.
+class EditSource:
+    """A dataset whose states can be restored, and their environment.
 
-    warnings: what may make the restored world differ from the recorded one.
+    warnings: reasons why the restored world may differ from the recorded one.
     """
 
     dataset: Dataset
@@ -55,12 +55,11 @@ class Source:
     warnings: tuple[str, ...] = ()
 
 
-def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> Source:
-    """Read what is needed to restore a dataset's states.
+def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> EditSource:
+    """Open a dataset whose states are to be restored.
 
-    robot, task: their files, if they do not ship. shape: of its object, if that is a mesh.
-    Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
-    a robot and task that are known here, `MismatchError` if its states do not fit them.
+    robot, task: files of the user's own robot and task. shape: of its object, if that is a mesh. Raises `ManipError` if
+    the folder is not a dataset of ours, or its robot or task is unknown, `MismatchError` if its states do not fit them.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -74,8 +73,8 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
     if lacking:
         what = f"the robot {spec.robot!r} and the task {spec.task!r}" + (f" with {spec.object}" if spec.object else "")
         raise ManipError(
-            f"{root} is for {what}, of which not all is known here, so its "
-            f"states cannot be restored; give {' and '.join(lacking)}"
+            f"{root} is for {what}, not all of it built in, so its states cannot be restored; "
+            f"give {' and '.join(lacking)}"
         )
     given = get_robot(robot).name if robot else spec.robot, get_task(task).name if task else spec.task
     for what, ours, theirs in zip(("robot", "task"), given, (spec.robot, spec.task), strict=True):
@@ -85,22 +84,22 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
     if shape and (ours := env_spec(env).object) != spec.object:
         raise MismatchError("object", str(root), spec.object, "--task.object", ours)
     size = env_spec(env).sim_state_size
-    lacks = size - spec.sim_state_size  # of states from before they held all draws
+    lacks = size - spec.sim_state_size  # older states do not hold all draws
     if lacks not in (0, *OLDER):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
     here, there = env_fingerprint(env), dataset.fingerprint
-    left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
+    left, right = ({key: one.get(key, "nothing") for key in _COMPARED} for one in (there, here))
     warnings = compare_fingerprints(str(root), left, "this machine", right)
     if lacks:
-        warnings.append(f"{root} was recorded before states held how episodes look: what they drew of that is not seen")
-    return Source(dataset, env, tuple(warnings))
+        warnings.append(f"{root} was recorded before states held looks: its randomised looks are not restored")
+    return EditSource(dataset, env, tuple(warnings))
 
 
 @dataclass(frozen=True)
-class Target:
-    """Folder of the new dataset, and how it is made.
+class EditTarget:
+    """The new dataset's folder, and how it is written.
 
-    replace: as in `new_folder`. on_piece: called after each episode of the source, or `CHUNK` of scenes.
+    replace: as in `new_folder`. on_piece: called after each episode, or each `CHUNK` of scenes.
     """
 
     root: Path
@@ -109,12 +108,12 @@ class Target:
     on_piece: Callable[[], None] = lambda: None
 
 
-def relabel_dataset(source: Source, target: Target) -> int:
-    """Write `source` anew with the expert's label of every state; executed actions, pictures and all else stay.
+def relabel_dataset(source: EditSource, target: EditTarget) -> int:
+    """Write `source` with the expert's label of every state; all other columns and pictures stay the same.
 
-    A state that the expert was not asked in when it was recorded is labelled, too. Returns how many frames have another
-    label: its action by more than `NOTICEABLE`, its phase, or whether it is sound. Raises what reading and
-    `rewrite_columns` raise, `ManipError` if a worker dies.
+    States in which the expert was not queried get a label, too. Returns the number of frames whose label changed in its
+    action by more than `NOTICEABLE`, in phase, or in validity. Raises what reading and `rewrite_columns` raise, and
+    `ManipError` if a worker dies.
     """
     scale, dataset = env_actions(source.env).scale, source.dataset
     changed = 0
@@ -122,7 +121,7 @@ def relabel_dataset(source: Source, target: Target) -> int:
     def relabelled() -> Iterator[Columns]:
         nonlocal changed
         for episode, columns in labels:
-            changed += _changed(episode.columns, columns, scale)
+            changed += _count_changed(episode.columns, columns, scale)
             target.on_piece()
             yield columns
 
@@ -136,8 +135,8 @@ def relabel_dataset(source: Source, target: Target) -> int:
     return changed
 
 
-def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> Info:
-    """Write `source` anew with these cameras' pictures in place of its own; every other column stays as it is.
+def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget) -> Info:
+    """Write `source` with the pictures of these cameras instead of its own; all other columns stay the same.
 
     Raises `RenderError` if there is no OpenGL, and what reading and `write_dataset` raise.
     """
@@ -152,11 +151,11 @@ def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> Inf
     return _write(target, spec, fingerprint, provenance, work, episodes)
 
 
-def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> Info:
-    """Write the dataset of other scenes of a dataset's states, each frame or branch an episode.
+def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> Info:
+    """Write a dataset of new scenes of a dataset's states, in which each frame or branch is an episode.
 
-    The same seed gives the same scenes, and more frames begin with the same ones. Raises `NothingToLearnError` if no
-    scene has a sound label.
+    The same seed gives the same scenes, and a larger number of frames begins with the same ones. Raises
+    `NothingToLearnError` if no scene has a valid label.
     """
     columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
     drawn = {"scenes": scenes.anew, "branch_steps": scenes.branch_steps, "cameras": asdict(scenes.cameras)}
@@ -164,7 +163,7 @@ def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> Info:
     seeds = scenes.numbers[::CHUNK]
     tried = {"seeds": [seeds[0], seeds[-1]], "tried": len(seeds)}
     provenance = {"redrawn": {**_origin(source), **drawn, **vary}, **tried}
-    spec = replace(env_spec(source.env, scenes.cameras), video=False)  # frames have nothing to do with each other
+    spec = replace(env_spec(source.env, scenes.cameras), video=False)  # frames are independent scenes
     fingerprint = env_fingerprint(source.env, scenes.cameras)
     work = partial(_draw_scenes, source.env, scenes)
     pieces = scenes.chunks(columns[schema.SIM_STATE], _leads(source, columns))
@@ -172,7 +171,7 @@ def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> Info:
 
 
 def _write[T](
-    target: Target,
+    target: EditTarget,
     spec: RobotTaskSpec,
     fingerprint: Mapping[str, Any],
     provenance: Mapping[str, Any],
@@ -196,9 +195,9 @@ def _write[T](
 
 
 def label_episode(env: EnvConfig, episode: Episode) -> Columns:
-    """Return the columns of the expert's labels of an episode's states, (T,) or (T, n), as datasets have them.
+    """Return the expert's labels of an episode's states as columns of a dataset, (T,) or (T, n).
 
-    Where there is no sound label the action holds the arm still, and `label_valid` is 0.
+    If a label is invalid, its action holds the arm still and `label_valid` is 0.
     """
     expert = make_expert(env)
     labels = [expert.label(State.from_vector(state)) for state in episode.columns[schema.SIM_STATE]]
@@ -210,12 +209,12 @@ def label_episode(env: EnvConfig, episode: Episode) -> Columns:
 
 
 def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Columns:
-    """Return columns of states, rows of `sim_state` (T, m): pictures (T, height, width, 3), and keypoints (T, 3 K).
+    """Render states, rows of `sim_state` (T, m), to columns: pictures (T, height, width, 3), keypoints (T, 3 K).
 
-    An environment with these cameras gives the same bytes in these states. Raises `RenderError` without OpenGL.
+    An environment with these cameras gives the same bytes. Raises `RenderError` without OpenGL.
     """
     if env.robot in STOCK and not STOCK[env.robot].cameras:
-        raise RenderError(f"{env.robot} has no cameras here")
+        raise RenderError(f"{env.robot} has no cameras")
     view, spec, rows = make_env(env, cameras), env_spec(env, cameras), len(states)
     found: Columns = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
     found |= {key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys}
@@ -229,7 +228,7 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
     return found
 
 
-def _changed(before: Columns, after: Columns, scale: NDArray[np.float64]) -> int:
+def _count_changed(before: Columns, after: Columns, scale: NDArray[np.float64]) -> int:
     gaps = (np.abs(before[schema.ACTION] - after[schema.ACTION]) / scale).max(axis=1)
     same = (before[key].ravel() == after[key].ravel() for key in (schema.LABEL_VALID, schema.EXPERT_PHASE))
     return int((~np.logical_and(*same) | (gaps > NOTICEABLE)).sum())
@@ -240,8 +239,8 @@ def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> 
     return [replace(episode, columns={**episode.columns, **pictures})]
 
 
-def _leads(source: Source, columns: Columns) -> NDArray[np.float64]:
-    """How far labels are beyond the expert's own, (T, n): for servos that sag (`manip-il serve --log=`), else 0."""
+def _leads(source: EditSource, columns: Columns) -> NDArray[np.float64]:
+    """Return labels minus the expert's actions, (T, n): their lead for sagging servos (`serve --log=`), else 0."""
     action = columns[schema.ACTION].astype(np.float64)
     if source.dataset.provenance.get("driver") != SERVED:
         return np.zeros_like(action)
@@ -261,7 +260,7 @@ def _draw_scenes(
     return [to_episode(frames) for frames in made if frames]
 
 
-def _origin(source: Source) -> dict[str, str]:
+def _origin(source: EditSource) -> dict[str, str]:
     return {"from": source.dataset.root.name, "sha256": dataset_sha256(source.dataset.root)}
 
 

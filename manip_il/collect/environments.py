@@ -1,6 +1,6 @@
-"""Environments by robot and task: made, and described for datasets, checkpoints and evaluations.
+"""Make environments by robot and task, and describe them for datasets, checkpoints and evaluations.
 
-Robots of our own stand in scenes that are built of a robot and a task; `stock` environments are gymnasium's own.
+Our own scenes are built from a robot and a task; `stock` environments are gymnasium's.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from manip_il.tasks.table import TASKS, get_task, is_task
 
 
 def is_known(robot: str, task: str, shape: str = "") -> bool:
-    """Return whether there is an environment of this robot, task and object here."""
+    """Return whether this robot, task and object are built in."""
     if robot in STOCK:
         return task in STOCK[robot].tasks
     return is_robot(robot) and is_task(task) and not is_stored(shape)
@@ -47,7 +47,7 @@ def is_known(robot: str, task: str, shape: str = "") -> bool:
 def make_env(
     config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
 ) -> Environment:
-    """Make an environment. Raises `UsageError` for cameras or conditions that it does not have."""
+    """Make an environment. Raises `UsageError` for cameras or conditions that it does not support."""
     if config.robot in STOCK:
         return make_stock(config.robot, config.task, cameras, conditions)
     return env_of(config, cameras, conditions)
@@ -55,13 +55,13 @@ def make_env(
 
 @lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
-    """Make the expert of an environment, or return the one that was made."""
+    """Return the expert of an environment, cached."""
     return make_stock_expert(config.robot, config.task) if config.robot in STOCK else Expert(config_scene(config))
 
 
 @cache
 def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
-    """Return names, sizes and rate that a dataset or policy for this environment must share."""
+    """Return the names, sizes and rate that a dataset or policy for this environment must share."""
     check_cameras(config.robot, cameras)
     if config.robot in STOCK:
         stock, robot = get_stock(config.task, config.robot), STOCK[config.robot]
@@ -104,7 +104,7 @@ def env_actions(config: EnvConfig) -> ActionSpace:
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
-    """Return versions, and hashes of the compiled model and of the environment's and the cameras' settings."""
+    """Return versions, and hashes of the compiled model and the settings of environment and cameras."""
     if cameras is None:
         return dict(_fingerprint(config))
     look = hashlib.sha256(f"{canonical_json(cameras)} {DRAWN}".encode()).hexdigest()
@@ -117,11 +117,11 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
     if config.robot not in STOCK:
         task = get_task(config.task, config.object)
         settings["task"], _, argument = task.name.partition(":")
-        settings |= {"reward": argument} if argument else {}  # as it was called when carry alone had one
+        settings |= {"reward": argument} if argument else {}  # its name when only carry had an argument
         own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
         mesh = Shape.parse(config.object).mesh if config.object else None
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
-    if not config.object:  # as before there was any
+    if not config.object:  # as in versions without objects
         del settings["object"]
     made = described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)
     return environment_fingerprint(model_bytes(made.model), settings) | own

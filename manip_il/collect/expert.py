@@ -1,4 +1,4 @@
-"""The expert: a function of `State` alone, from anywhere a learner can get to."""
+"""The expert: a function of `State` alone, which labels any state that a learner reaches."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from manip_il.sim.world import Scene, World
 
 F64 = NDArray[np.float64]
 
-FALLEN = -0.05  # an object under this height has left the table [m]
-NO_PROGRESS = 0.995  # a step that leaves this share of an error is none
-NEAR = 0.03  # weighted pose error below which no progress is no trouble [m]
+FALLEN = -0.05  # an object below this height has left the table [m]
+NO_PROGRESS = 0.995  # a step that leaves more than this share of the error makes no progress
+NEAR = 0.03  # distance of the hand below which lack of progress is accepted [m]
 
 
 class Expert:
     """Labels any state of one scene.
 
-    The same state gives bit-equal labels in any order and any process: inverse kinematics starts from the
-    measured joints with a fixed posture target, and the phase is read off the geometry. Gripper opening and touch
-    are the only memory.
+    The same state gives bit-equal labels in any order and process: inverse kinematics starts from the measured joints
+    with a fixed posture target, and the phase follows from the geometry, gripper opening and touch.
     """
 
     def __init__(self, scene: Scene):
@@ -39,11 +38,10 @@ class Expert:
     def label(self, state: State, world: object | None = None) -> Label:
         """Return the expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
 
-        world: one of the same scene that is in this state, poses up to date: it is read, and nothing is restored.
+        world: a world of the same scene that is already in this state, with poses up to date; it is only read.
 
-        Where there is no sound action (object out of reach, inverse kinematics without a solution), `valid`
-        is false, `reason` says why, and the action holds the arm still. Raises `MismatchError` for a state of
-        another scene.
+        If there is no sound action (object out of reach, inverse kinematics without a solution), `valid` is false,
+        `reason` says why, and the action holds the arm still. Raises `MismatchError` for a state of another scene.
         """
         if not (isinstance(world, World) and world.scene is self._scene):
             world = self._world
@@ -87,7 +85,7 @@ class Expert:
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
     def _step(self, q: F64, position: F64, rotation: F64, target: Target) -> tuple[F64, float] | None:
-        """A joint step [rad] and what it leaves of the error; an exact one is aimed again, off by what it misses."""
+        """Return a joint step [rad] and the remaining share of the error; `exact` corrects the target by the miss."""
         ik, most = self._ik, self._scene.robot.max_joint_step
         first = ik.step(position, rotation, most, target.lean)
         if first is None or not target.exact:

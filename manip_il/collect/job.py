@@ -1,4 +1,4 @@
-"""One rollout job: all that a worker must know to turn seeds into episodes."""
+"""A rollout job: everything that a worker needs to turn seeds into episodes."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from manip_il.sim.shape import draws_shape
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
-if TYPE_CHECKING:  # torch only where a learner drives
+if TYPE_CHECKING:  # torch is imported only if a learner drives
     from manip_il.learn.policy import LearnedPolicy
 
 LOCKSTEP = 25  # environments that share one call of the policy
-OWN_MODELS = 8  # at most so many where each needs a model of its own, which is 26 MB for the Panda
+OWN_MODELS = 8  # largest number if each needs its own model, which is 26 MB for the Panda
 
 
 @dataclass(frozen=True)
 class RolloutJob:
-    """Driver and environment of rollouts, their length, and what is kept of them.
+    """Driver and environment of rollouts, their length, and what is recorded.
 
     hold: end an episode this many steps after success; None: at the horizon. patience: end it after this many steps
-    without progress. label: what the expert gives in the states that `query` selects. branch_steps: of a branch.
-    conditions: what episodes differ in from the nominal world, in turn by their seeds. batch: episodes that share one
-    call of the policy, at most; it changes no outcome. cameras: what is pictured in every step and kept; None for
-    nothing. A policy that looks at cameras gets their pictures all the same.
+    without progress. label: what the expert returns in the states that `query` selects. branch_steps: length of a
+    branch. conditions: randomisation of the world, alternating by seed. batch: largest number of episodes that share
+    a policy call; does not change outcomes. cameras: recorded in every step; None for none. A policy always gets the
+    pictures that it needs.
     """
 
     env: EnvConfig
@@ -54,20 +54,20 @@ class RolloutJob:
 
     def __post_init__(self) -> None:
         if self.label == "takeover" and self.driver.name != "policy":
-            raise UsageError(f"the expert takes over from a policy; this rollout is driven by {self.driver.name!r}")
+            raise UsageError(f"takeover needs a policy that drives; this rollout is driven by {self.driver.name!r}")
 
     @property
     def policy(self) -> Path | None:
-        """The checkpoint that drives, its `pretrained_model` folder."""
+        """The `pretrained_model` folder of the policy that drives."""
         return next(iter(self.driver.policies), None)
 
     @property
     def labels_all(self) -> bool:
-        """Whether every state gets its label, whoever drives."""
+        """Whether every state is labelled."""
         return self.label == "per_state" and self.query.kind == "every"
 
     def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
-        """Yield one episode a seed, in the order in which they end."""
+        """Yield one episode per seed, in the order in which they end."""
         if not seeds:
             return
         cameras = observed_cameras(self)
@@ -79,14 +79,14 @@ class RolloutJob:
             yield replace(self._to_episode(frames, branch_env), drawn=drawn)
 
     def _lockstep(self) -> int:
-        """Environments that run in lockstep in one process."""
+        """Return the number of environments that run in lockstep in one process."""
         if self.policy is None:
-            return 1  # alone, an environment has the processor's cache
+            return 1  # a single environment makes best use of the processor's cache
         varies = draws_shape(self.env.object) or any(one.changes_model() for one in self.conditions)
         return min(self.batch, OWN_MODELS) if varies or self.env.robot in STOCK else self.batch
 
     def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:
-        """An episode's frames as columns, with what the expert gives as `label` has it."""
+        """Return an episode's frames as columns, with the labels, takeover or branches of `label`."""
         beta, expert = self.driver.beta, make_expert(self.env)
         if self.label == "last":
             return to_episode(frames, self.round, beta, labelled=False)
@@ -104,20 +104,20 @@ class RolloutJob:
 def run_steps(
     job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
 ) -> Iterator[Transition]:
-    """Yield every step of a job's episodes as it happens in these environments. act: in place of the job's driver."""
+    """Run a job's episodes in these environments and yield every step. act: replaces the job's driver."""
     policies = tuple(_load(job, path, envs[0]) for path in job.driver.policies)
     setting = Setting(env_actions(job.env), job.env.horizon, policies)
     takeover = job.label == "takeover"
-    horizon = (2 if takeover else 1) * job.env.horizon  # one for the learner, and one for the expert
+    horizon = (2 if takeover else 1) * job.env.horizon  # for learner and expert each
     rules = Rules(horizon, job.hold, job.patience, takeover)
     gate = gate_of(job.label, job.query, setting)
     return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)
 
 
 def observed_cameras(job: RolloutJob) -> CameraConfig | None:
-    """Return the cameras of a job's environments: those that are recorded, else those that its policy looks at.
+    """Return the cameras of a job's environments: the recorded ones, else those of its policy.
 
-    Raises `MismatchError` if the policy would not find its pictures among the recorded ones.
+    Raises `MismatchError` if the recorded cameras do not include those of the policy.
     """
     wanted = policy_cameras(job.policy) if job.policy is not None else None
     if wanted is None or job.cameras is None:

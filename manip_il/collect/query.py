@@ -1,8 +1,8 @@
-"""When the expert is queried, and what it gives then.
+"""When the expert is queried, and what it returns.
 
 A rule is written `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`. `rollout` applies it in every
-step to the learner's actions, and nowhere else is the expert queried for a label. Differences between actions are
-measured in longest steps (of an action's largest dimension), so that a bound means the same for every robot.
+step to the learner's actions; the expert is queried for labels nowhere else. Differences between actions are measured
+in longest steps (in the largest dimension), so that a bound has the same meaning for every robot.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from manip_il.seeding import rng_for
 
 F64 = NDArray[np.float64]
 LabelMode = Literal["per_state", "takeover", "branch", "last"]
-"""What the expert gives when it is queried.
+"""What the expert returns when it is queried.
 
-`per_state`: its label. `takeover`: it drives to the end, for which it has a horizon of its own. `branch`: in a copy of
-the simulator it drives some steps ahead. `last`: the label of the last state alone, for its phase.
+`per_state`: its label. `takeover`: it drives to the end, with its own horizon. `branch`: it drives some steps in a copy
+of the simulator. `last`: only the label of the last state, for its phase.
 """
-_STREAM = "ask"  # of random numbers; another name would draw other states
+_STREAM = "ask"  # random stream; another name would draw other states
 
 
 @dataclass(frozen=True)
 class Query:
-    """A rule that says when the expert is queried, one of `RULES`. bound: None for rules without one.
+    """A rule for when the expert is queried, one of `RULES`. bound: None for rules without one.
 
-    Raises `UnknownName` for its kind, `UsageError` for a bound outside the rule's range.
+    Raises `UnknownName` for an unknown kind, `UsageError` for a bound outside the rule's range.
     """
 
     kind: str = "every"
@@ -57,37 +57,37 @@ class Query:
         return self.kind if self.bound is None else f"{self.kind}:{self.bound:g}"
 
     def start(self, setting: Setting) -> Gate:
-        """Return the rule at work, for the episodes of one process. Raises `UsageError` for policies that lack it."""
+        """Return the rule as a function, for the episodes of one process. Raises `UsageError` if it lacks policies."""
         rule, _ = RULES[self.kind]
         return rule(self.bound or 0.0, setting)
 
 
 def _every(bound: float, setting: Setting) -> Gate:
-    """In every state (Ross et al. 2011)."""
+    """Query in every state (Ross et al. 2011)."""
     return lambda turns, actions: [True] * len(turns)
 
 
 def _one(bound: float, setting: Setting) -> Gate:
-    """Once an episode, at a step drawn evenly (with one episode a round: Stagger, Li & Zhang 2025).
+    """Query once per episode, at a uniformly drawn step (with one episode per round: Stagger, Li & Zhang 2025).
 
-    Of a takeover it is drawn from the horizon, so never if the episode ends before.
+    For a takeover it is drawn from the horizon, so there is none if the episode ends earlier.
     """
     return lambda turns, actions: [turn.step == drawn_step(turn.seed, setting.horizon) for turn in turns]
 
 
 def _probability(bound: float, setting: Setting) -> Gate:
-    """At each step by chance."""
+    """Query at each step with the bound as probability."""
     rngs = generators(_STREAM)
     return lambda turns, actions: [rngs(turn.seed).uniform() < bound for turn in turns]
 
 
 def _ensemble(bound: float, setting: Setting) -> Gate:
-    """Where policies that differ by their seed disagree by more than the bound (Menda et al. 2019).
+    """Query if policies that differ by their seed disagree by more than the bound (Menda et al. 2019).
 
-    Measured by the root mean square distance of their actions to the mean, in the worst dimension.
+    Disagreement is the root mean square distance of their actions from the mean, in the worst dimension.
     """
     if len(setting.policies) < 2:
-        raise UsageError("query=ensemble needs other policies to disagree with")
+        raise UsageError("query=ensemble needs at least two policies")
     others = setting.policies[1:]
 
     def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
@@ -98,9 +98,9 @@ def _ensemble(bound: float, setting: Setting) -> Gate:
 
 
 def _safety(bound: float, setting: Setting) -> Gate:
-    """Where expert and learner differ by more than the bound (Zhang & Cho 2017).
+    """Query if expert and learner differ by more than the bound (Zhang & Cho 2017).
 
-    To know where, the expert labels every state; its label is kept where they do.
+    The expert labels every state to decide; its label is kept only if they differ.
     """
 
     def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
@@ -111,7 +111,7 @@ def _safety(bound: float, setting: Setting) -> Gate:
     return gate
 
 
-RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | None]] = {  # with the bound's limits
+RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | None]] = {  # kind -> rule, bound limits
     "every": (_every, None),
     "one": (_one, None),
     "probability": (_probability, (1e-6, 1.0)),
@@ -121,7 +121,7 @@ RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | N
 
 
 def parse_query(text: str) -> Query:
-    """Return a rule as it is written; `UnknownName` for its kind, `UsageError` for a wrong or missing bound."""
+    """Parse a rule; `UnknownName` for an unknown kind, `UsageError` for an invalid or missing bound."""
     kind, colon, bound = text.partition(":")
     try:
         return Query(kind, float(bound) if colon else None)
@@ -130,7 +130,7 @@ def parse_query(text: str) -> Query:
 
 
 def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
-    """Return when a rollout queries the expert; `one` waits for the end (`labelled`) unless the expert takes over."""
+    """Return when a rollout queries the expert; for `one` that is after it (`labelled`), unless it takes over."""
     if label == "last":
         return lambda turns, actions: [turn.step == setting.horizon - 1 for turn in turns]
     if query.kind == "one" and label != "takeover":
@@ -139,7 +139,7 @@ def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
 
 
 def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[Transition]:
-    """Return an episode's frames, for `one` with the label of a step drawn from those that there are."""
+    """Return an episode's frames; for `one`, with the label of a randomly drawn step."""
     if query.kind == "one":
         step = drawn_step(frames[0].seed, len(frames))
         frames[step] = replace(frames[step], label=expert.label(frames[step].state))
@@ -147,7 +147,7 @@ def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[T
 
 
 def cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
-    """Return the learner's frames as a part that ends, and the expert's if it took over; no more than the horizon."""
+    """Return the learner's frames, at most `horizon`, as a finished part, followed by the expert's if it took over."""
     taken = next((i for i, frame in enumerate(frames) if frame.actor != Actor.LEARNER), None)
     if taken == 0:
         return frames
@@ -162,5 +162,5 @@ def branch(env: Environment, expert: Labeller, first: State, seed: int, steps: i
 
 
 def drawn_step(seed: int, steps: int) -> int:
-    """Return one step of `steps`, the same for the same episode."""
+    """Return a random step below `steps`, the same for the same episode."""
     return int(rng_for(seed, _STREAM).integers(steps))

@@ -1,7 +1,7 @@
-"""Workers of a Ray cluster: of `RAY_ADDRESS` or one that runs on this machine, else a local one that is started.
+"""Workers of a Ray cluster: the one at `RAY_ADDRESS` or running on this machine, else a new local one.
 
-They send what is to be stored to this process, and get files from it, once a node: the policies', those of a task of
-one's own and of a mesh. Nodes need no shared disk.
+Workers return episodes to this process, which stores them. Nodes need no shared disk: policies and files of a user's
+own task and mesh are sent to them, once per node.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ except ImportError as missing:
     raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
 
 Files = dict[str, bytes]
-_LEVEL = 1  # of compression; an episode of numbers is then a fifth
+_LEVEL = 1  # compression level; reduces an episode without pictures to a fifth
 _DEATHS = (
     exceptions.WorkerCrashedError,
     exceptions.NodeDiedError,
@@ -44,13 +44,13 @@ _DEATHS = (
 
 
 class RayPool:
-    """Up to `workers` tasks at once, one core each; by default as many as the cluster has cores now.
+    """Runs up to `workers` tasks at once, one core each; by default one per core of the cluster.
 
-    Raises `ManipError` if there is no cluster.
+    Raises `ManipError` if no cluster can be reached or started.
     """
 
     def __init__(self, workers: int | None):
-        self._running: dict[Future[list[Episode]], Any] = {}  # with Ray's reference of each
+        self._running: dict[Future[list[Episode]], Any] = {}  # future -> Ray's reference
         self._folders: dict[Path, Any] = {}  # folder -> its files in Ray's store
         self._most, self._ours = workers, not ray.is_initialized()
         if self._ours:
@@ -61,14 +61,14 @@ class RayPool:
 
     @property
     def count(self) -> int:
-        """Tasks that run at once; more if nodes have come."""
+        """Number of tasks that run at once; grows with the cluster."""
         return self._most or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
-        """Send some seeds of a job to the cluster."""
-        files = [self._ship(folder) for folder in job.driver.policies]
-        task = self._ship(Path(job.env.task)) if job.env.task.endswith(SUFFIX) else None
-        mesh = self._ship(Path(path)) if (path := mesh_path(job.env.object)) else None
+        """Submit some seeds of a job to the cluster."""
+        files = [self._upload(folder) for folder in job.driver.policies]
+        task = self._upload(Path(job.env.task)) if job.env.task.endswith(SUFFIX) else None
+        mesh = self._upload(Path(path)) if (path := mesh_path(job.env.object)) else None
         reference = _run_remote.remote(__version__, job, seeds, journal, task, mesh, *files)
         future: Future[list[Episode]] = Future()
         self._running[future] = reference
@@ -76,7 +76,7 @@ class RayPool:
         return future
 
     def close(self) -> None:
-        """Cancel what runs; a cluster that was started here ends."""
+        """Cancel running tasks, and shut down a cluster that was started here."""
         for reference in list(self._running.values()):
             ray.cancel(reference, force=True)
         self._running.clear()
@@ -85,7 +85,7 @@ class RayPool:
             ray.shutdown()
 
     def _settle(self, future: Future[list[Episode]], answer: Future[bytes], journal: Journal | None) -> None:
-        """Store what came home, and hand the episodes or the error on."""
+        """Store returned episodes, and set the future's result or error."""
         self._running.pop(future, None)
         try:
             found: list[tuple[Episode, bytes]] = pickle.loads(zstandard.decompress(answer.result()))
@@ -96,11 +96,11 @@ class RayPool:
         except _DEATHS as death:
             future.set_exception(BrokenExecutor(str(death)))
         except ManipError as error:
-            future.set_exception(getattr(error, "cause", error))  # as it was raised on its node
+            future.set_exception(getattr(error, "cause", error))  # the error raised on the node
         except Exception as error:
             future.set_exception(ManipError(f"Ray: {(str(error) or repr(error)).splitlines()[-1]}"))
 
-    def _ship(self, folder: Path) -> Any:
+    def _upload(self, folder: Path) -> Any:
         if folder not in self._folders:
             root, paths = (folder.parent, [folder]) if folder.is_file() else (folder, sorted(folder.rglob("*.*")))
             self._folders[folder] = ray.put({path.relative_to(root).as_posix(): path.read_bytes() for path in paths})
@@ -116,7 +116,7 @@ def run_there(
     mesh: Files | None,
     *policies: Files,
 ) -> bytes:
-    """Return the packed answer of a task on a node. Raises `ManipError` if it has another version of the program."""
+    """Return the packed result of a task on a node. Raises `ManipError` if the node has another version."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
@@ -135,8 +135,8 @@ def run_there(
         return zstandard.compress(pickle.dumps(found), _LEVEL)
 
 
-# Deaths are counted by the engine: Ray itself is to try once. Its function keeps a name of its own, so that what is
-# sent is the name and a node runs the function that it has, else the version would be this process's everywhere.
+# The engine counts deaths, so Ray must not retry. The remote function has another name than the plain one, so that Ray
+# pickles the latter by name and each node runs its own version, which `run_there` then compares.
 _run_remote = ray.remote(num_cpus=1, max_retries=0)(run_there)
 
 

@@ -1,4 +1,4 @@
-"""Record episodes: run the seeds that have no journal, write each journal the moment it ends, and the dataset."""
+"""Record episodes: run the seeds without a journal, and write each journal as soon as its episode ends."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]
-_BETWEEN = 20  # at most so many are handed on between two that end, as there may be thousands from before
-MAX_TRIES = 3  # times the asked number of episodes, before an expert that mostly fails is given up
+_BETWEEN = 20  # most stored episodes yielded after each new one, since there may be thousands
+MAX_TRIES = 3  # most tries, as a multiple of the requested successes
 
 
 def journal_of(journals: Path, job: RolloutJob) -> Journal:
-    """Return the folder that a job's episodes are stored in."""
+    """Return the journals' folder for a job's episodes."""
     return Journal(journals, env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras))
 
 
 def collect(
     engine: Engine, job: RolloutJob, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
 ) -> Iterator[tuple[Journal, Episode]]:
-    """Run the seeds that have no journal in `journals` yet; each finished episode becomes one file at once.
+    """Run the seeds that have no journal in `journals` yet; each finished episode is written at once.
 
-    Yields what `read_journal` gives of them in the order of the seeds, as soon as all before one are there. A seed that
-    kills its worker again and again is left out: a warning names it. on_episode is called once an episode is on disk;
-    what it raises ends the run, and what is on disk stays.
+    Yields the result of `read_journal` in seed order, as soon as all earlier seeds are done. A seed that repeatedly
+    kills its worker is left out with a warning. on_episode: called when an episode is on disk; an exception in it ends
+    the run, and finished episodes stay on disk.
     """
     journal, waiting, on_disk = journal_of(journals, job), deque(seeds), set(list_seeds(journals))
 
@@ -62,9 +62,9 @@ def collect_successes(
     journals: Path,
     on_episode: OnEpisode | None = None,
 ) -> Iterator[tuple[Journal, Episode]]:
-    """Run seeds in order until `count` episodes succeeded; yields all of them as `collect` does.
+    """Run seeds in order until `count` episodes have succeeded; yield all episodes as `collect` does.
 
-    Which episodes come out depends on the seeds alone. Raises `ManipError` where too few succeed.
+    The episodes depend on the seeds alone. Raises `ManipError` if too few succeed.
     """
     tried, good = 0, 0
     while good < count:
@@ -78,9 +78,9 @@ def collect_successes(
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:
-    """Return a job's driver, round and labels, as datasets name them, and the ranges that its episodes draw from.
+    """Return a job's driver, round, labels and randomisation, as stored in datasets.
 
-    An episode's draws follow from these and its seed, by `Condition.draw`.
+    An episode's random draws follow from these and its seed, by `Condition.draw`.
     """
     source: dict[str, Any] = {"driver": job.driver.name, "round": job.round, "beta": job.driver.beta}
     if job.conditions:

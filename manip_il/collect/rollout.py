@@ -1,7 +1,7 @@
-"""The one loop that steps environments, as a generator of transitions.
+"""The only loop that steps environments, as a generator of transitions.
 
 Environments run in lockstep, so that a learner acts in all of them in one batch. Recording, labelling and evaluation
-consume what it yields and are no branches inside it. The expert is queried in one place, `_choose`.
+consume its transitions instead of being branches inside it. Only `_choose` queries the expert.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from manip_il.tasks.stock.envs import StockEnvironment, StockLabeller
 F64 = NDArray[np.float64]
 Environment = ManipEnv | StockEnvironment
 Labeller = Expert | StockLabeller
-GROWTH = 0.01  # of the share of a task that is done: less is no progress
+GROWTH = 0.01  # smallest increase of a task's progress, in [0, 1], that counts
 
 
 @dataclass(slots=True)
 class Turn:
-    """One running episode at one step, as a driver sees it. `label` is None where the expert was not queried.
+    """One running episode at one step, as a driver sees it. label: None if the expert was not queried.
 
-    world: in this state for as long as the turn lasts, where the environment has one.
+    world: the environment's world, if it has one, in this state until the turn ends.
     """
 
     seed: int
@@ -43,7 +43,7 @@ class Turn:
     world: World | None = None
 
     def query(self) -> Label:
-        """Return the expert's label of this state and keep it. Raises `ManipError` where there is no expert."""
+        """Return the expert's label of this state and keep it. Raises `ManipError` if there is no expert."""
         if self.label is None:
             self.label = self.peek()
         return self.label
@@ -51,24 +51,24 @@ class Turn:
     def peek(self) -> Label:
         """Return the expert's label of this state without keeping it."""
         if self.labeller is None:
-            raise ManipError(f"episode {self.seed}: nobody to ask for a label at step {self.step}")
+            raise ManipError(f"episode {self.seed}: there is no expert to query at step {self.step}")
         return self.labeller.label(self.state, self.world)
 
 
 Act = Callable[[Sequence[Turn]], list[tuple[F64, Actor]]]
-"""A driver at work: returns an action (n,) and who chose it, for every turn of a step."""
+"""A started driver: returns an action (n,) and its actor for every turn of a step."""
 Gate = Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]]
-"""A query rule at work: returns whether the expert is queried in each turn, given the actions (n,) that would be
+"""A started query rule: returns whether the expert is queried in each turn, given the actions (n,) that would be
 executed.
 """
 
 
 @dataclass(frozen=True)
 class Rules:
-    """Rules of an episode.
+    """When an episode ends.
 
-    horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
-    patience: end it after this many steps without progress, too. takeover: once queried, the expert drives to the end.
+    horizon: most control steps. hold: continue for this many steps after success, then end; None: to the horizon.
+    patience: also end after this many steps without progress. takeover: once queried, the expert drives to the end.
     """
 
     horizon: int
@@ -90,7 +90,7 @@ class _Slot:
     chosen: tuple[F64, Actor] = field(init=False)
 
     def is_stuck(self, patience: int) -> bool:
-        """Return whether progress has grown by no `GROWTH` for so many steps."""
+        """Return whether progress has not grown by `GROWTH` for `patience` steps."""
         if self.turn.progress >= self.best + GROWTH:
             self.best, self.since = self.turn.progress, self.step
         return self.step - self.since >= patience
@@ -106,11 +106,10 @@ def rollout(
     *,
     first: State | None = None,
 ) -> Iterator[Transition]:
-    """Run one episode per seed, `len(envs)` at a time; yields every step's transition as it happens.
+    """Run one episode per seed, `len(envs)` at a time; yield the transition of every step.
 
-    An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on its neighbours.
-    gate: when the labeller is queried; None for never. first: the state in which every episode begins, in place of its
-    seed's.
+    An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on other episodes.
+    gate: when the labeller is queried; None for never. first: the start state of every episode, instead of its seed's.
     """
     waiting = iter(seeds)
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]
@@ -147,7 +146,7 @@ def _begin_step(slot: _Slot, labeller: Labeller | None) -> None:
 
 
 def _choose(running: Sequence[_Slot], act: Act, gate: Gate | None, takeover: bool) -> None:
-    """Choose every episode's action and, where the gate says so, query the expert."""
+    """Choose every episode's action and, if the gate selects it, query the expert."""
     led = [slot for slot in running if not slot.taken_over]
     turns = [slot.turn for slot in led]
     chosen = act(turns) if led else []

@@ -1,6 +1,6 @@
-"""New scenes of visited states: goals and untouched objects drawn anew, looks too, then labelled and pictured.
+"""New scenes of visited states: randomise goals, untouched objects and looks, then label and render.
 
-The expert is a function of the state, so it labels scenes that nobody drove to: as many as there are frames.
+The expert is a function of the state, so it can label scenes that were never visited.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from manip_il.tasks.stock.aloha.environment import AlohaEnv
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time
-GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares: of new goals, of moved objects, and of those that come near the hand
-_UNTOUCHED = 0.04  # of an object's centre from the hand [m]
+GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares of new goals, of moved objects, and of these near the hand
+_UNTOUCHED = 0.04  # least distance of an untouched object's centre from the hand [m]
 _AROUND = 0.04  # standard deviation of an object's place near the hand, in x and y [m]
-_DEEP = 1e-3  # what is moved may overlap with something by so much [m]
-_TRIES = 5  # scenes drawn for a state, before it stays as it was visited
+_DEEP = 1e-3  # largest overlap of a moved object with another [m]
+_TRIES = 5  # scenes drawn for a state, before it is kept as visited
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """The scenes that are drawn of a dataset's states, and what is pictured of them.
+    """How scenes are drawn from a dataset's states, and their cameras.
 
-    anew: draw goals and objects anew, too, and not looks alone. conditions: what the looks of every frame are drawn
-    from. branch_steps: control steps for which the expert drives on from every state, for policies that plan. first:
-    number of the first frame in the stream of draws, so that several datasets of one seed have different scenes.
+    anew: also draw goals and objects, not only looks. conditions: from which the looks of every frame are drawn.
+    branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
+    of the first scene in the random stream, so that several datasets of one seed have different scenes.
     """
 
     cameras: CameraConfig
@@ -55,14 +55,14 @@ class Scenes:
 
     @property
     def numbers(self) -> range:
-        """Numbers of the scenes in the stream of draws. Raises `UsageError` for more than a seed has."""
+        """Numbers of the scenes in the random stream. Raises `UsageError` if the stream has too few."""
         return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
     def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
         """Yield the first number, the visited states and their leads of each `CHUNK` of scenes.
 
-        states: rows of `sim_state` (S, m), which are taken by turns, in an order that the seed draws. leads: what is
-        added to the labels of each (S, n).
+        states: rows of `sim_state` (S, m), used in turn, in an order drawn from the seed. leads: added to the labels of
+        each, (S, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
         for at in range(0, self.frames, CHUNK):
@@ -71,7 +71,7 @@ class Scenes:
 
 
 class SceneDrawer:
-    """Draws, labels and pictures scenes of one environment."""
+    """Draws, labels and renders scenes of one environment."""
 
     def __init__(self, config: EnvConfig, scenes: Scenes):
         self._env, self._shape = make_env(config, scenes.cameras), config.object
@@ -79,9 +79,9 @@ class SceneDrawer:
         self._scenes = scenes
 
     def frames(self, visited: State, number: int, seed: int, lead: F64 | float = 0.0) -> list[Transition]:
-        """Return what becomes of one visited state: one labelled frame, or those of a branch; none without a label.
+        """Return the scene of one visited state: one labelled frame, or those of a branch; [] without a valid label.
 
-        number: of the scene in the stream of draws. seed: the column's. lead: added to the one frame's label, (n,).
+        number: of the scene in the random stream. seed: of the column. lead: added to a single frame's label, (n,).
         """
         rng = rng_for(number, "redraw")
         visited = self._with_look(replace(visited, streak=0, ever=False), number)
@@ -99,8 +99,8 @@ class SceneDrawer:
         return list(branch(self._env, self._expert, state, seed, self._scenes.branch_steps))
 
     def _with_look(self, state: State, number: int) -> State:
-        """The state with the looks of a frame; as it was where nothing is drawn."""
-        if not isinstance(self._env, ManipEnv):  # which looks one way
+        """Return the state with randomised looks, if the environment has any."""
+        if not isinstance(self._env, ManipEnv):  # has fixed looks
             return state
         conditions, shape = self._scenes.conditions, self._shape
         drawn = draw(conditions, number, shape) if conditions else {}
@@ -115,10 +115,10 @@ class SceneDrawer:
         )
 
     def redrawn(self, visited: State, rng: np.random.Generator) -> State | None:
-        """Return a scene with other goals and other places of what is untouched; None for one that cannot be."""
+        """Return a scene with new goals and new places of untouched objects; None if it is impossible."""
         if isinstance(self._env, AlohaEnv):
             return self._env.redrawn(visited, rng)
-        assert isinstance(self._env, ManipEnv)  # no other has cameras
+        assert isinstance(self._env, ManipEnv)  # the only other kind with cameras
         world, task = self._env.world, self._env.scene.task
         world.restore(visited.physics, visited.variation)
         free, markers = self._untouched(world), _markers(world.model)
@@ -142,7 +142,7 @@ class SceneDrawer:
         return None if overlaps.any() else replace(visited, physics=world.physics())
 
     def _untouched(self, world: World) -> set[int]:
-        """Objects and furniture, as bodies, that touch nothing but what is fixed to the world, and rest."""
+        """Return bodies of objects and furniture that are at rest and touch only what is fixed to the world."""
         model, (roots, _) = world.model, _contacts(world)
         touched = set(roots[(roots > 0).all(axis=1) & (roots[:, 0] != roots[:, 1])].ravel().tolist())
         ee = world.ee.position.tolist()
@@ -156,18 +156,18 @@ class SceneDrawer:
 
 @lru_cache(1)
 def _markers(model: mujoco.MjModel) -> set[int]:
-    """Bodies that show goals: starts place them, and nothing touches them."""
+    """Return the bodies that mark goals: mocap bodies without collisions."""
     solid = set(model.body_rootid[model.geom_bodyid[model.geom_contype > 0]].tolist())
     return {body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and body not in solid}
 
 
 def _near_hand(world: World, at: F64, rng: np.random.Generator) -> F64:
-    """A place about the hand, at the height of another, (3,) [m]."""
+    """Return a random place around the hand, at the height of `at`, (3,) [m]."""
     return np.append(world.ee.position[:2] + rng.normal(0.0, _AROUND, 2), at[2])
 
 
 def _contacts(world: World) -> tuple[NDArray[np.int32], F64]:
-    """Bodies that are in contact, by their roots, (C, 2), and how deep [m], (C,)."""
+    """Return the root bodies of every contact, (C, 2), and its depth [m], (C,)."""
     model, contacts = world.model, world.data.contact
     mujoco.mj_collision(model, world.data)
     return model.body_rootid[model.geom_bodyid[contacts.geom]], -contacts.dist

@@ -1,4 +1,4 @@
-"""Write files and folders so that they are there whole or not at all, and name the path where a disk refuses."""
+"""Write files and folders atomically, and name the path if a disk is full or read-only."""
 
 from __future__ import annotations
 
@@ -14,53 +14,53 @@ from pathlib import Path
 from manip_il import checks
 from manip_il.errors import FolderExistsError, ManipError
 
-PARTIAL = ".partial"  # suffix of what is not finished
-_REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # of a disk, which reading never gives
+PARTIAL = ".partial"  # suffix of unfinished files and folders
+_WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # never raised by reading
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Generator[None]:
-    """Raise `ManipError` that names the file, else `path`, if the disk has no space or is read-only."""
+    """Raise `ManipError` naming the file, or else `path`, if the disk is full or read-only."""
     try:
         yield
-    except OSError as error:  # those of Arrow and FFmpeg are, too
-        if error.errno not in _REFUSALS:
+    except OSError as error:  # errors of Arrow and FFmpeg are OSErrors, too
+        if error.errno not in _WRITE_ERRORS:
             raise
         raise ManipError(f"cannot write {error.filename or path}: {os.strerror(error.errno)}") from error
 
 
 @contextlib.contextmanager
 def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
-    """Give an empty sibling of `root` to write into; on leaving, sync it to disk and rename it to `root`.
+    """Yield an empty sibling of `root` to write into; at the end, sync it to disk and rename it to `root`.
 
-    An exception removes the sibling; what a killed writer left of one is removed by the next writer.
-    Raises `FolderExistsError` if `root` holds something, before and after; with `replace` that stays until the
-    new folder is whole, and is removed then. Raises `ManipError` if the disk is full or read-only.
+    An exception removes the sibling; the next writer removes the leftovers of a killed one. Raises `FolderExistsError`
+    if `root` is not empty, at the beginning or end; with `replace` the old folder is removed once the new one is
+    complete. Raises `ManipError` if the disk is full or read-only.
     """
     root = root.absolute()
     if not (replace and root.is_dir()):
-        _refuse_full(root)
+        _require_empty(root)
     with writing(root):
         root.parent.mkdir(parents=True, exist_ok=True)
         for left in root.parent.glob(f".{root.name}.*{PARTIAL}"):
             lock = os.open(left, os.O_RDONLY)
-            if _try_lock(lock):  # refused while its writer lives
+            if _try_lock(lock):  # fails while its writer lives
                 shutil.rmtree(left, ignore_errors=True)
             os.close(lock)
         partial = _partial(root)
         partial.mkdir()
     lock = os.open(partial, os.O_RDONLY)
-    _try_lock(lock)  # the kernel lets go when the writer dies: so leftovers are known
+    _try_lock(lock)  # the kernel releases it when the writer dies, which identifies leftovers
     try:
         with writing(root):
             yield partial
-            _libc("syncfs", lock)  # in one call, however many files it has
+            _libc("syncfs", lock)  # one call for all files
         if replace and root.exists():
-            here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: there is no moment without `root`
+            here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
             _libc("renameat2", here, os.fsencode(partial), here, os.fsencode(root), exchange)
             shutil.rmtree(partial, ignore_errors=True)
         else:
-            _refuse_full(root)
+            _require_empty(root)
             partial.rename(root)
         sync(root.parent)
     except BaseException:
@@ -72,25 +72,25 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
 
 @contextlib.contextmanager
 def exclusive(folder: Path) -> Generator[None]:
-    """Hold `folder`, which need not exist, for this process; others see a file `.<name>.lock` beside it.
+    """Lock `folder`, which need not exist, for this process by a file `.<name>.lock` next to it.
 
-    If nothing may be written beside it (a container's volume), it is not held. Raises `ManipError`, with the
-    holder's process id, if another process holds it. The kernel lets go of what a killed process held.
+    If the file cannot be written (next to a container's volume), the folder is not locked. Raises `ManipError`, with
+    the owner's process id, if another process holds the lock. The kernel releases locks of a killed process.
     """
     path = folder.absolute().with_name(f".{folder.absolute().name}.lock")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle = _hold(folder, path)
+        handle = _lock(folder, path)
     try:
         yield
     finally:
         if handle is not None:
-            path.unlink(missing_ok=True)  # while it is held, so that nobody else's is removed
+            path.unlink(missing_ok=True)  # before unlocking, so that no other process's file is removed
             os.close(handle)
 
 
-def _hold(folder: Path, path: Path) -> int | None:
-    """Return the lock file, open and locked; None if it may not be written."""
+def _lock(folder: Path, path: Path) -> int | None:
+    """Return the lock file, open and locked; None if it cannot be written."""
     try:
         handle = checks.without_link(str(path), os.O_RDWR | os.O_CREAT)
     except OSError as error:
@@ -108,9 +108,9 @@ def _hold(folder: Path, path: Path) -> int | None:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write `data` to `path` so that `path` holds all of it or what it held before.
+    """Write `data` to `path` atomically, and make its folder.
 
-    Its folder is made. Raises `ManipError` if the disk is full or read-only.
+    Raises `ManipError` if the disk is full or read-only.
     """
     partial = _partial(path)
     with writing(path):
@@ -124,11 +124,11 @@ def write_file(path: Path, data: bytes) -> None:
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
-        sync(path.parent)  # else a power cut may take the new name back
+        sync(path.parent)  # else a power cut may undo the rename
 
 
 def sync(path: Path) -> None:
-    """Have the disk hold a file's content, or a folder's list of names."""
+    """Flush a file's content, or a folder's list of names, to disk."""
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         os.fsync(handle)
@@ -137,13 +137,13 @@ def sync(path: Path) -> None:
 
 
 def _partial(path: Path) -> Path:
-    """A sibling that nobody else has."""
+    """Return a unique sibling."""
     return path.with_name(f".{path.name}.{os.urandom(6).hex()}{PARTIAL}")
 
 
 def _try_lock(handle: int) -> bool:
     """Lock an open file or folder until it is closed; return False if another process holds it."""
-    with contextlib.suppress(OSError):  # of a cluster's file system that knows no locks
+    with contextlib.suppress(OSError):  # a cluster's file system may not support locks
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -152,12 +152,12 @@ def _try_lock(handle: int) -> bool:
 
 
 def _libc(name: str, *arguments: int | bytes) -> None:
-    """Call a function of Linux's C library that Python does not have."""
+    """Call a function of Linux's C library that Python does not wrap."""
     if getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments):
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
 
 
-def _refuse_full(root: Path) -> None:
+def _require_empty(root: Path) -> None:
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise FolderExistsError(root)

@@ -1,4 +1,4 @@
-"""Make datasets of what is on disk: of a folder of journals, of several datasets, of one with other numbers."""
+"""Make datasets: from rollouts or journals, by merging datasets, or by replacing columns of one."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ Rollouts = Iterable[tuple[Journal, Episode]]
 
 @dataclass(frozen=True)
 class Recording:
-    """The dataset that rollouts become: `recording.json` in the folder of their journals.
+    """How rollouts become a dataset: `recording.json` in the folder of their journals.
 
-    A rollout becomes as many episodes as it has parts (see `parts`). only_successes: failed ones are left out.
-    only_labelled: those without a valid label are. episodes: at most so many, the first in seed order; None: all.
-    labels: at most so many valid ones; after the last one `label_valid` is 0, episodes beyond it are left out.
-    provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it. stills:
-    they are PNGs in the data files, for frames that have nothing to do with each other.
+    A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes. only_labelled:
+    leave out episodes without a valid label. episodes: keep at most the first so many in seed order; None: all. labels:
+    keep at most so many valid labels; later ones have `label_valid` 0, and later episodes are left out. provenance: who
+    drove, stored in the dataset. video: fields of `VideoConfig`. stills: store pictures as PNGs in the data files, for
+    frames that are independent scenes.
     """
 
     repo_id: str
@@ -55,27 +55,27 @@ class Recording:
     stills: bool = False
 
     def write(self, journals: Path) -> None:
-        """Write `recording.json` beside the journals."""
+        """Write `recording.json` next to the journals."""
         write_file(journals / RECORDING, (json.dumps(asdict(self), indent=1) + "\n").encode())
 
     @classmethod
     def read(cls, journals: Path) -> Recording:
-        """Return the folder's recording; if it has none, one that takes every episode."""
+        """Return the folder's recording, or one that keeps every episode."""
         path = journals / RECORDING
         if not path.is_file():
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
         with reading(path):
-            data = checks.read_json(path, "what a recording's journals become")
+            data = checks.read_json(path, "the settings of a recording")
             checks.repo_id("repo_id", data.get("repo_id"))
             return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
 
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
-        """Write the dataset of rollouts in seed order; its counts, and how many failed episodes were left out.
+        """Write rollouts in seed order as a dataset; return its info and the number of failed episodes left out.
 
-        Every rollout is taken, also once the dataset is full. The first one's environment is the dataset's; another
-        fingerprint is logged as a warning. Which episodes come in depends on the rollouts alone, so that recording as
-        they come and building later give the same bytes. Raises what `write_dataset` raises, `MismatchError` for a
-        rollout of another robot, task or cameras, `NothingToLearnError` if there is no episode.
+        Every rollout is consumed, even if the dataset is full. The dataset's environment is that of the first; another
+        fingerprint is logged as a warning. The selection depends on the rollouts alone, so that recording directly and
+        building later give the same bytes. Raises what `write_dataset` raises, `MismatchError` for a rollout of another
+        robot, task or cameras, `NothingToLearnError` if there is no episode.
         """
         rollouts = iter(rollouts)
         if (first := next(rollouts, None)) is None:
@@ -109,7 +109,7 @@ class Recording:
                         found, labels = found + 1, labels + own
             if not found:
                 raise NothingToLearnError(
-                    "no episode has labels to learn from: the expert was never queried, or gave no valid label"
+                    "no episode has labels to learn from: the expert was never queried or gave no valid label"
                 )
             provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
 
@@ -118,29 +118,29 @@ class Recording:
         return write_dataset(selected(), root, spec, provenance, replace=replace, **options), failed
 
     def _is_full(self, episodes: int, labels: int) -> bool:
-        """Whether every asked episode or label is in."""
-        asked = (self.episodes, episodes), (self.labels, labels)
-        return any(most is not None and found >= most for most, found in asked)
+        """Whether a limit on episodes or labels is reached."""
+        limits = (self.episodes, episodes), (self.labels, labels)
+        return any(most is not None and found >= most for most, found in limits)
 
 
 def _first_labels(episode: Episode, most: int) -> Episode:
-    """Return the episode with `label_valid` 0 behind its first `most` sound labels."""
+    """Return the episode with `label_valid` 0 after its first `most` valid labels."""
     valid = episode.columns[LABEL_VALID].astype(np.int64)
     kept = valid * (np.cumsum(valid).reshape(valid.shape) <= most)
     return dataclasses.replace(episode, columns=episode.columns | {LABEL_VALID: kept})
 
 
 def local_id(folder: str) -> str:
-    """Return the repository's id, `local/NAME`, of a dataset in a folder of this name, whatever characters it has."""
+    """Return the repository id, `local/NAME`, for a folder's name, which may have any characters."""
     name = re.sub(r"\.{2,}", ".", re.sub(r"[^A-Za-z0-9_.\-]+", "_", folder)).lstrip(".")
     return f"local/{name[: checks.LONGEST_NAME] or 'dataset'}"
 
 
 def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> tuple[Info, int]:
-    """Build the LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
+    """Build a LeRobot dataset from a folder of journals, in seed order; equal to the one that `record` writes.
 
     Returns what `Recording.make` returns. Raises what reading raises, `ManipError` if there is no journal,
-    `FolderExistsError` if `root` holds something, unless `replace` is to swap it for the new one at the end.
+    `FolderExistsError` if `root` is not empty, unless `replace` swaps it for the new one at the end.
     """
     recording = Recording.read(journals)
     if repo_id is not None:
@@ -158,10 +158,10 @@ def merge_datasets(
     fingerprint: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Info:
-    """Merge the episodes of several datasets, in order, into one: equal to `write_dataset` of them.
+    """Merge several datasets, in order, into one; equal to `write_dataset` of all their episodes.
 
-    The fingerprint is the first one's unless given; if theirs differ, a warning is logged. The provenance names the
-    sources and theirs, beside what is given. Films are copied. Raises `MismatchError` naming both sides if the specs
+    fingerprint: by default the first dataset's; if they differ, a warning is logged. The new provenance is the given
+    one with the sources and their provenance. Films are copied. Raises `MismatchError` naming both sides if the specs
     differ.
     """
     if not roots:
@@ -183,10 +183,10 @@ def merge_datasets(
 def rewrite_columns(
     dataset: Dataset, target: Path, columns: Iterable[Columns], provenance: Mapping[str, Any], **options: Any
 ) -> Info:
-    """Write a dataset to `target` with these columns in place of its own; films are copied.
+    """Write a dataset to `target` with some columns replaced; films are copied.
 
-    columns: of every episode in stored order, name -> (T,) or (T, d). options: those of `write_dataset`. Raises what
-    it raises, `ManipError` for columns of other lengths than the episodes.
+    columns: for every episode in stored order, name -> (T,) or (T, d). options: those of `write_dataset`. Raises what
+    it raises, `ManipError` if columns and episodes differ in length.
     """
 
     def changed() -> Iterator[tuple[Episode, Films | None]]:
@@ -198,14 +198,14 @@ def rewrite_columns(
 
 
 def _with_films(dataset: Dataset) -> Iterator[tuple[Episode, Films | None]]:
-    """Yield the episodes of a dataset; pictures in films are not decoded, and come as these."""
+    """Yield the episodes of a dataset; pictures in films are not decoded but passed on as `Films`."""
     films = bool(dataset.spec.cameras and dataset.spec.video)
     for number, episode in enumerate(dataset.read_episodes(pictures=not films)):
         yield episode, (dataset, number) if films else None
 
 
 def dataset_sha256(root: Path) -> str:
-    """Return the hash of what a dataset says in numbers: its description, statistics and columns, not its videos."""
+    """Return the hash of a dataset's description, statistics and columns, without its videos."""
     digest = hashlib.sha256()
     for path in (root / layout.INFO, root / layout.STATS, *sorted(root.glob(layout.DATA_FILES))):
         with path.open("rb") as file:

@@ -1,8 +1,8 @@
-"""The pictures of one camera of a LeRobot v3.0 dataset, in films or in the data files, decoded when they are read.
+"""The pictures of one camera of a LeRobot v3.0 dataset, in films or data files, decoded on reading.
 
-Nothing else opens a picture of a dataset, and this takes MP4, PNG and JPEG alone. FFmpeg looks at what a file holds,
-not at its name: a playlist named `.mp4` makes it open other files and addresses. Pillow hands other formats to other
-programs (EPS to Ghostscript).
+All pictures of datasets are opened here, and only as MP4, PNG or JPEG. By default FFmpeg detects the format from the
+content: a playlist named `.mp4` would make it open other files and URLs. Pillow passes some formats to other programs
+(EPS to Ghostscript).
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ from manip_il.errors import ManipError, MismatchError, UnknownName
 I64 = NDArray[np.int64]
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
-_PIECE_BYTES = 32 * 1024 * 1024  # of pictures that a thread decodes at once
-_PIECE = 32  # frames that are, however large: decoding starts at the last key frame before them
+_PIECE_BYTES = 32 * 1024 * 1024  # size of the pictures that a thread decodes at once
+_PIECE = 32  # least number of these, because decoding starts at the key frame before them
 _OPTIONS = {
     "protocol_whitelist": "file",
-    "enable_drefs": "0",  # tracks that are in other files
+    "enable_drefs": "0",  # no tracks in other files
 }
-_OPEN_FILMS, _OPEN_TABLES = 32, 4  # files that one process holds open
+_OPEN_FILMS, _OPEN_TABLES = 32, 4  # files that one process keeps open
 
 
 @dataclass(frozen=True)
-class Part:
-    """Frames `first` to `first + count - 1` of a file, which are the dataset's from `row` on."""
+class FrameRange:
+    """Frames `first` to `first + count - 1` of a file, which are rows `row` and following of the dataset."""
 
     path: str
     first: int
@@ -56,9 +56,9 @@ class Part:
 
 @dataclass(frozen=True)
 class Camera:
-    """Pictures of one camera. size: height and width; parts: in the order of the frames, each of which they hold once.
+    """Pictures of one camera. size: height and width; parts: in row order, together every frame once.
 
-    films: whether its files are videos; else pictures are cells of the data files.
+    films: whether pictures are in video files; else they are cells of the data files.
     """
 
     root: Path
@@ -67,13 +67,13 @@ class Camera:
     frames: int
     size: tuple[int, int]
     films: bool
-    parts: tuple[Part, ...]
+    parts: tuple[FrameRange, ...]
 
     @classmethod
     def of(cls, root: Path, info: Info, episodes: EpisodeTable, data_files: Sequence[Path], key: str) -> Camera:
-        """Find a camera's pictures without decoding any.
+        """Find a camera's pictures without decoding them.
 
-        Raises `UnknownName` for a column that is no camera, `ManipError` for depth maps, and for a dataset whose files
+        Raises `UnknownName` for a column that is not a camera, `ManipError` for depth maps, and if the dataset's files
         do not hold each frame once.
         """
         cameras = {feature.key: feature for feature in info.of_dtype(*PICTURES)}
@@ -81,18 +81,18 @@ class Camera:
             raise UnknownName(f"camera in {root}", key, cameras)
         feature = cameras[key]
         if not feature.is_rgb:
-            raise ManipError(f"{key} of {root}, of shape {feature.shape}, holds no RGB pictures")
+            raise ManipError(f"{key} of {root} has shape {feature.shape}; expected RGB pictures")
         films = feature.dtype == "video"
         parts = _film_parts(episodes, info, key) if films else _table_parts(root, data_files)
         ends = [part.row + part.count for part in parts]
         if [0, *ends[:-1]] != [part.row for part in parts] or ends[-1:] != [info.frames]:
-            raise ManipError(f"{root}: its files of {key} do not hold each of {info.frames} frames once")
+            raise ManipError(f"{root}: the files of {key} do not hold each of {info.frames} frames once")
         return cls(root, key, info.fps, info.frames, feature.picture_size, films, tuple(parts))
 
     def rows(self, rows: I64) -> Pictures:
-        """Return the pictures of these rows (B,), decoded, (B, height, width, 3).
+        """Return the decoded pictures of these rows (B,), (B, height, width, 3).
 
-        Raises `ManipError` for one that is not there, `MismatchError` for one of another size.
+        Raises `ManipError` if one is missing, `MismatchError` if one has another size.
         """
         wanted, places = np.unique(rows, return_inverse=True)
         starts = np.array([part.row for part in self.parts])
@@ -101,8 +101,8 @@ class Camera:
         found = [self._read(self.parts[which[at[0]]], wanted[at]) for at in np.split(np.arange(len(wanted)), cuts)]
         return np.concatenate(found)[places.reshape(-1)] if len(rows) else np.empty((0, *self.size, 3), np.uint8)
 
-    def _read(self, part: Part, rows: I64) -> Pictures:
-        """Consecutive rows of one part."""
+    def _read(self, part: FrameRange, rows: I64) -> Pictures:
+        """Return the pictures of consecutive rows of one part."""
         path, first = self.root / part.path, part.first + int(rows[0]) - part.row
         with reading(path):
             changed = path.stat().st_mtime_ns
@@ -110,7 +110,7 @@ class Camera:
                 pictures = read_frames(_film(path, changed, threading.get_ident()), first, len(rows), self.fps)
             else:
                 cells = _table(path, changed, self.key)[first : first + len(rows)]
-                # where a cell has no bytes, its `path` is not followed
+                # a cell's `path` is never followed
                 pictures = np.stack([decode_picture((cell or {}).get("bytes")) for cell in cells.to_pylist()])
         if pictures.shape[1:] != (*self.size, 3):
             what, found = f"shape of {self.key}", pictures.shape[1:]
@@ -119,14 +119,14 @@ class Camera:
 
 
 def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None) -> NDArray[np.uint8]:
-    """Return all pictures of cameras, decoded by a thread a core, channels before pixels: (N, 3, height, width).
+    """Return all pictures of cameras, decoded with one thread per core, channels first: (N, 3, height, width).
 
-    They are in a nameless file of the temporary folder, mapped into memory, and go with the array. on_frames: is called
-    with the number of frames decoded since the last call. Raises `ManipError` if there is no room.
+    The array is a memory map of an unnamed temporary file, which is deleted with it. on_frames: called with the number
+    of frames decoded since the last call. Raises `ManipError` if the disk is full.
     """
     shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
-        os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # else a full disk ends the process
+        os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # else a full disk kills the process
         decoded = np.memmap(file, np.uint8, "r+", shape=shape)
 
     def fill(camera: Camera, start: int, rows: I64) -> int:
@@ -146,9 +146,9 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
 
 
 def decode_picture(content: bytes | None) -> Pictures:
-    """Return the picture (height, width, 3) in the content of a PNG or JPEG file.
+    """Decode a PNG or JPEG file's content to a picture (height, width, 3).
 
-    Raises `ValueError` or `OSError` for another format, one that is not RGB, or None.
+    Raises `ValueError` or `OSError` for another format, another colour mode, or None.
     """
     with Image.open(BytesIO(content or b""), formats=("PNG", "JPEG")) as picture:
         if picture.mode != "RGB":
@@ -157,62 +157,62 @@ def decode_picture(content: bytes | None) -> Pictures:
 
 
 def open_video(path: Path) -> InputContainer:
-    """Open an MP4 file for reading; its pictures are not decoded yet. Raises `av.FFmpegError` for what is none."""
+    """Open an MP4 file for reading, without decoding. Raises `av.FFmpegError` if it is not an MP4 file."""
     return av.open(f"file:{path}", format="mp4", options=_OPTIONS)
 
 
 def read_frames(container: InputContainer, first: int, count: int, fps: float) -> Pictures:
     """Decode frames `first` to `first + count - 1` of an open video, (count, height, width, 3).
 
-    Raises `ValueError` if it does not hold each of them, and what the decoder raises.
+    Raises `ValueError` if one is missing, and what the decoder raises.
     """
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]
-    container.seek(round(first / fps / tick), stream=stream)  # to the key frame there or before
+    container.seek(round(first / fps / tick), stream=stream)  # to the last key frame up to there
     pictures: list[NDArray[np.uint8]] = []
-    for frame in itertools.islice(container.decode(stream), first + count):  # also where more claim to come before
+    for frame in itertools.islice(container.decode(stream), first + count):  # bounded even if the file is malicious
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
             pictures.append(frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False))
         if ahead > 0 or len(pictures) == count:
             break
     if len(pictures) != count:
-        raise ValueError(f"it has no frame {first + len(pictures)}; its dataset counts {count} from {first} on")
+        raise ValueError(f"it has no frame {first + len(pictures)}; expected frames {first} to {first + count - 1}")
     return np.stack(pictures)
 
 
 @lru_cache(_OPEN_FILMS)
 def _film(path: Path, changed: int, thread: int) -> InputContainer:
-    """Open a file, as it is since `changed`, for one thread: opening takes longer than decoding an episode."""
+    """Open a file for one thread, cached because opening takes longer than decoding an episode."""
     return open_video(path)
 
 
 @lru_cache(_OPEN_TABLES)
 def _table(path: Path, changed: int, key: str) -> Any:
-    """Return a file's pictures as they are stored."""
+    """Return a file's pictures as stored."""
     return read_file(path, [key]).column(key)
 
 
-def _film_parts(episodes: EpisodeTable, info: Info, key: str) -> list[Part]:
-    """Find consecutive frames of a file that are consecutive frames of the dataset: mostly the whole file."""
+def _film_parts(episodes: EpisodeTable, info: Info, key: str) -> list[FrameRange]:
+    """Return maximal ranges of frames that are consecutive both in a file and in the dataset."""
     clips = episodes.clips[key]
     firsts = np.round(clips.starts * info.fps).astype(np.int64)
-    found: list[Part] = []
+    found: list[FrameRange] = []
     for place in np.argsort(episodes.start, kind="stable"):
         count, row = int(episodes.length[place]), int(episodes.start[place])
         path, first = clips.files[place], int(firsts[place])
         if found and (path, first) == (found[-1].path, found[-1].first + found[-1].count):
             found[-1] = replace(found[-1], count=found[-1].count + count)
         elif count:
-            found.append(Part(path, first, count, row))
+            found.append(FrameRange(path, first, count, row))
     return found
 
 
-def _table_parts(root: Path, data_files: Sequence[Path]) -> list[Part]:
+def _table_parts(root: Path, data_files: Sequence[Path]) -> list[FrameRange]:
     counts = [pq.read_metadata(path).num_rows for path in data_files]
     rows = np.cumsum([0, *counts]).tolist()
     return [
-        Part(path.relative_to(root).as_posix(), 0, count, row)
+        FrameRange(path.relative_to(root).as_posix(), 0, count, row)
         for path, count, row in zip(data_files, counts, rows, strict=False)
         if count
     ]

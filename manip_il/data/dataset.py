@@ -1,6 +1,6 @@
-"""Any LeRobot v3.0 dataset, this program's or anybody's: opened once, as numpy arrays, without torch.
+"""Read any LeRobot v3.0 dataset, ours or not, as numpy arrays, without torch.
 
-Beside LeRobot's files a dataset of this program has `meta/manip_il.json` (`own`); LeRobot's tools drop it.
+Besides LeRobot's files, our datasets have `meta/manip_il.json` (`own`), which LeRobot's tools drop.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
 
 @dataclass(frozen=True)
 class Own:
-    """Content of `meta/manip_il.json`: names and sizes, the environment's fingerprint, where the episodes came from."""
+    """Content of `meta/manip_il.json`: names and sizes, the environment's fingerprint, the episodes' origin."""
 
     spec: s.RobotTaskSpec
     fingerprint: Mapping[str, Any]
@@ -46,9 +46,9 @@ class Own:
 
 
 class Dataset:
-    """A dataset on disk. Everything is read when it is first asked for, once.
+    """A dataset on disk. Everything is read once, on first use.
 
-    Reading raises `ManipError` naming the file that cannot be read.
+    Raises `ManipError` naming a file that cannot be read.
     """
 
     def __init__(self, root: Path, info: Info):
@@ -56,7 +56,7 @@ class Dataset:
 
     @classmethod
     def open(cls, root: Path) -> Dataset:
-        """Open a folder. Raises `ManipError` for one that is no dataset."""
+        """Open a folder. Raises `ManipError` if it is not a dataset."""
         return cls(Path(root), read_info(Path(root)))
 
     def __len__(self) -> int:
@@ -65,7 +65,7 @@ class Dataset:
 
     @property
     def fps(self) -> float:
-        """Frames a second."""
+        """Frame rate [Hz]."""
         return self.info.fps
 
     @property
@@ -75,17 +75,17 @@ class Dataset:
 
     @property
     def cameras(self) -> list[str]:
-        """Names of the columns that are pictures, `observation.images.<camera>`."""
+        """Names of the columns of pictures, `observation.images.<camera>`."""
         return [feature.key for feature in self.info.of_dtype(*PICTURES)]
 
     @cached_property
     def own(self) -> Own | None:
-        """Content of this program's own file; None in a dataset of another program."""
+        """Content of our own file; None in a dataset of another program."""
         path = self.root / layout.OURS
         if not path.exists():
             return None
         with reading(path):
-            ours = checks.read_json(path, "what this program says of its datasets")
+            ours = checks.read_json(path, "manip_il's description of a dataset")
             spec = s.RobotTaskSpec.from_json(ours["spec"])
             return Own(spec, dict(ours["fingerprint"]), dict(ours["provenance"]))
 
@@ -101,22 +101,22 @@ class Dataset:
 
     @cached_property
     def spec(self) -> s.RobotTaskSpec:
-        """The spec that the dataset was written with.
+        """The dataset's spec.
 
-        LeRobot's tools drop our file beside theirs; then it comes from LeRobot's own, the task `unknown`, as for the
-        datasets of other programs: without the columns and cameras that they lack. Raises `ManipError` for a dataset
-        without actions.
+        For datasets of other programs, and after LeRobot's tools have dropped our file, it is derived from LeRobot's
+        files, with task `unknown` and without missing columns and cameras. Raises `ManipError` for a dataset without
+        actions.
         """
         if self.own is not None:
-            one = len(self.tasks) == 1  # else every episode has its own
+            one = len(self.tasks) == 1  # else episodes have different instructions
             return dataclasses.replace(self.own.spec, instruction=self.instruction) if one else self.own.spec
         features = self.features
         if s.ACTION not in features:
-            raise ManipError(f"{self.root} has no column {s.ACTION}: there is nothing to learn from it")
+            raise ManipError(f"{self.root} has no column {s.ACTION}, so there is nothing to learn from it")
         around = features.get(s.ENVIRONMENT_STATE)
         cameras = [features[key] for key in self.cameras if key.startswith(s.IMAGES) and features[key].is_rgb]
         sizes = {one.picture_size for one in cameras}
-        if len(sizes) > 1:  # a spec has one for all
+        if len(sizes) > 1:  # a spec has one size for all cameras
             cameras = []
         robot: dict[str, Any] = {**s.robot_of(self.info.robot or UNKNOWN_ROBOT)}
         return s.RobotTaskSpec(
@@ -139,24 +139,24 @@ class Dataset:
 
     @property
     def instruction(self) -> str:
-        """The text of the first task; empty if there is none."""
+        """The text of the first task; "" if there is none."""
         return next(iter(self.tasks.values()), "")
 
     @cached_property
     def episodes(self) -> EpisodeTable:
-        """One entry an episode: where its frames are, what it is about, what it drew."""
+        """The table of episodes: their frames, tasks and random draws."""
         return read_episode_table(self.root, self.info)
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Statistics by column and name, (n,), of pictures (channels, 1, 1); computed if the dataset has none."""
+        """Statistics by column and name, (n,), or (channels, 1, 1) of pictures; computed if the dataset has none."""
         if (self.root / layout.STATS).exists():
             return read_statistics(self.root)
         return column_statistics(self.columns())
 
     @cached_property
     def data_files(self) -> list[Path]:
-        """The data files, in the order of their rows."""
+        """The data files in row order."""
         paths = sorted(self.root.glob(layout.DATA_FILES))
         if not paths:
             raise ManipError(f"{self.root} has no data: no file matches {layout.DATA_FILES}")
@@ -169,9 +169,9 @@ class Dataset:
         return paths
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; of one file they are read-only.
+        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; they may be read-only.
 
-        names: all numbers by default. Raises `UnknownName` for a column that is not there.
+        names: by default all numeric columns. Raises `UnknownName` for an unknown column.
         """
         if names is None:
             names = [feature.key for feature in self.info.of_dtype(*NUMBERS)]
@@ -181,7 +181,7 @@ class Dataset:
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     def pieces(self, names: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the columns, (T,) or (T, d), of one data file after the other. Raises what `columns` raises."""
+        """Yield the columns, (T,) or (T, d), of each data file. Raises what `columns` raises."""
         known = [key for key, feature in self.features.items() if feature.dtype not in PICTURES]
         for name in names:
             if name not in known:
@@ -193,15 +193,15 @@ class Dataset:
             yield piece
 
     def camera(self, key: str) -> Camera:
-        """Return a camera's pictures, none of them decoded. Raises what `Camera.of` raises."""
+        """Return a camera's pictures, not yet decoded. Raises what `Camera.of` raises."""
         return Camera.of(self.root, self.info, self.episodes, self.data_files, key)
 
     def frames(self, key: str, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a camera's pictures of these rows (B,), decoded, (B, height, width, 3)."""
+        """Return a camera's decoded pictures of these rows (B,), (B, height, width, 3)."""
         return self.camera(key).rows(rows)
 
     def clip(self, key: str, episode: int) -> tuple[Path, int, int]:
-        """Return where a camera's pictures of an episode are: a film, the first frame in it, and their number."""
+        """Return the location of a camera's pictures of an episode: film, first frame, and number of frames."""
         clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)
         first = round(float(clips.starts[place]) * self.fps)
         return self.root / clips.files[place], first, int(self.episodes.length[place])
@@ -212,7 +212,7 @@ class Dataset:
         return read_picture_statistics(self.root, self.cameras)
 
     def rows_of(self, episode: int) -> NDArray[np.int64]:
-        """Return the rows of an episode, (T,). Raises `UsageError` for one that is not there."""
+        """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
         if not 0 <= episode < self.info.episodes:
             raise UsageError(f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}")
         table = self.episodes
@@ -220,9 +220,9 @@ class Dataset:
         return np.arange(table.start[place], table.start[place] + table.length[place])
 
     def read_episodes(self, *, pictures: bool = True) -> Iterator[Episode]:
-        """Yield the episodes of a dataset with this program's columns, in order, scalars as (T, 1) columns.
+        """Yield the episodes of a dataset with our columns, in order, scalars as (T, 1) columns.
 
-        With pictures if wanted. An episode's success is what `next.success` has. One data file is held at a time.
+        pictures: include them. Success is read from `next.success`. One data file is in memory at a time.
         """
         cameras = {key: self.camera(key) for key in self.spec.image_keys} if pictures else {}
         left_out = {} if pictures else self.spec.image_keys
@@ -238,14 +238,14 @@ class Dataset:
                 }
                 own |= {key: piece[key][start:stop].reshape(-1, *shapes[key]) for key in stored}
                 if (text := texts.get(int(task[start]))) is None:
-                    raise ManipError(f"{self.root}: rows have the task {task[start]}, which {layout.TASKS} lacks")
+                    raise ManipError(f"{self.root}: rows have task {task[start]}, which {layout.TASKS} lacks")
                 columns, solved = {key: own[key] for key in shapes}, own[s.SUCCESS]
                 ends = bool(solved.any()), bool(solved[-1])
                 yield Episode(int(own[s.SEED].flat[0]), columns, *ends, text, drawn.get(int(index[start]), {}))
             row += len(index)
 
     def count_successes(self) -> int:
-        """Return how many episodes succeeded at some step; 0 if no column says so."""
+        """Return how many episodes succeeded at some step; 0 without a column of successes."""
         if s.SUCCESS not in self.features:
             return 0
         columns = self.columns([layout.EPISODE_INDEX, s.SUCCESS])
@@ -254,7 +254,7 @@ class Dataset:
 
 
 def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
+    """Read columns, (T,) or (T, d), of several datasets in sequence; frame and episode numbers continue.
 
     Raises what `Dataset.columns` raises.
     """

@@ -1,7 +1,7 @@
-"""Turn transitions into episodes with a dataset's columns, and rollouts into the episodes of a dataset.
+"""Turn transitions into rollouts with a dataset's columns, and rollouts into the episodes of a dataset.
 
-One rollout is one `Episode`: the learner's path, and what the expert did from where it took over or demonstrated a
-branch. Each of these parts ends with `next.done`; in a dataset each is an episode (`parts`).
+One rollout is one `Episode`: the learner's path, followed by the expert's takeover or branches. Each of these parts
+ends with `next.done`; in a dataset each is an episode (`parts`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from manip_il.mdp import Episode, Transition
 
 
 def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
-    """Yield each rollout's transitions as its last one arrives, from interleaved ones."""
+    """Group interleaved transitions by rollout; yield each group when its last transition arrives."""
     running: dict[int, list[Transition]] = {}
     for transition in transitions:
         frames = running.setdefault(transition.seed, [])
@@ -32,8 +32,8 @@ def to_episode(
 ) -> Episode:
     """Return an episode with the schema's columns, (T, 1) or (T, d).
 
-    labelled: with the columns of labels; in frames without one `label_valid` is 0, the phase 0, and the label the
-    executed action. path: the first so many frames decide whether it succeeded; by default all.
+    labelled: include the columns of labels; frames without a label have `label_valid` 0, phase 0, and the executed
+    action as label. path: number of first frames that decide success; by default all.
     """
     count = len(frames)
     columns: dict[str, NDArray[Any]] = {
@@ -72,7 +72,7 @@ def to_episode(
 
 
 def parts(episode: Episode) -> list[Episode]:
-    """Cut a rollout behind every frame that is `next.done`: each part is an episode of a dataset."""
+    """Split a rollout after every frame with `next.done`; each part is an episode of a dataset."""
     ends = np.flatnonzero(episode.columns[schema.DONE].ravel()) + 1
     if len(ends) < 2:
         return [episode]

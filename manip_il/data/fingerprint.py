@@ -1,4 +1,4 @@
-"""Fingerprints of environments: versions and hashes that decide what is computed, and their comparison."""
+"""Fingerprints of environments (versions and hashes that determine the computed bytes) and their comparison."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 from threadpoolctl import threadpool_info
 
-_HASH = 12  # characters that tell two hashes apart
-_LONGEST = 80  # characters of a value in a warning
+_HASH = 12  # printed characters of a hash
+_LONGEST = 80  # printed characters of any other value
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 _MEANING = {
     "model_sha256": "compiled MuJoCo model",
@@ -27,9 +27,9 @@ _MEANING = {
 
 
 def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> dict[str, str]:
-    """Return versions of what computes, the processor, and SHA-256 of the compiled model and of the config.
+    """Return versions of packages, the processor, and SHA-256 hashes of the compiled model and the config.
 
-    Two equal fingerprints promise equal bytes. No package is imported for it: a missing one is `absent`.
+    Equal fingerprints mean equal bytes. No package is imported for it; a missing one is `absent`.
     """
     versions = {name: _version(name) for name in _PACKAGES}
     return {
@@ -43,13 +43,13 @@ def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> di
 
 @functools.cache
 def processor() -> str:
-    """Return what decides the last bits of float arithmetic: vector extensions, BLAS and its kernels, the C library.
+    """Return what affects the last bits of float arithmetic: vector extensions, BLAS and its kernels, the C library.
 
     For example `x86_64 AVX512_ICL, openblas 0.3.29 SkylakeX, glibc 2.36`.
     """
     extensions = [name for name, found in __cpu_features__.items() if found]
     libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
-    # Other packages may have brought a BLAS of their own into this process.
+    # Other packages may have loaded their own BLAS into this process.
     numpys = [one for one in libraries if "numpy" in one["filepath"]] or libraries or [{}]
     blas = " ".join(str(numpys[0].get(key, "")) for key in ("internal_api", "version", "architecture"))
     return f"{platform.machine()} {extensions[-1] if extensions else ''}, {blas}, {' '.join(platform.libc_ver())}"
@@ -58,7 +58,7 @@ def processor() -> str:
 def compare_fingerprints(
     left_name: str, left: Mapping[str, Any], right_name: str, right: Mapping[str, Any]
 ) -> list[str]:
-    """Return one warning, naming both sides, for every entry that differs; an empty list where nothing does."""
+    """Return one warning, naming both sides, for every entry that differs."""
     warnings: list[str] = []
     for key in dict.fromkeys([*left, *right]):
         ours, theirs = left.get(key, "nothing"), right.get(key, "nothing")
@@ -70,9 +70,9 @@ def compare_fingerprints(
 
 
 def canonical_json(value: Any) -> str:
-    """Return JSON with sorted keys and no spaces: equal configs give equal text, whatever their order.
+    """Return JSON with sorted keys and no spaces, so that equal configs give equal text.
 
-    Takes dataclasses as well. Raises `TypeError` for anything else.
+    Also takes dataclasses. Raises `TypeError` for anything else.
     """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=dataclasses.asdict)
 

@@ -1,8 +1,8 @@
-"""Channels of messages that Foxglove shows without settings, one message a frame, and pictures read back from them.
+"""Channels of messages that Foxglove shows without settings, one message per frame, and decoding of their pictures.
 
 Schemas: Foxglove's own in protobuf (`JointStates`, `RawImage`, `Log`), LeRobot's scalars in JSON.
-Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd, which uses what
-successive frames share: on rendered frames of 128 x 128 that took a third of a PNG's bytes and a fifth of its time.
+Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd, which exploits the
+similarity of successive frames: rendered frames of 128 x 128 took a third of a PNG's bytes and a fifth of its time.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from manip_il.data import schema as s
 from manip_il.mdp import Episode
 
 U8 = NDArray[np.uint8]
-Times = Sequence[int]  # nanoseconds, one a frame
+Times = Sequence[int]  # [ns], one per frame
 
 NANOSECONDS = 1_000_000_000
-IMAGE_TOPICS = "/observation/images/"  # before a camera's name, as LeRobot has it
+IMAGE_TOPICS = "/observation/images/"  # prefix of a camera's name, as in LeRobot
 _JOINT_TOPICS = {"/joint_states": s.STATE, "/action": s.ACTION, "/executed_action": s.EXECUTED_ACTION}
 _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 
-# LeRobot's own, word for word (`lerobot.utils.foxglove_visualization`)
+# copied from LeRobot (`lerobot.utils.foxglove_visualization`)
 _NAMED_NUMBER = {"type": "object", "properties": {"label": {"type": "string"}, "value": {"type": "number"}}}
 SCALARS: dict[str, Any] = {
     "type": "object",
@@ -49,7 +49,7 @@ SCALARS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Channel:
-    """One topic. schema: its id is the writer's to give; messages: encoded, one a frame; they can be taken once."""
+    """One topic. schema: its id is set by the writer; messages: encoded, one per frame, an iterator."""
 
     topic: str
     schema: Schema
@@ -74,7 +74,7 @@ def joint_states(topic: str, names: Sequence[str], values: NDArray[Any], times: 
 
 
 def scalars(topic: str, labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Channel:
-    """Make a channel of labelled numbers. rows: T of Python's finite numbers, as JSON has no others."""
+    """Make a channel of labelled numbers. rows: T rows of finite Python numbers, because JSON has no others."""
     # filling a template is five times as fast as encoding a dict
     slots = (f'{{"label":{json.dumps(label).replace("%", "%%")},"value":%r}}' for label in labels)
     template = f'{{"scalars":[{",".join(slots)}]}}'
@@ -83,7 +83,7 @@ def scalars(topic: str, labels: Sequence[str], rows: Iterable[Sequence[float]]) 
 
 
 def images(topic: str, frame_id: str, pictures: Iterable[U8], times: Times) -> Channel:
-    """Make a channel of RGB pictures (height, width, 3), without loss."""
+    """Make a lossless channel of RGB pictures (height, width, 3)."""
     message = RawImage(frame_id=frame_id, encoding="rgb8")
 
     def fill(picture: U8) -> None:
@@ -105,7 +105,7 @@ def texts(topic: str, name: str, lines: Iterable[str], times: Times) -> Channel:
 
 
 def episode_channels(episode: Episode, spec: s.RobotTaskSpec) -> Iterator[Channel]:
-    """Yield every channel that the columns of an episode, which fit the spec, can fill."""
+    """Yield a channel for each of the episode's columns that has one."""
     times, columns = frame_times(episode, spec), episode.columns
     for topic, key in _JOINT_TOPICS.items():
         if key in columns:
@@ -136,9 +136,9 @@ def add_channels(writer: Writer, channels: Sequence[Channel], times: Times) -> N
 
 
 def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8]:
-    """Return every camera's pictures as `images` wrote them; a camera without any is left out.
+    """Return the pictures that `images` wrote, by camera; a camera without pictures is left out.
 
-    chunks: of a file, in order. shape: of what each camera has, (T, height, width, 3).
+    chunks: of a file, in order. shape: of each camera's pictures, (T, height, width, 3).
     """
     pictures: dict[str, U8] = {}
     cameras: dict[int, str] = {}  # by the id of their channel
@@ -162,7 +162,7 @@ def _protobuf_channel[Row](
     rows: Iterable[Row],
     fill: Callable[[Row], None],
 ) -> Channel:
-    """Make a channel of one message a row, which is stamped, filled from the row and encoded."""
+    """Make a channel with one message per row, stamped and filled from the row."""
 
     def messages() -> Iterator[bytes]:
         for time, row in zip(times, rows, strict=True):

@@ -1,8 +1,8 @@
-"""The gate for what arrives from outside: every file is opened once in a child process with bounded memory and time.
+"""The gate for untrusted datasets: every file is opened once in a child process with limited memory and time.
 
-Other readers take the type of a column from a parquet file's own metadata, decode what is in it by that type (audio,
-PDF, any format that Pillow knows), and if a picture's cell has no bytes follow its `path`, an address too. Such files
-are refused.
+Other readers take a column's type from the parquet file's metadata, decode its content accordingly (audio, PDF, any
+format that Pillow knows), and follow the `path`, even a URL, of a picture's cell without bytes. Such files are
+refused.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from manip_il.data.camera import open_video
 from manip_il.data.info import read_info
 from manip_il.errors import ManipError
 
-_BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG
+_PREFIXES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG
 _DEPTH = (b"II*\0", b"MM\0*")  # TIFF, which this program does not open
 _PLAIN = ("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json", "Array2D", "Array3D", "Array4D", "Array5D")
-_BATCH = 64  # rows held at once
+_BATCH = 64  # rows in memory at once
 
 
 def check_arrived(root: Path, *, strict: bool = True) -> None:
-    """Open every file of a dataset in a child process. Raises `ManipError` naming the file that does not pass.
+    """Open every file of a dataset in a child process. Raises `ManipError` naming a file that is refused.
 
-    strict: refuse what is damaged, too; else only what needs too much memory or time or ends the process.
+    strict: refuse damaged files, too; else only files that need too much memory or time or crash the process.
     """
     checks.in_child(str(root), open_files, root, strict)
 
 
 def open_files(root: Path, strict: bool = True) -> None:
     """Open every file of a dataset, in the child process. Raises `ManipError` as `check_arrived` does."""
-    pictures: dict[str, tuple[bytes, ...]] = {}  # column -> what its cells may begin with
-    with suppress(ManipError):  # else no reader gets to its pictures
+    pictures: dict[str, tuple[bytes, ...]] = {}  # column -> allowed prefixes of its cells
+    with suppress(ManipError):  # without a valid info.json nothing reads the pictures
         cameras = read_info(root).of_dtype("image")
-        pictures = {one.key: _BEGIN if one.is_rgb else (*_BEGIN, *_DEPTH) for one in cameras}
+        pictures = {one.key: _PREFIXES if one.is_rgb else (*_PREFIXES, *_DEPTH) for one in cameras}
     for path in sorted(path for path in root.rglob("*") if not path.is_dir()):
         if not path.is_file():
             raise ManipError(
@@ -58,16 +58,16 @@ def open_files(root: Path, strict: bool = True) -> None:
 
 
 def _open_file(path: Path, pictures: Mapping[str, tuple[bytes, ...]]) -> None:
-    """Read a file of a dataset to its end, by its suffix. Raises whatever reading it raises."""
+    """Read a whole file of a dataset according to its suffix. Raises what reading raises."""
     if path.suffix == ".parquet":
         with pq.ParquetFile(path) as file:
             schema = file.schema_arrow
-            cells = {one.name: pictures.get(one.name, _BEGIN) for one in schema if _is_picture(one, pictures)}
+            cells = {one.name: pictures.get(one.name, _PREFIXES) for one in schema if _is_picture(one, pictures)}
             _check_types(schema, len(cells))
             row = 0
             for batch in file.iter_batches(_BATCH, use_threads=False):
-                for key, begin in cells.items():
-                    _check_cells(key, batch.column(key), begin, row)
+                for key, prefixes in cells.items():
+                    _check_cells(key, batch.column(key), prefixes, row)
                 row += len(batch)
     elif path.suffix == ".mp4":
         with closing(open_video(path)) as container:
@@ -82,15 +82,15 @@ def _is_picture(column: pa.Field, pictures: Collection[str]) -> bool:
 
 
 def _check_types(schema: pa.Schema, pictures: int) -> None:
-    """Raise `ValueError` for a type of `datasets` that is decoded, besides those of so many columns of pictures."""
+    """Raise `ValueError` if readers would decode a column other than `pictures` columns of images."""
     about = (schema.metadata or {}).get(b"huggingface", b"").decode(errors="replace")
     decoded = [name for name in re.findall(r'"_type"\s*:\s*"(.*?)"', about) if name not in _PLAIN]
     if decoded != ["Image"] * len(decoded) or len(decoded) > pictures:
         raise ValueError(f"its metadata has columns decoded as {checks.shorten(decoded[-1])}; expected plain values")
 
 
-def _check_cells(key: str, cells: pa.Array, begin: tuple[bytes, ...], first: int) -> None:
-    """Raise `ValueError` unless every cell has the bytes of a picture."""
+def _check_cells(key: str, cells: pa.Array, prefixes: tuple[bytes, ...], first: int) -> None:
+    """Raise `ValueError` unless every cell has the bytes of a picture. first: row of the first cell."""
     kind = cells.type
     place = kind.get_field_index("bytes") if pa.types.is_struct(kind) else -1
     if place < 0 or not (pa.types.is_binary(kind[place].type) or pa.types.is_large_binary(kind[place].type)):
@@ -98,5 +98,5 @@ def _check_cells(key: str, cells: pa.Array, begin: tuple[bytes, ...], first: int
     content: Any = pc.struct_field(cells, "bytes")  # pyright: ignore[reportAttributeAccessIssue]
     begins: list[bytes | None] = pc.binary_slice(content, 0, 8).to_pylist()  # pyright: ignore[reportAttributeAccessIssue]
     for row, found in enumerate(begins, first):
-        if not (found or b"").startswith(begin):
+        if not (found or b"").startswith(prefixes):
             raise ValueError(f"column {key!r} has no PNG or JPEG in row {row:,}; expected its bytes")

@@ -21,14 +21,14 @@ NUMBERS = (
 )
 INDEX_FEATURES = (*layout.INDEX_DTYPES,)
 
-# LeRobot's placeholders alone (`str.format` would also read attributes), and no way out of the dataset
+# allows only LeRobot's placeholders (`str.format` would also read attributes) and paths inside the dataset
 _TEMPLATE = re.compile(r"(?!/)(?!.*\.\.)(?:[^{}]|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
-_MOST = 2**53  # frames
+_MOST = 2**53  # frames or episodes
 
 
 @dataclass(frozen=True)
 class Feature:
-    """One column, or one camera. shape: of one frame."""
+    """One column or camera. shape: of one frame."""
 
     key: str
     dtype: str
@@ -38,12 +38,12 @@ class Feature:
 
     @property
     def size(self) -> int:
-        """Numbers in a frame."""
+        """Number of values in a frame."""
         return math.prod(self.shape)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """One name a number: those of the file, whether a list or lists by group, else `<column>.<place>`."""
+        """A name for each value: from the file (a list, or lists by group), else `<column>.<place>`."""
         names: Any = self.names
         groups = cast(dict[str, Any], names).values() if isinstance(names, dict) else [names]
         found = [str(name) for group in groups if isinstance(group, list) for name in cast(list[Any], group)]
@@ -51,13 +51,13 @@ class Feature:
 
     @property
     def is_rgb(self) -> bool:
-        """Whether it is a camera whose pictures are red, green and blue, and no depth."""
+        """Whether it is a camera with RGB pictures, not depth."""
         depth = self.details.get("is_depth_map") or self.details.get("video.is_depth_map")
         return self.dtype in PICTURES and 3 * math.prod(self.picture_size) == self.size > 0 and not depth
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """Height and width [pixels]; the names say where they stand, else they come first."""
+        """Height and width [pixels], located by the names; without names they come first."""
         names = cast(list[Any], self.names) if isinstance(self.names, list) else []
         if "height" in names and "width" in names and len(names) == len(self.shape):
             return self.shape[names.index("height")], self.shape[names.index("width")]
@@ -83,10 +83,10 @@ class Info:
 
 @contextmanager
 def reading(path: Path) -> Generator[None]:
-    """Raise `ManipError` that names a file, in one line, for whatever is raised while it is read."""
+    """Turn every error raised while a file is read into a one-line `ManipError` that names it."""
     try:
         yield
-    except Exception as error:  # what is in the file decides what a library raises
+    except Exception as error:  # libraries raise anything, depending on the file
         if isinstance(error, ManipError) and str(path) in str(error):
             raise
         reason = getattr(error, "strerror", None) or checks.one_line(error) or type(error).__name__
@@ -96,8 +96,7 @@ def reading(path: Path) -> Generator[None]:
 def read_info(root: Path) -> Info:
     """Read `meta/info.json` of a dataset.
 
-    Raises `ManipError` for a folder that has none, for another version, and for a name or path that leads out of the
-    dataset.
+    Raises `ManipError` if it is missing, has another version, or has a name or path that leads outside the dataset.
     """
     path = root / layout.INFO
     if not path.exists():
@@ -124,7 +123,7 @@ def read_info(root: Path) -> Info:
 
 
 def _feature(key: str, table: dict[str, Any]) -> Feature:
-    checks.name("a feature", key)  # folders and files are named by it
+    checks.name("a feature", key)  # folders and files are named after it
     details = table.get("info") or table.get("video_info") or {}
     shape = tuple(checks.whole("a size in a shape", size, 0, _MOST) for size in table["shape"])
     return Feature(key, table["dtype"], shape, table.get("names"), dict(details))

@@ -1,4 +1,4 @@
-"""One dataset or several learnt from as one, in the words in which LeRobot's factories ask for a dataset's metadata."""
+"""One or more datasets as one training set, with the metadata attributes that LeRobot's factories expect."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from manip_il.data.statistics import PooledStatistics, Statistics
 from manip_il.errors import ManipError, MismatchError
 
 I64 = NDArray[np.int64]
-LEARNT = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)  # columns that datasets taken as one must share
-_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # LeRobot's, for every camera
+LEARNT = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)  # columns that joined datasets must share
+_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # from LeRobot, for every camera
 
 
 class JoinedDatasets:
-    """Datasets in the order in which their frames are numbered.
+    """Several datasets; frames are numbered in the given order.
 
-    features: LeRobot's table of the columns and cameras that all have in one shape, without depth. stats: of all their
-    frames, each counted once; the cameras' are ImageNet's, as `lerobot-train` takes them. tasks: each text once.
+    features: LeRobot's table of the columns and cameras that all have with the same shape, without depth. stats: over
+    all frames; for cameras those of ImageNet, as in `lerobot-train`. tasks: each text once.
 
-    Raises `MismatchError` for several of different rates or columns to learn from.
+    Raises `MismatchError` if rates or training columns differ.
     """
 
     def __init__(self, datasets: Sequence[Dataset]):
         self.datasets, first = tuple(datasets), datasets[0]
         self.roots = tuple(one.root for one in datasets)
-        for other in self.datasets[1:]:  # the rate, and the columns that are learnt from, are the same
+        for other in self.datasets[1:]:
             pairs = {"rate": (first.fps, other.fps)}
             pairs |= {f"column {key}": (_shape(first, key) or "none", _shape(other, key) or "none") for key in LEARNT}
             for what, (ours, theirs) in pairs.items():
@@ -50,16 +50,16 @@ class JoinedDatasets:
         self.tasks = list(dict.fromkeys(text for one in self.datasets for text in one.tasks.values()))
 
     def joint_tasks(self, own: I64) -> I64:
-        """Return the place in `tasks` of every frame's text, (N,), from the number that its dataset has for it, (N,).
+        """Return the index in `tasks` of every frame, (N,), given the `task_index` in its own dataset, (N,).
 
-        Raises `ManipError` for a number without a text.
+        Raises `ManipError` for an index without a text.
         """
         places, found = {text: place for place, text in enumerate(self.tasks)}, list[I64]()
         pieces = np.split(own, np.cumsum([*map(len, self.datasets)])[:-1])
         for dataset, piece in zip(self.datasets, pieces, strict=True):
             numbers, which = np.unique(piece, return_inverse=True)
             if missing := set(numbers.tolist()) - dataset.tasks.keys():
-                raise ManipError(f"{dataset.root}: rows have the task {min(missing)}, which {TASKS} lacks")
+                raise ManipError(f"{dataset.root}: rows have task {min(missing)}, which {TASKS} lacks")
             found.append(np.array([places[dataset.tasks[one]] for one in numbers.tolist()], np.int64)[which])
         return np.concatenate(found)
 
@@ -74,5 +74,5 @@ class JoinedDatasets:
 
 
 def _shape(dataset: Dataset, key: str) -> tuple[int, ...]:
-    """A column's shape; () if there is none."""
+    """Return a column's shape; () if it is missing."""
     return dataset.features[key].shape if key in dataset.features else ()

@@ -1,6 +1,6 @@
 """Journals: one crash-safe MCAP file for every finished episode.
 
-A file is written under a temporary name, synced and renamed, so it is whole or not there. Every column is kept bit for
+A file is written under a temporary name, synced and renamed, so it is complete or absent. Every column is kept bit for
 bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove shows all messages.
 """
 
@@ -32,19 +32,19 @@ _FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
 _NPY = ".npy"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
-_FINAL = "final/"  # what journals of before had of the observation after the last frame
+_FINAL = "final/"  # prefix of the final observation in older journals
 
 
 @dataclass(frozen=True)
 class Journal:
-    """A folder of the journals of episodes of one environment."""
+    """A folder of journals of one environment."""
 
     folder: Path
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
 
     def encode(self, episode: Episode) -> bytes:
-        """Return the content of an episode's journal; the same episode gives the same bytes.
+        """Return an episode's journal as bytes; the same episode gives the same bytes.
 
         Raises `ValueError` for a column that numpy can only pickle.
         """
@@ -55,7 +55,7 @@ class Journal:
         channels, times = foxglove.episode_channels(episode, self.spec), foxglove.frame_times(episode, self.spec)
         foxglove.add_channels(writer, list(channels), times)
         for key, column in episode.columns.items():
-            if not key.startswith(IMAGES):  # pictures travel as messages, without loss as well
+            if not key.startswith(IMAGES):  # pictures are stored as lossless messages
                 numbers = BytesIO()
                 np.save(numbers, column, allow_pickle=False)
                 writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", numbers.getvalue())
@@ -63,7 +63,7 @@ class Journal:
         return stream.getvalue()
 
     def store(self, seed: int, content: bytes) -> Path:
-        """Write what `encode` gave to disk, in place of an earlier file of the seed; return its path."""
+        """Write the bytes from `encode` to disk, replacing an earlier file of the seed; return its path."""
         path = episode_path(self.folder, seed)
         write_file(path, content)
         return path
@@ -73,10 +73,10 @@ class Journal:
         return self.store(episode.seed, self.encode(episode))
 
     def prepare(self) -> list[str]:
-        """Check that episodes may be added to the folder; return warnings to show.
+        """Check that episodes can be added to the folder; return warnings to show.
 
-        Unfinished files of killed writers are removed, so no other writer may be at work. The first journal speaks for
-        all. Raises `MismatchError` if it is of another robot, task or cameras, and what `read_journal` raises.
+        Removes unfinished files of killed writers, so no other writer may be running. Checks the first journal only:
+        raises `MismatchError` if it has another robot, task or cameras, and what `read_journal` raises.
         """
         for leftover in self.folder.glob(f".episode-*{PARTIAL}"):
             leftover.unlink(missing_ok=True)
@@ -89,25 +89,25 @@ class Journal:
 
 
 def episode_path(folder: Path, seed: int) -> Path:
-    """Return the path of the journal of a seed."""
+    """Return the path of a seed's journal."""
     return folder / f"episode-{seed:012d}.mcap"
 
 
 def list_seeds(folder: Path) -> list[int]:
-    """Return the seeds of the folder's finished episodes, in order; none where the folder does not exist."""
+    """Return the seeds of the folder's finished episodes, in order; [] if the folder does not exist."""
     return sorted(int(match[1]) for path in folder.glob("episode-*.mcap") if (match := _NAME.fullmatch(path.name)))
 
 
 def list_episodes(folder: Path) -> list[Path]:
-    """Return the folder's finished episodes in the order of their seeds; none where the folder does not exist."""
+    """Return the folder's finished episodes in seed order; [] if the folder does not exist."""
     return [episode_path(folder, seed) for seed in list_seeds(folder)]
 
 
 def read_journal(path: Path) -> tuple[Journal, Episode]:
-    """Return an episode as it was written, bit for bit, and the environment that it comes from.
+    """Read an episode, bit for bit, and the description of its environment.
 
-    Raises `ManipError` naming the file if it is cut short, changed, or none of ours, `OlderSchemaError` for another
-    version of ours.
+    Raises `ManipError` naming the file if it is truncated, changed or not ours, `OlderSchemaError` if its version is
+    older.
     """
     try:
         with path.open("rb") as stream:
@@ -115,14 +115,14 @@ def read_journal(path: Path) -> tuple[Journal, Episode]:
     except OlderSchemaError as error:
         error.args = (f"{path}: {error}",)
         raise
-    except Exception as error:  # what has right checksums and is none of ours can make a parser raise anything
+    except Exception as error:  # a foreign file with valid checksums can make a parser raise anything
         why = checks.one_line(error) or type(error).__name__
-        again = "delete it, and --resume=true records it again"
+        again = "delete it; --resume=true records it again"
         raise ManipError(f"{path} is not a complete episode: {why}; {again}") from error
 
 
 def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
-    """Take a file apart, whose checksums are compared."""
+    """Read a file and verify its checksums."""
     texts: Mapping[str, str] = {}
     columns: dict[str, NDArray[Any]] = {}
     chunks: list[Chunk] = []
@@ -133,7 +133,7 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
             columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
         elif isinstance(record, Chunk):
             chunks.append(record)
-        elif isinstance(record, DataEnd):  # the checksum that it holds was right
+        elif isinstance(record, DataEnd):  # all checksums were verified
             break
     if (found := texts.get("format")) == "1":
         raise OlderSchemaError("1", schema.VERSION)
@@ -142,7 +142,7 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
     spec, fingerprint = RobotTaskSpec.from_json(values.pop("spec")), values.pop("fingerprint")
     frames = values.pop("frames")
-    if spec.cameras:  # else nothing in the messages is needed
+    if spec.cameras:  # else the messages are not needed
         pictures = foxglove.read_images(chunks, (frames, *spec.image_size, 3))
         columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
     # journals of older versions have neither instruction nor draws
@@ -150,7 +150,7 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
 
 
 def _to_texts(journal: Journal, episode: Episode) -> dict[str, str]:
-    """Return all but the columns as JSON by name."""
+    """Return everything except the columns as JSON, by name."""
     values: dict[str, Any] = {
         "seed": episode.seed,
         "success": bool(episode.success),

@@ -1,4 +1,4 @@
-"""Files of JSON lines, a record each: a kill costs at most the line that it cut short."""
+"""Files with one JSON record per line; a kill truncates at most the last line."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Record = Mapping[str, Any]
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Return every record, without a last line that was cut short; none if there is no file.
+    """Return every record, except a truncated last line; [] if there is no file.
 
-    A number that is not finite is None. Raises `ManipError` naming any other line that is not a JSON object.
+    Non-finite numbers are None. Raises `ManipError` naming any other line that is not a JSON object.
     """
     lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
     whole = [line for line in lines if line.endswith(b"\n")]
@@ -26,7 +26,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def append_line(path: Path, record: Record) -> None:
-    """Add a record, in place of a last line that was cut short; a number that is not finite is null."""
+    """Append a record, replacing a truncated last line; non-finite numbers become null."""
     line = json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n"
     with writing(path), _open(path) as file:
         size = file.seek(0, os.SEEK_END)
@@ -36,7 +36,7 @@ def append_line(path: Path, record: Record) -> None:
             file.truncate(file.read().rfind(b"\n") + 1)
         file.seek(0, os.SEEK_END)
         file.write(line)
-        file.flush()  # here, where a full disk is named
+        file.flush()  # inside `writing`, which names a full disk
 
 
 def _open(path: Path) -> BinaryIO:
@@ -53,5 +53,5 @@ def _finite(record: Record) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return numpy scalars and arrays, and paths, as JSON values."""
+    """Return a numpy scalar, an array or a path as a JSON value."""
     return value.tolist() if hasattr(value, "tolist") else str(value)

@@ -1,6 +1,6 @@
 """Paths of a LeRobot v3.0 dataset and the Arrow types of its columns (lerobot 0.6.1, `datasets/utils.py`).
 
-Restated here, and held against the library by the tests, because importing `lerobot.datasets` imports torch (seconds).
+Copied here, and compared with the library by tests, because importing `lerobot.datasets` imports torch (seconds).
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from typing import Any
 
 import pyarrow as pa
 
-Features = dict[str, dict[str, Any]]  # column or camera -> dtype, shape of a frame, names
+Features = dict[str, dict[str, Any]]  # column or camera -> dtype, shape per frame, names
 VERSION = "v3.0"
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
-OURS = "meta/manip_il.json"  # spec, fingerprint, provenance: LeRobot does not touch files that it does not know
+OURS = "meta/manip_il.json"  # spec, fingerprint, provenance; LeRobot ignores it
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 DATA_FILES = "data/*/*.parquet"
 EPISODES_FILES = "meta/episodes/*/*.parquet"
-CHUNKS_SIZE = 1000  # files in one chunk folder
+CHUNKS_SIZE = 1000  # files per chunk folder
 DATA_FILES_SIZE_IN_MB = 100
 VIDEO_FILES_SIZE_IN_MB = 200
 
@@ -32,12 +32,12 @@ FRAME_INDEX = "frame_index"
 EPISODE_INDEX = "episode_index"
 INDEX = "index"
 TASK_INDEX = "task_index"
-DRAWN = "drawn"  # of meta/episodes, ours: what an episode drew, as JSON
+DRAWN = "drawn"  # our column in meta/episodes: an episode's random draws, as JSON
 
 INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's content, and the name that it had
-VIDEO_COLUMNS = {  # of meta/episodes, behind `videos/<camera column>/`
+PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's content and its original name
+VIDEO_COLUMNS = {  # in meta/episodes, with the prefix `videos/<camera column>/`
     "chunk_index": pa.int64(),
     "file_index": pa.int64(),
     "from_timestamp": pa.float64(),
@@ -47,19 +47,19 @@ STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
 def all_features(own: Features) -> Features:
-    """Return a dataset's own features and LeRobot's five, in the order of the columns."""
+    """Return a dataset's own features and LeRobot's five, in column order."""
     return {**own, **{key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_DTYPES.items()}}
 
 
 def data_schema(features: Features) -> pa.Schema:
-    """Return Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
+    """Return the Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
 
     Its metadata holds the Hugging Face features that `datasets` reads.
     """
     fields: list[pa.Field] = []
     hugging_face: dict[str, Any] = {}
     for key, feature in features.items():
-        if feature["dtype"] == "video":  # in files of their own
+        if feature["dtype"] == "video":  # stored in separate files
             continue
         if feature["dtype"] == "image":
             fields.append(pa.field(key, PICTURE))
@@ -81,9 +81,9 @@ def data_schema(features: Features) -> pa.Schema:
 
 
 def episodes_schema(features: Features, *, drawn: bool) -> pa.Schema:
-    """Return Arrow schema of `meta/episodes`: one row an episode, statistics of every column included.
+    """Return the Arrow schema of `meta/episodes`: one row per episode, including statistics of every column.
 
-    drawn: with a column of what episodes drew.
+    drawn: include a column of the episodes' random draws.
     """
     columns = {EPISODE_INDEX: pa.int64(), "tasks": pa.list_(pa.string())}
     for name in ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"):
@@ -101,7 +101,7 @@ def episodes_schema(features: Features, *, drawn: bool) -> pa.Schema:
 
 
 def tasks_table(instructions: Sequence[str]) -> pa.Table:
-    """Return the tasks, as pandas would write them with `task` for its index: LeRobot looks tasks up by that index."""
+    """Return the table of tasks, written like pandas with `task` as index, by which LeRobot looks them up."""
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
         for name, kind, numpy_type in ((TASK_INDEX, "int64", "int64"), ("task", "unicode", "object"))
@@ -113,19 +113,19 @@ def tasks_table(instructions: Sequence[str]) -> pa.Table:
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
-    """Return path, chunk and file index of the `number`-th file. names: other fields of the template."""
+    """Return path, chunk index and file index of the `number`-th file. names: other fields of the template."""
     chunk, file = divmod(number, CHUNKS_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **names), chunk, file
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write `data` laid out as LeRobot does."""
+    """Write `data` in LeRobot's JSON layout."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
 def _stat_type(name: str, is_picture: bool) -> pa.DataType:
-    """One number a dimension; of pictures one a channel, as (3, 1, 1)."""
+    """Return a statistic's type: one number per dimension, or per channel of pictures, as (3, 1, 1)."""
     if name == "count":
         return pa.list_(pa.int64())
     return pa.list_(pa.list_(pa.list_(pa.float64()))) if is_picture else pa.list_(pa.float64())

@@ -1,7 +1,7 @@
-"""Write LeRobot v3.0 datasets with pyarrow and PyAV, episode by episode, in memory that does not grow.
+"""Write LeRobot v3.0 datasets with pyarrow and PyAV, episode by episode, in constant memory.
 
-LeRobot's own writer takes 80 to 160 ms an episode and loses all of them when it is killed; this one writes the same
-files in a few milliseconds an episode, and the dataset is there whole or not at all. Tests read it with LeRobot.
+LeRobot's own writer takes 80 to 160 ms per episode and loses all of them when it is killed. This one writes the same
+files in a few milliseconds per episode, and the dataset appears complete or not at all. Tests read it with LeRobot.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
-_GROUP_ROWS = 1_000  # frames in a row group
-_EPISODE_ROWS = 100  # rows of meta/episodes held before they are written
-_FORMAT = 1  # of meta/manip_il.json
+_GROUP_ROWS = 1_000  # frames per row group
+_EPISODE_ROWS = 100  # rows of meta/episodes that are buffered
+_FORMAT = 1  # version of meta/manip_il.json
 Columns = Mapping[str, NDArray[Any]]
-Films = tuple[Dataset, int]  # a dataset and the number of its episode that has the same pictures, in films
+Films = tuple[Dataset, int]  # a dataset, and the number of its episode with the same pictures, in films
 
 
 def write_dataset(
@@ -48,13 +48,13 @@ def write_dataset(
     video: VideoConfig | None = None,
     replace: bool = False,
 ) -> Info:
-    """Write the episodes, in order, as a dataset of this program's columns; return what its `info.json` says.
+    """Write the episodes, in order, as a dataset with our columns; return its `info.json`.
 
-    It appears whole. Episodes are taken one by one and not kept; the same ones in the same order give the same bytes,
-    videos included. One that comes with films has them copied. provenance: where they came from; it is read after the
-    last one. video: LeRobot's settings by default. replace: as in `new_folder`. Raises `FolderExistsError` if `root`
-    holds something, `UsageError` for pictures or settings that the encoder refuses, both before an episode is taken;
-    what `ordered_columns` raises for one that does not fit; `ManipError` if there is none, or no space.
+    The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
+    give the same bytes, videos included. Films of an episode are copied. provenance: the episodes' origin, read after
+    the last one. video: by default LeRobot's settings. replace: as in `new_folder`. Before taking an episode, raises
+    `FolderExistsError` if `root` is not empty, and `UsageError` for pictures or settings that the encoder refuses; then
+    what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
     """
     video = video or VideoConfig()
     if spec.cameras and spec.video:
@@ -73,9 +73,9 @@ def write_dataset(
 
 
 class TableWriter:
-    """Writes a LeRobot dataset of any features into a folder, an episode after the other.
+    """Writes a LeRobot dataset with any features into a folder, episode by episode.
 
-    features: of the dataset's own columns and cameras. drawn: whether episodes say what they drew.
+    features: the dataset's own columns and cameras. drawn: whether episodes come with their random draws.
     """
 
     def __init__(
@@ -97,15 +97,15 @@ class TableWriter:
         self.films = {key: CameraFiles(folder, key, video or VideoConfig(), int(fps)) for key in films}
         self._pooled = PooledStatistics()
         self._rows: list[dict[str, Any]] = []
-        self._tasks: dict[str, int] = {}  # text -> its number, as they first appear
+        self._tasks: dict[str, int] = {}  # text -> index, in order of first appearance
         self.episodes = self.frames = 0
 
     def add_columns(
         self, columns: Columns, tasks: Sequence[str], drawn: str | None = None, films: Films | None = None
     ) -> None:
-        """Append an episode. columns: (T,) or (T, ...) by name; pictures (T, height, width, 3). tasks: of every frame.
+        """Append an episode. columns: (T,) or (T, ...), pictures (T, height, width, 3). tasks: text of every frame.
 
-        drawn: what it drew, as JSON. films: where its pictures are copied from. Raises what writing raises.
+        drawn: random draws, as JSON. films: the source of copied pictures. Raises what writing raises.
         """
         numbers = np.array([self._tasks.setdefault(text, len(self._tasks)) for text in tasks], np.int64)
         columns = {**columns, **self._index_columns(numbers)}
@@ -144,16 +144,16 @@ class TableWriter:
         self.frames += len(numbers)
 
     def close_files(self) -> None:
-        """Write what is written once a dataset. Raises `ManipError` if there was no episode."""
+        """Write `info.json`, tasks and statistics, and close all files. Raises `ManipError` without episodes."""
         if not self.episodes:
-            raise ManipError("no episodes: there is no dataset to write")
+            raise ManipError("there are no episodes to write")
         self._write_rows()
         for files in (self._data, self._meta, *self.films.values()):
             files.close()
         table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in self.features.items()}
         for key, film in self.films.items():
             table[key]["info"] = film.info()
-        about = {  # keys in LeRobot's order
+        about = {  # in LeRobot's order
             "codebase_version": layout.VERSION,
             "fps": self._fps,
             "features": table,
@@ -174,9 +174,9 @@ class TableWriter:
         layout.write_json(self.folder / layout.STATS, to_lists(self._pooled.result()))
 
     def close(self) -> None:
-        """Close files, finished or not."""
+        """Close all files, complete or not."""
         for files in (self._data, self._meta, *self.films.values()):
-            with suppress(OSError):  # a full disk was reported before
+            with suppress(OSError):  # a full disk was already reported
                 files.close()
 
     def _index_columns(self, tasks: NDArray[np.int64]) -> Columns:
@@ -190,7 +190,7 @@ class TableWriter:
         }
 
     def _write_rows(self) -> None:
-        """The rows of meta/episodes that are held."""
+        """Write the buffered rows of meta/episodes."""
         if not self._rows:
             return
         chunk, file = self._meta.next_place()

@@ -1,8 +1,7 @@
-"""Parquet files of datasets: write numbered ones a row group at a time, read columns, tasks and the table of episodes.
+"""Parquet files of datasets: write numbered files by row groups, read columns, tasks and the table of episodes.
 
-An episode's draws are this program's: text in a column of its own of `meta/episodes`, one JSON object an episode, `{}`
-for nothing. LeRobot's merge keeps the column, its split and delete drop it; every frame's `sim_state` has the draws
-all the same.
+The random draws of an episode are a column of ours in `meta/episodes`, one JSON object per episode. LeRobot's merge
+keeps the column, its split and delete drop it; `sim_state` has the draws in any case.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ I64, F64 = NDArray[np.int64], NDArray[np.float64]
 
 
 class ParquetFiles:
-    """Numbered parquet files, one open at a time; a new one starts once the open one is full.
+    """Numbered parquet files, one open at a time; when it is full, the next one is started.
 
-    group_rows: rows that a row group has at least, but for a file's last. A writer keeps a description of every row
-    group in memory until the file is closed, so many small ones would cost more than the rows.
+    group_rows: least number of rows in a row group, except a file's last. A writer keeps a description of every row
+    group in memory until the file is closed, so many small ones would need more memory than the rows.
     """
 
     def __init__(self, folder: Path, template: str, schema: pa.Schema, group_rows: int = 1):
@@ -46,14 +45,14 @@ class ParquetFiles:
         self._waiting_bytes = 0
 
     def next_place(self) -> tuple[int, int]:
-        """Return the chunk and file index that the next rows go to."""
+        """Return the chunk and file index of the next rows."""
         written = self._path.stat().st_size if self._writer is not None else 0
         if written + self._waiting_bytes >= self._limit:
             self.close()
         return layout.numbered(self._template, self._number)[1:]
 
     def write(self, table: pa.Table) -> tuple[int, int]:
-        """Append rows; return the chunk and file index that they go to."""
+        """Append rows; return their chunk and file index."""
         place = self.next_place()
         self._waiting.append(table)
         self._waiting_bytes += table.nbytes
@@ -62,11 +61,11 @@ class ParquetFiles:
         return place
 
     def close(self) -> None:
-        """Close the open file, if any; the next write opens the next one."""
+        """Close the open file, if any; the next write starts a new one."""
         if self._waiting:
             self._flush()
         if self._writer is not None:
-            writer, self._writer = self._writer, None  # first: a full disk lets no file be closed twice
+            writer, self._writer = self._writer, None  # first, so that an error on closing is raised once
             writer.close()
             self._number += 1
 
@@ -80,8 +79,8 @@ class ParquetFiles:
             self._writer = pq.ParquetWriter(
                 *(self._path, self.schema),
                 compression="snappy",
-                use_dictionary=repeating,  # the numbers of a vector seldom do
-                write_page_checksum=True,  # else a changed bit is read as another number
+                use_dictionary=repeating,  # numbers in vectors seldom repeat
+                write_page_checksum=True,  # detects changed bits
             )
         self._writer.write_table(table)
 
@@ -106,40 +105,38 @@ def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table
 def _to_png(picture: NDArray[np.uint8]) -> bytes:
     """Return a picture (height, width, 3) as the content of a PNG file."""
     stream = BytesIO()
-    Image.fromarray(picture).save(
-        stream, "PNG", compress_level=1
-    )  # the next levels save a tenth and take twice as long
+    Image.fromarray(picture).save(stream, "PNG", compress_level=1)  # higher levels save a tenth and take twice as long
     return stream.getvalue()
 
 
 def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return columns of a file, those that it has. Raises `ManipError` if it is damaged."""
+    """Return those of the columns that a file has. Raises `ManipError` if it is damaged."""
     with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
-        # one thread: handing out pieces of one episode costs more than reading them
+        # one thread: distributing pieces of one episode costs more than reading them
         return file.read(list(columns), use_threads=False).replace_schema_metadata(None)
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Return a dataset's tasks by their number; the column of texts is pandas' index, with a name or without."""
+    """Return a dataset's tasks by index; their texts are the pandas index, with or without a name."""
     path = root / layout.TASKS
     with reading(path):
         table = read_file(path, pq.read_schema(path).names)
         texts = [one.name for one in table.schema if one.type in (pa.string(), pa.large_string())]
-        name = "task" if "task" in texts else texts[-1]  # pandas writes an index behind the columns
+        name = "task" if "task" in texts else texts[-1]  # pandas writes the index after the columns
         return dict(zip(table.column(layout.TASK_INDEX).to_pylist(), table.column(name).to_pylist(), strict=True))
 
 
 def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
-    """Return a column, (T,) or (T, *shape), as its feature says; text as objects.
+    """Return a column, (T,) or (T, *shape), with its feature's dtype; text as objects.
 
-    Raises `ValueError` if values have another kind or shape, or some are missing.
+    Raises `ValueError` if values have another kind or shape, or are missing.
     """
     array: Any = column.combine_chunks()
     is_vector = feature.size > 1
     while isinstance(array, pa.ExtensionArray | pa.ListArray | pa.FixedSizeListArray):
         array, is_vector = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten(), True
     dtype = np.dtype(feature.dtype if feature.dtype in NUMBERS else object)
-    try:  # files may hold numbers narrower
+    try:  # files may hold narrower numbers
         values = array.to_numpy(zero_copy_only=False).astype(dtype, casting="same_kind", copy=False)
         return values.reshape(len(column), *feature.shape if is_vector else ())
     except (TypeError, ValueError) as error:
@@ -148,8 +145,8 @@ def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class Clips:
-    """Places of one camera's episodes, one entry an episode: a video file, and the start in it [s]."""
+class VideoSpans:
+    """Where one camera's episodes are, one entry per episode: the video file, and the start in it [s]."""
 
     files: list[str]
     starts: F64
@@ -157,14 +154,14 @@ class Clips:
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """One entry an episode. drawn: by the index of the episode."""
+    """Columns with one entry per episode. drawn: random draws by episode index."""
 
     index: I64
     length: I64
     start: I64
     stop: I64
     tasks: list[list[str]]
-    clips: dict[str, Clips]  # camera column -> places
+    clips: dict[str, VideoSpans]  # by camera column
     drawn: dict[int, dict[str, Any]] = field(default_factory=dict[int, dict[str, Any]])
 
     def __len__(self) -> int:
@@ -172,7 +169,7 @@ class EpisodeTable:
 
 
 def read_episode_table(root: Path, info: Info) -> EpisodeTable:
-    """Read all files of `meta/episodes`, but for statistics. Raises `ManipError` naming what cannot be read."""
+    """Read `meta/episodes`, without statistics. Raises `ManipError` naming a file that cannot be read."""
     paths = sorted(root.glob(layout.EPISODES_FILES))
     if not paths:
         raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
@@ -184,14 +181,14 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
         def numbers(name: str) -> I64:
             return table.column(name).cast(pa.int64()).to_numpy()
 
-        def clips(key: str) -> Clips:
+        def clips(key: str) -> VideoSpans:
             places = zip(
                 *(numbers(f"videos/{key}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True
             )
             files = [
                 info.video_path.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places
             ]
-            return Clips(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
+            return VideoSpans(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
         index, none = numbers(layout.EPISODE_INDEX), [None] * len(table)
         drawn, tasks = (
@@ -213,7 +210,7 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
 
 
 def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statistics]:
-    """Return the statistics of every episode's pictures, of cameras by their column, as far as there are any."""
+    """Return the stored statistics of every episode's pictures, by camera column."""
     found: list[Statistics] = []
     for path in sorted(root.glob(layout.EPISODES_FILES)):
         names = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}

@@ -1,4 +1,4 @@
-"""The columns of a dataset: keys, dtypes, shapes (LeRobot v3.0), and the checks that an episode fits them."""
+"""The columns of a dataset: keys, dtypes and shapes (LeRobot v3.0), and checks that an episode fits them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from manip_il.tasks.stock.table import TWO_ARMS
 
 STATE = "observation.state"
 ENVIRONMENT_STATE = "observation.environment_state"
-IMAGES = "observation.images."  # before a camera's name
+IMAGES = "observation.images."  # prefix of a camera's name
 ACTION = "action"
 EXECUTED_ACTION = "executed_action"
 ACTOR = "actor"
@@ -30,28 +30,28 @@ SEED = "seed"
 ROUND = "round"
 BETA = "beta"
 
-OWN_OBJECT = "the task's own"  # what an empty name of an object means
+OWN_OBJECT = "the task's own"  # meaning of an empty object name
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
-SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as LeRobot's recorder has them
+SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as in LeRobot's recorder
 JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
-LEROBOT_TYPES = {"so_follower": "so101"}  # robots of another name here, by their `robot_type`
-VERSION = 2  # of these columns and what they mean: 2 has progress, whole states and named phases
-MOST_FPS = 10_000  # control steps a second
-_LARGEST_SIZE = 1_000_000  # of a state [numbers] or a side of a picture [pixels]
+LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, if it differs
+VERSION = 2  # version of the columns and their meaning: 2 has progress, complete states and named phases
+MOST_FPS = 10_000  # highest control rate [Hz]
+_LARGEST_SIZE = 1_000_000  # largest state [numbers] or picture side [pixels]
 MUST_AGREE = ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning")
-_MAY_LACK = ("object", "robot_type", "video", "keypoints")  # of a spec as JSON
+_OPTIONAL = ("object", "robot_type", "video", "keypoints")  # keys of a spec's JSON that may be missing
 
 
 @dataclass(frozen=True)
 class RobotTaskSpec:
     """Names, sizes and rate that a dataset, a policy and an environment must share.
 
-    Robot, task and cameras may become parts of paths. Raises `ManipError` naming what is wrong.
+    Names of robot, task and cameras are safe in paths. Raises `ManipError` naming an invalid value.
     """
 
     robot: str
     task: str
-    fps: int  # control steps a second
+    fps: int  # control rate [Hz]
     joint_names: tuple[str, ...]  # n: arm joints, then the gripper
     environment_state_names: tuple[str, ...]  # k
     sim_state_size: int  # m
@@ -60,11 +60,11 @@ class RobotTaskSpec:
     action_meaning: str = OPENINGS
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
-    phases: tuple[str, ...] = ()  # what `expert_phase` counts: none, then the rungs of the task's ladder
-    object: str = ""  # shape and size of what the task moves; empty for the task's own
-    robot_type: str = ""  # the robot as LeRobot calls it; empty if that is `robot`
-    video: bool = True  # whether pictures are frames of video files; else each is a PNG in the data files
-    keypoints: tuple[str, ...] = ()  # points of the scene whose places in every camera's picture are columns
+    phases: tuple[str, ...] = ()  # names of the values of `expert_phase`: none, then the rungs of the task's ladder
+    object: str = ""  # shape and size of the object that the task moves; empty for the task's own
+    robot_type: str = ""  # LeRobot's name of the robot; empty if it is `robot`
+    video: bool = True  # whether pictures are in video files; else they are PNGs in the data files
+    keypoints: tuple[str, ...] = ()  # points of the scene with columns of their image coordinates, for every camera
     schema: int = VERSION
 
     def __post_init__(self) -> None:
@@ -76,17 +76,17 @@ class RobotTaskSpec:
         for camera in self.cameras:
             checks.name("a camera", camera)
         if len(set(self.cameras)) < len(self.cameras):
-            raise ManipError(f"cameras are {checks.shorten(self.cameras)}; expected each once")
+            raise ManipError(f"cameras are {checks.shorten(self.cameras)}; expected each one once")
 
     def to_json(self) -> dict[str, Any]:
-        """Return the spec as JSON types; without what may lack if it is empty, and without video if it is true."""
+        """Return the spec as JSON types, without optional keys that have their default."""
         values = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
         values |= {"video": None if self.video else False, "keypoints": list(self.keypoints) or None}
-        return {key: value for key, value in values.items() if value not in ("", None) or key not in _MAY_LACK}
+        return {key: value for key, value in values.items() if value not in ("", None) or key not in _OPTIONAL}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
-        """Return the inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
+        """Return the spec that `to_json` wrote; raises `ManipError` for a missing or unknown key."""
         if (found := data.get("schema", 1)) != VERSION:
             raise OlderSchemaError(checks.shorten(found), VERSION)
         values: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in data.items()}
@@ -97,7 +97,7 @@ class RobotTaskSpec:
 
     @property
     def lerobot_type(self) -> str:
-        """Name of the robot in LeRobot's `meta/info.json`."""
+        """The robot's name in LeRobot's `meta/info.json`."""
         return self.robot_type or self.robot
 
     @property
@@ -107,12 +107,12 @@ class RobotTaskSpec:
 
     @property
     def keypoint_keys(self) -> dict[str, str]:
-        """Column -> camera; none if no points are named."""
+        """Column -> camera; {} if no points are named."""
         return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
 
 
 def robot_of(robot_type: str) -> dict[str, str]:
-    """Return what a spec says of a robot by LeRobot's name of it."""
+    """Return the fields of a spec that follow from LeRobot's name of a robot."""
     if robot_type not in LEROBOT_TYPES:
         return {"robot": robot_type}
     return {"robot": LEROBOT_TYPES[robot_type], "robot_type": robot_type, "action_meaning": SERVOS}
@@ -143,7 +143,7 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
 
 
 def keypoint_numbers(spec: RobotTaskSpec) -> list[str]:
-    """Return names of the numbers (3 K,) of a camera's keypoints."""
+    """Return the names of the numbers (3 K,) of a camera's keypoints."""
     return [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
 
 
@@ -156,10 +156,10 @@ def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
 
 
 def check_same_spec(left_name: str, left: Any, right_name: str, right: RobotTaskSpec, also: Sequence[str] = ()) -> None:
-    """Raise `MismatchError` unless actions and observations mean the same on both sides.
+    """Raise `MismatchError` unless actions and observations have the same meaning on both sides.
 
-    The task may differ: a policy may be tried on another one. left: a spec, or what has its fields. also: other fields
-    that must agree.
+    The task may differ, so that a policy can be tried on another one. left: a spec, or an object with its fields. also:
+    other fields that must agree.
     """
     for what in (*MUST_AGREE, *also):
         ours, theirs = getattr(left, what), getattr(right, what)
@@ -169,7 +169,7 @@ def check_same_spec(left_name: str, left: Any, right_name: str, right: RobotTask
 
 
 def ordered_columns(episode: Episode, spec: RobotTaskSpec, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:
-    """Return the episode's columns in the order of `features(spec)`, but for those that it is `without`.
+    """Return the episode's columns in the order of `features(spec)`, except those in `without`.
 
     (T,) for scalars, (T, d) for vectors, uint8 (T, height, width, 3) for pictures. Raises `MismatchError` if the
     episode has other columns.

@@ -1,7 +1,7 @@
 """Statistics of columns under LeRobot's names, in float64.
 
-Those of an episode are exact: a quantile is the value of rank ceil(q T), which LeRobot reads off a histogram of 5,000
-bins. Those of a dataset are pooled from its episodes', as LeRobot pools them: min, max, mean and std are exact, a
+Statistics of an episode are exact: a quantile is the value of rank ceil(q T), whereas LeRobot uses a histogram of
+5,000 bins. Statistics of a dataset are pooled from its episodes as in LeRobot: min, max, mean and std are exact, a
 quantile is the mean of the episodes' quantiles, weighted by their frames.
 """
 
@@ -20,10 +20,10 @@ from manip_il import checks
 from manip_il.data.info import reading
 from manip_il.data.lerobot_layout import QUANTILES, STAT_NAMES, STATS
 
-Statistics = dict[str, dict[str, NDArray[Any]]]  # column -> name -> one value a dimension
+Statistics = dict[str, dict[str, NDArray[Any]]]  # column -> name -> one value per dimension
 F64 = NDArray[np.float64]
 _POOLED = tuple(name for name in STAT_NAMES if name != "count")
-_LEVELS = np.arange(256)  # of a pixel
+_LEVELS = np.arange(256)  # pixel values
 
 
 def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
@@ -46,7 +46,7 @@ def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
 
 
 def picture_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """Return the statistics of pictures (T, height, width, 3): levels in [0, 1], one a channel, (3, 1, 1)."""
+    """Return the statistics of pictures (T, height, width, 3): values in [0, 1], one per channel, (3, 1, 1)."""
     counts = np.zeros(3 * len(_LEVELS), np.int64)
     for frame in frames:
         counts += Image.fromarray(frame).histogram()
@@ -65,22 +65,22 @@ def picture_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
 
 
 def quantile_places(count: int) -> dict[str, int]:
-    """Return where in a sorted row of `count` values each quantile stands, from 0."""
+    """Return the index of each quantile in a sorted row of `count` values."""
     return {name: max(math.ceil(share * count), 1) - 1 for name, share in QUANTILES.items()}
 
 
 class PooledStatistics:
-    """Statistics of all episodes or datasets that were added, which have the same columns; quantiles may be missing."""
+    """Pooled statistics of episodes or datasets with the same columns; quantiles may be missing."""
 
     def __init__(self) -> None:
         self._first: Statistics = {}
-        self._sums: dict[str, F64] = {}  # by name, of all columns in a row
+        self._sums: dict[str, F64] = {}  # statistic -> values of all columns, concatenated
         self._count = 0
 
     def add(self, episode: Statistics) -> None:
-        """Add the statistics of one of them.
+        """Add the statistics of one episode or dataset.
 
-        Mean and std as in Chan et al. (1979), Updating formulae and a pairwise algorithm, eq. 2.1.
+        Mean and std follow Chan et al. (1979), Updating formulae and a pairwise algorithm, eq. 2.1.
         """
         names = [name for name in _POOLED if all(name in one for one in episode.values())]
         new = {name: np.concatenate([one[name].ravel() for one in episode.values()]) for name in names}
@@ -113,12 +113,12 @@ class PooledStatistics:
 
 
 def to_lists(statistics: Statistics) -> dict[str, dict[str, list[Any]]]:
-    """Return statistics as plain lists, as `meta/stats.json` has them."""
+    """Return statistics as plain lists, as in `meta/stats.json`."""
     return {key: {name: values.tolist() for name, values in table.items()} for key, table in statistics.items()}
 
 
 def read_statistics(root: Path) -> Statistics:
-    """Read `meta/stats.json`; statistics of pictures are (channels, 1, 1). Raises `ManipError` for what is none."""
+    """Read `meta/stats.json`; statistics of pictures are (channels, 1, 1). Raises `ManipError` if it is invalid."""
     path = root / STATS
     with reading(path):
         found = checks.read_json(path, "a dataset's statistics")

@@ -1,7 +1,7 @@
-"""Encode cameras as LeRobot does, but as they come: every episode is appended to a file that stays open.
+"""Encode pictures with LeRobot's settings; every episode is appended to a file that stays open.
 
-LeRobot writes one file an episode and then copies all that is there so far into a new one. Its settings are restated
-here, and held against the library by the tests, because importing `lerobot.configs.video` imports torch (seconds).
+LeRobot writes one file per episode and then copies all earlier ones into a new file. Its settings are copied here, and
+compared with the library by tests, because importing `lerobot.configs.video` imports torch (seconds).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from manip_il.errors import UsageError
 
 
 @dataclass(frozen=True)
-class Clip:
-    """One camera's frames of one episode: from frame `first` of a file on."""
+class VideoSpan:
+    """One camera's frames of one episode: `frames` frames of a file, from `first`."""
 
     chunk: int
     file: int
@@ -51,8 +51,8 @@ class CameraFiles:
         self._stream: VideoStream | None = None
         self._copied: dict[tuple[Dataset, Path], tuple[int, int]] = {}  # chunk and file index
 
-    def copy(self, dataset: Dataset, episode: int) -> Clip:
-        """Take an episode's frames from a dataset's film, which is copied once."""
+    def copy(self, dataset: Dataset, episode: int) -> VideoSpan:
+        """Copy a dataset's film, once, and return the place of an episode in it."""
         source, first, frames = dataset.clip(self._key, episode)
         if (dataset, source) not in self._copied:
             self.close()
@@ -61,9 +61,9 @@ class CameraFiles:
             shutil.copyfile(source, self._folder / name)
             self._copied[dataset, source] = chunk, file
             self._number += 1
-        return Clip(*self._copied[dataset, source], first, frames)
+        return VideoSpan(*self._copied[dataset, source], first, frames)
 
-    def write(self, frames: Pictures) -> Clip:
+    def write(self, frames: Pictures) -> VideoSpan:
         """Append the frames of an episode. Raises `av.FFmpegError` if they cannot be encoded or written."""
         if self._bytes >= self._limit:
             self.close()
@@ -71,9 +71,9 @@ class CameraFiles:
         size = frames.shape[1], frames.shape[2]
         if self._stream is None:
             encoder = self._open(self._folder / name, size)
-        else:  # a stream of its own, so that its bytes depend on no other episode
+        else:  # a new encoder, so that its bytes do not depend on other episodes
             encoder = _new_encoder(self._config, size, self._fps)
-        clip = Clip(chunk, number, self._frames, len(frames))
+        clip = VideoSpan(chunk, number, self._frames, len(frames))
         for picture in frames:
             self._mux(_encode(encoder, _video_frame(picture, self._frames, self._fps)))
             self._frames += 1
@@ -82,7 +82,7 @@ class CameraFiles:
 
     def close(self) -> None:
         """Finish the open file, if any. Raises `OSError` if it cannot be written."""
-        container, self._container, self._stream = self._container, None, None  # a full disk lets none be closed twice
+        container, self._container, self._stream = self._container, None, None  # an error on closing is raised once
         if container is not None:
             self._number, self._frames, self._bytes = self._number + 1, 0, 0
             container.close()
@@ -106,7 +106,7 @@ class CameraFiles:
 
     def _open(self, path: Path, size: tuple[int, int]) -> VideoCodecContext:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # without bitexact the muxer's version is in the file; with faststart a reader finds the index at its begin
+        # bitexact omits the muxer's version; faststart puts the index at the beginning
         self._container = av.open(str(path), "w", options={"movflags": "faststart", "fflags": "+bitexact"})
         options = self._config.options()
         self._stream = cast(VideoStream, self._container.add_stream(self._config.vcodec, self._fps, options=options))
@@ -121,16 +121,16 @@ class CameraFiles:
 
 
 def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Packet]:
-    """Encode a frame, or what is left; the first one opens the encoder.
+    """Encode a frame, or None to flush; the first one opens the encoder.
 
-    SVT-AV1, if root runs it, makes the thread that opens it, and its own, real-time ones (SCHED_FIFO) for good: these,
-    and every process that they start, would starve all others.
+    If run by root, SVT-AV1 permanently makes the opening thread and its own threads real-time (SCHED_FIFO). These and
+    their child processes would starve all others.
     """
     opens = not encoder.is_open
     packets = encoder.encode(frame)
     if opens and os.geteuid() == 0 and encoder.name == "libsvtav1":
         for thread in map(int, os.listdir("/proc/self/task")):
-            with suppress(OSError):  # it has ended
+            with suppress(OSError):  # the thread has ended
                 os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
     return packets
 
@@ -143,7 +143,7 @@ def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoC
 
 
 def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: int) -> None:
-    os.environ.setdefault("SVT_LOG", "1")  # errors only: else it prints its version whenever an encoder opens
+    os.environ.setdefault("SVT_LOG", "1")  # errors only; else it prints its version for every encoder
     encoder.height, encoder.width = size
     encoder.pix_fmt = config.pix_fmt
     encoder.framerate, encoder.time_base = Fraction(fps), Fraction(1, fps)
@@ -156,13 +156,13 @@ def _video_frame(picture: NDArray[np.uint8], number: int, fps: int) -> av.VideoF
 
 
 def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
-    """Encode one picture of this height and width; raises `UsageError` with the encoder's reason."""
+    """Encode one picture of this height and width; raises `UsageError` with the encoder's reason if it fails."""
     level = av.logging.get_level()
-    av.logging.set_level(av.logging.ERROR)  # else there is no reason to read
+    av.logging.set_level(av.logging.ERROR)  # else the reason is not logged
     with av.logging.Capture() as log:
         try:
             if len(av.VideoFormat(config.pix_fmt).components) < 3:
-                raise ValueError(f"{config.pix_fmt} has no colour")
+                raise ValueError(f"pixel format {config.pix_fmt} has no colour")
             encoder = _new_encoder(config, size, fps)
             _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
             _encode(encoder, None)

@@ -1,4 +1,4 @@
-"""Examine a dataset by every check, and repair what its journals or its own data allow."""
+"""Run every check on a dataset, and repair it from its journals or its own data."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from manip_il.errors import ManipError
 Check = Callable[[Dataset], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (*files.CHECKS, *learning.CHECKS)
 _FILE = re.compile(r"(?:meta|data|videos)/[\w.\-/]*\w")
-_PICTURES = 100  # of a camera, of which its statistics are
+_PICTURES = 100  # pictures per camera from which statistics are computed
 
 
 def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
-    """Return every finding about a folder, none for a dataset that is whole. Raises nothing, whatever it holds.
+    """Return all findings about a folder, [] for a sound dataset. Never raises.
 
-    Every file is opened in a child process first; if that needs too much memory or time, or the folder is no dataset,
-    this is the only finding. more: checks beside those of this room.
+    Every file is first opened in a child process; if that needs too much memory or time, or the folder is not a
+    dataset, this is the only finding. more: additional checks.
     """
     try:
         check_arrived(root, strict=False)
@@ -44,22 +44,22 @@ def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
         found = [_explain(root, problem)]
     else:
         found = [finding for check in (*CHECKS, *more) for finding in _run(check, dataset)]
-    # several checks may need the same file
+    # several checks may report the same file
     return list(dict.fromkeys(replace(one, remedy=one.remedy or mend(root, one)) for one in found))
 
 
 def _run(check: Check, dataset: Dataset) -> Iterator[Finding]:
     try:
         yield from check(dataset)
-    except Exception as problem:  # what one check cannot read or finish must not hide the others
+    except Exception as problem:  # a failing check must not hide the others
         yield _explain(dataset.root, problem)
 
 
 def _explain(root: Path, problem: Exception) -> Finding:
     text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
     text = text.partition("; run `manip-il data check")[0].replace(f"{root}/", "").removeprefix(f"{root}: ")
-    text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as if its recorder had died")
-    place = [str(root), *_FILE.findall(text)][-1]  # the last is a file in a folder
+    text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as after a crash of the recorder")
+    place = [str(root), *_FILE.findall(text)][-1]  # the last one is the file
     return Finding(place, text.replace(f"cannot read {place}: ", "cannot be read: "))
 
 
@@ -69,16 +69,16 @@ def has_errors(findings: Sequence[Finding]) -> bool:
 
 
 def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
-    """Repair what can be repaired; yield one line for each thing that was done, or was not and why.
+    """Repair what can be repaired; yield one line for each repair, or for the reason why one was not possible.
 
-    Nothing is deleted: what is replaced or moved is kept in `ROOT.before-repair`. Raises `ManipError` if that is there,
-    for what is reached through links, and while another process is at work on it. Examine it anew afterwards.
+    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Raises `ManipError` if that exists,
+    if a link leads outside, and while another process uses the dataset. Check the dataset again afterwards.
     """
     kept = root.with_name(f"{root.name}.before-repair")
     if kept.exists():
-        raise ManipError(f"{kept} is there already, from an earlier repair; move it elsewhere first")
+        raise ManipError(f"{kept} already exists, from an earlier repair; move it elsewhere first")
     if linked := [path for path in root.rglob("*") if not path.resolve().is_relative_to(root.resolve())]:
-        raise ManipError(f"{linked[0]} is a link to elsewhere, where nothing is changed; repair a copy of the dataset")
+        raise ManipError(f"{linked[0]} is a link out of the dataset, which is not followed; repair a copy instead")
     with exclusive(root):
         if has_errors(findings) and journals_of(root).is_dir():
             yield _rebuild(root, kept)
@@ -87,7 +87,7 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
             shutil.move(path, kept)
             yield f"moved away: {path.name}"
         for name, compute in ((INFO, _recount), (STATS, _recompute)):
-            with suppress(ManipError, OSError, ValueError):  # what cannot be read stays a finding
+            with suppress(ManipError, OSError, ValueError):  # unreadable files remain findings
                 if content := compute(root):
                     kept.mkdir(exist_ok=True)
                     for path in root.glob(name):
@@ -95,13 +95,13 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
                     write_json(root / name, content)
                     yield f"computed from the data: {name}"
         if kept.exists():
-            yield f"what was replaced or moved is kept in {kept}"
+            yield f"replaced and moved files are kept in {kept}"
 
 
 def _rebuild(root: Path, kept: Path) -> str:
-    """Build the dataset from its journals, unless they hold less than it does."""
+    """Build the dataset from its journals, unless they hold fewer episodes than it does."""
     journals, fresh = journals_of(root), root.with_name(f".{root.name}.rebuilt.partial")
-    held = 0  # if nothing of it can be read
+    held = 0  # if it cannot be read
     with suppress(ManipError):
         held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
     try:
@@ -110,23 +110,23 @@ def _rebuild(root: Path, kept: Path) -> str:
         return f"not rebuilt: {problem}"
     if info.episodes < held:
         shutil.rmtree(fresh)
-        return f"not rebuilt: {journals.name} makes {info.episodes} episodes, and {held} are still readable"
+        return f"not rebuilt: {journals.name} holds {info.episodes} episodes, but {held} are still readable"
     root.rename(kept)
     fresh.rename(root)
     return f"rebuilt from {journals.name}: {info.episodes} episodes"
 
 
 def _recount(root: Path) -> dict[str, Any]:
-    """Return info.json with the counts of episodes, rows and tasks that are there; empty if it has them."""
+    """Return info.json with the actual counts of episodes, rows and tasks; {} if they are right."""
     dataset, about = Dataset.open(root), checks.read_json(root / INFO, "a dataset's description")
     rows = sum(pq.read_metadata(path).num_rows for path in root.glob(DATA_FILES))
     counts = {"total_episodes": len(dataset.episodes), "total_frames": rows, "total_tasks": len(dataset.tasks)}
-    right = {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}}
-    return {} if about.items() >= counts.items() else right
+    corrected = {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}}
+    return {} if about.items() >= counts.items() else corrected
 
 
 def _recompute(root: Path) -> dict[str, Any]:
-    """Return statistics of finite columns and, from some pictures, of cameras; empty if the stored ones are right."""
+    """Return statistics of finite columns and, from some pictures, of cameras; {} if the stored ones are right."""
     if not any(finding.place.startswith(STATS) for finding in examine_folder(root)):
         return {}
     dataset, stats = Dataset.open(root), Statistics()

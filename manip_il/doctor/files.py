@@ -1,4 +1,4 @@
-"""Whether files fit each other: `info.json`, episodes, tasks, statistics, rows, videos and this program's columns."""
+"""Checks that files agree: `info.json`, episodes, tasks, statistics, rows, videos and our own columns."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, readi
 from manip_il.doctor.finding import Finding, journals_of, list_first, of_episodes, warning
 
 _AXES = (["height", "width", "channels"], ["height", "width", "channel"], ["channels", "height", "width"])
-_TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # shares: LeRobot computes in float32
+_TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # relative, because LeRobot computes in float32
 _TEMPORARY = re.compile(r"\..*\.tmp|.*\.(partial|incomplete|ffconcat)|tmp[a-z0-9_]{8}|images|\.cache")
-_LATE = 1e-4  # LeRobot's reader refuses a frame that is further from its row [s]
+_LATE = 1e-4  # largest distance of a frame from its row in time that LeRobot's reader accepts [s]
 
 
 def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
-    """Check that no recorder, writer or download died here."""
+    """Check for leftovers of a recorder, writer or download that died."""
     for path in leftovers(dataset.root):
         name = path.relative_to(dataset.root.absolute().parent).as_posix()
         yield warning(name, "left by a recorder, writer or download that died")
 
 
 def leftovers(root: Path) -> list[Path]:
-    """Return temporary files and folders in a dataset and beside it, which nobody needs."""
+    """Return unneeded temporary files and folders in a dataset and next to it."""
     root = root.absolute()
     inside = [path for path in [*root.iterdir(), *root.glob("meta/*")] if _TEMPORARY.fullmatch(path.name)]
     beside = root.parent.glob(f".{root.name}.*.partial")
@@ -42,23 +42,23 @@ def leftovers(root: Path) -> list[Path]:
 
 
 def check_info(dataset: Dataset) -> Iterator[Finding]:
-    """Check that `meta/info.json` has every column, and cameras with names and shapes with which LeRobot trains."""
+    """Check that `meta/info.json` has every column, and cameras with names and shapes that LeRobot can train on."""
     for feature in dataset.info.of_dtype(*PICTURES):
         shape, names = list(feature.shape), feature.names
         if names not in _AXES or len(shape) != 3 or shape[0 if names[0] == "channels" else 2] not in (1, 3):
-            text = f"a camera of shape {shape} with names {names}, on which LeRobot does not train"
+            text = f"a camera of shape {shape} with names {names}, on which LeRobot cannot train"
             remedy = 'set [height, width, 3] and ["height", "width", "channels"] there'
             some_train = isinstance(names, list) and names[:2] == ["height", "width"]
             yield Finding(f"{layout.INFO}: {feature.key}", text, remedy, is_error=not some_train)
     wanted = {key for key, feature in dataset.features.items() if feature.dtype != "video"} | {*INDEX_FEATURES}
     for path in dataset.data_files:
         if odd := sorted(wanted ^ {*pq.read_schema(path).names}):
-            text = f"has other columns than {layout.INFO}, with which LeRobot does not load it: {list_first(odd)}"
+            text = f"differs from {layout.INFO} in columns, so LeRobot cannot load it: {list_first(odd)}"
             yield Finding(path.relative_to(dataset.root).as_posix(), text)
 
 
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
-    """Check that episodes count from 0 and follow each other, that the rows are theirs, at the rate's times."""
+    """Check that episodes are numbered from 0 and contiguous, and rows belong to them, with times at the frame rate."""
     table, tasks, info = dataset.episodes, dataset.tasks, dataset.info
     ends = np.cumsum(table.length)
     frame = np.concatenate([np.arange(length) for length in table.length])
@@ -74,7 +74,7 @@ def check_rows(dataset: Dataset) -> Iterator[Finding]:
         ("data: index", columns[layout.INDEX], np.arange(len(frame))),
         ("data: episode_index", columns[layout.EPISODE_INDEX], np.repeat(table.index, table.length)),
         ("data: frame_index", columns[layout.FRAME_INDEX], frame),
-        (f"data: timestamp at {dataset.fps:.6g} frames a second", columns[layout.TIMESTAMP], frame / dataset.fps),
+        (f"data: timestamp at {dataset.fps:.6g} frames per second", columns[layout.TIMESTAMP], frame / dataset.fps),
     ):
         if text := _differ(found, wanted, _LATE + 1e-6 * np.abs(wanted)):
             yield Finding(place, text)
@@ -84,7 +84,7 @@ def check_rows(dataset: Dataset) -> Iterator[Finding]:
 
 
 def _differ(found: NDArray[Any], wanted: Any, tolerance: Any = 0) -> str:
-    """Return where numbers (N,) differ first, and how many do; empty if none does."""
+    """Return where numbers (N,) first differ, and how many do; "" if none do."""
     if len(found) != len(wanted):
         return f"{len(found):,} values; expected {len(wanted):,}"
     bad = np.flatnonzero(~(np.abs(found.astype(np.float64) - wanted) <= tolerance))
@@ -96,28 +96,28 @@ def _differ(found: NDArray[Any], wanted: Any, tolerance: Any = 0) -> str:
 
 
 def check_numbers(dataset: Dataset) -> Iterator[Finding]:
-    """Check that numbers are finite, and that their statistics are those of `meta/stats.json`."""
+    """Check that numbers are finite, and that `meta/stats.json` has their statistics."""
     root, ends = dataset.root, np.cumsum(dataset.episodes.length)
     stored = dataset.statistics if (root / layout.STATS).exists() else None
     if stored is None:
-        yield warning(layout.STATS, "is missing: LeRobot normalises nothing without it")
+        yield warning(layout.STATS, "is missing: LeRobot cannot normalise without it")
     for feature in dataset.info.of_dtype(*NUMBERS, *PICTURES):
         key, text, table = feature.key, "", (stored or {}).get(feature.key)
         if feature.dtype in NUMBERS:
             values = dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64, copy=False)
             if len(bad := np.flatnonzero(~np.isfinite(values).all(axis=1))):
                 episodes = np.unique(np.searchsorted(ends, bad, side="right")).tolist()
-                what = f"no number in row {bad[0]:,} ({len(bad):,} such rows)"
+                what = f"not finite in row {bad[0]:,} ({len(bad):,} such rows)"
                 lost = of_episodes(root, f"data: {key}", what, episodes)
                 yield replace(lost, is_error=True, remedy="" if journals_of(root).is_dir() else lost.remedy)
             elif table is not None:
                 text = _compare(table, values, feature)
-        if stored is not None and key not in INDEX_FEATURES and (text or table is None):  # of those nobody needs any
+        if stored is not None and key not in INDEX_FEATURES and (text or table is None):  # index statistics are unused
             yield Finding(f"{layout.STATS}: {key}", text or "is missing")
 
 
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:
-    """Return how statistics differ from a column's, (N, n); a matrix has them over its last axis."""
+    """Return how statistics differ from those of a column (N, n), or of a matrix along its last axis."""
     flat = values if stored["mean"].size == values.shape[1] else values.reshape(-1, feature.shape[-1])
     for name, share in _TOLERANCES.items():
         tolerance = share * np.abs(flat).max(axis=0) + 1e-9
@@ -127,7 +127,7 @@ def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Fea
 
 
 def check_frames(dataset: Dataset) -> Iterator[Finding]:
-    """Check that every row has a picture in its data file, or a frame in a video at its time; none is decoded."""
+    """Check that every row has a picture in its data file, or a video frame at its time, without decoding."""
     table, root = dataset.episodes, dataset.root
     for key in [feature.key for feature in dataset.info.of_dtype("image")]:
         for path in dataset.data_files:
@@ -150,7 +150,7 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_own(dataset: Dataset) -> Iterator[Finding]:
-    """Check this program's own columns and file: names, shapes, labels, drivers, seeds."""
+    """Check our own columns and file: names, shapes, labels, drivers, seeds."""
     own, features = dataset.own, dataset.features
     if own is None:
         if {s.SIM_STATE, s.EXECUTED_ACTION} <= features.keys():
@@ -158,10 +158,10 @@ def check_own(dataset: Dataset) -> Iterator[Finding]:
             yield warning(layout.OURS, text, "copy it from the dataset that this one was made from")
         return
     there: dict[str, Any] = {key: ([*one.shape], one.names) for key, one in features.items()} | {"fps": dataset.fps}
-    said = {key: ([*one["shape"]], one["names"]) for key, one in s.features(own.spec).items()}
-    for key, wanted in {**said, "fps": own.spec.fps}.items():
+    ours = {key: ([*one["shape"]], one["names"]) for key, one in s.features(own.spec).items()}
+    for key, wanted in {**ours, "fps": own.spec.fps}.items():
         if (found := there.get(key, "missing")) != wanted:
-            yield Finding(layout.OURS, f"{key} is {str(wanted)[:80]}; {layout.INFO} says {str(found)[:80]}")
+            yield Finding(layout.OURS, f"{key} is {str(wanted)[:80]}, but {layout.INFO} has {str(found)[:80]}")
     valid, actor, seed = (dataset.columns([key])[key].reshape(-1) for key in (s.LABEL_VALID, s.ACTOR, s.SEED))
     first = seed[np.repeat(dataset.episodes.start, dataset.episodes.length)]
     right = {s.LABEL_VALID: (valid, valid.clip(0, 1)), s.ACTOR: (actor, actor.clip(0, 2)), s.SEED: (seed, first)}

@@ -1,6 +1,6 @@
-"""Why a policy will not learn from a dataset, of any origin: its motions and its cameras. Warnings, with numbers.
+"""Why a policy may not learn from a dataset: warnings about its motions and cameras, with numbers.
 
-Motions are looked at in episodes that a teacher drove: where a learner drives, actions are labels and move nothing.
+Motions are checked in episodes driven by a teacher; if a learner drives, actions are labels that were not executed.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from manip_il.doctor.finding import Finding, edit, list_first, of_episodes, warn
 from manip_il.mdp import Actor
 
 F64, Mask = NDArray[np.float64], NDArray[np.bool_]
-Rows = dict[int, slice]  # of episodes, by their numbers
+Rows = dict[int, slice]  # episode -> its rows
 _GRIPPER = re.compile(r"grip|finger|jaw|hand|claw", re.IGNORECASE)
-_STILL, _IDLE = 0.01, 0.1  # of every joint's range, within a second; of all frames
-_LEAD = 0.4  # by which actions may be ahead of the joints that follow them [s]
-_CLIPPED = 0.05  # of all frames
-_LEAST = 10  # episodes that are compared with each other
-_EPISODES, _PICTURES, _SIDE = 100, 6, 16  # that are decoded, of each; height and width of a thumbnail
-_SAME, _DARK = 1.5, 10.0  # levels, of 255: change of the most changed part of a thumbnail; mean of a picture
-_AGAIN = "correct what recorded it, and record again"
+_STILL = 0.01  # a joint is still if it moves by less than this share of its range within a second
+_IDLE, _CLIPPED = 0.1, 0.05  # tolerated shares of the frames
+_LEAD = 0.4  # tolerated lead of actions over the joints that follow them [s]
+_LEAST = 10  # least number of episodes for comparisons between them
+_EPISODES, _PICTURES, _SIDE = 100, 6, 16  # checked episodes, pictures of each, thumbnail size [pixels]
+_SAME, _DARK = 1.5, 10.0  # pixel values of 255: largest change in an unchanged thumbnail, mean of a black picture
+_AGAIN = "correct the recorder, and record again"
 
 
 def check_motions(dataset: Dataset) -> Iterator[Finding]:
-    """Check for idle stretches, late or early actions, joints that changed, commands in vain, texts of two motions."""
+    """Check for idle time, lagging actions, changed joint zeros, unreached commands, and texts of two motions."""
     features = [dataset.features.get(key) for key in (s.STATE, s.ACTION)]
     if not all(one and one.dtype in NUMBERS and len(one.shape) == 1 and one.size for one in features):
         return
@@ -42,10 +42,10 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
     spans = zip(table.index.tolist(), map(slice, table.start, table.stop), strict=True)
     rows = {episode: one for episode, one in spans if len(state[one]) > 1 and not learner[one].any()}
     if not rows or not np.isfinite(state).all() or not np.isfinite(action).all():
-        return  # named by another check
+        return  # reported by another check
     yield from _check_idle(dataset, rows, np.hstack([state, action]))
     yield from _check_texts(dataset, rows, state)
-    if action.shape == state.shape:  # of the same joints, as LeRobot's robots have them
+    if action.shape == state.shape:  # of the same joints, as for LeRobot's robots
         names = np.array(dataset.features[s.ACTION].labels)
         gripper = np.array([bool(_GRIPPER.search(name)) for name in names])
         arm = ~gripper if gripper.any() else np.arange(len(names)) < len(names) - 1
@@ -55,7 +55,7 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
 
 
 def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
-    """Seconds in which neither actions nor joints move; to rest at the end is no fault."""
+    """Find seconds in which neither actions nor joints move, except at an episode's end."""
     both = both / np.where(np.ptp(both, axis=0) > 1e-9, np.ptp(both, axis=0), np.inf)
     second, idle = max(2, round(dataset.fps)), dict[int, int]()
     for episode, span in rows.items():
@@ -63,37 +63,37 @@ def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
         moving = [np.ptp(both[start : start + second], axis=0).max() > _STILL for start in starts]
         idle[episode] = max(np.flatnonzero(moving), default=-1) + 1 - sum(moving)
     if (share := sum(idle.values()) * second / len(both)) > _IDLE:
-        text = f"nothing moves for seconds, in {share:.0%} of the frames: a policy learns to stand still there"
+        text = f"nothing moves for seconds, in {share:.0%} of the frames: a policy learns to stand still"
         yield of_episodes(dataset.root, s.ACTION, text, [episode for episode, seconds in idle.items() if seconds])
 
 
 def _check_lag(dataset: Dataset, rows: Rows, told: F64, found: F64) -> Iterator[Finding]:
-    """Actions that come after the motion that they should cause, or long before it, by cross-correlation."""
-    reach = min(round(dataset.fps / 2) + 1, int(np.median([span.stop - span.start for span in rows.values()])) // 4)
-    inner = np.concatenate([np.arange(span.start + reach, span.stop - reach) for span in rows.values()])
-    leads = range(-reach, reach + 1)
+    """Find actions that lag the motion that they should cause, or lead it by too much, by cross-correlation."""
+    longest = min(round(dataset.fps / 2) + 1, int(np.median([span.stop - span.start for span in rows.values()])) // 4)
+    inner = np.concatenate([np.arange(span.start + longest, span.stop - longest) for span in rows.values()])
+    leads = range(-longest, longest + 1)
     curves = np.array([_correlate(told[inner - lead], found[inner]) for lead in leads])
-    followed = curves.max(axis=0) > 0.9  # the others' actions are no targets
-    if reach < 2 or followed.sum() < max(2, len(followed) / 2):
+    followed = curves.max(axis=0) > 0.9  # other actions are not position targets
+    if longest < 2 or followed.sum() < max(2, len(followed) / 2):
         return
     curve = curves[:, followed].mean(axis=1)
     best = leads[int(curve.argmax())]
     fine = min(max(best, 1), max(2, round(_LEAD * dataset.fps)))
-    if fine != best and 1 - curve[fine + reach] > 1.3 * (1 - curve.max()) + 1e-6:
+    if fine != best and 1 - curve[fine + longest] > 1.3 * (1 - curve.max()) + 1e-6:
         how = f"lead the joints by {best}" if best > 0 else f"lag the joints by {-best}"
-        figures = f"correlation {curve.max():.4f}; {curve[fine + reach]:.4f} at a lead of {fine}"
-        remedy = f"the action of a frame is what is sent after its observation: {_AGAIN}"
+        figures = f"correlation {curve.max():.4f}; {curve[fine + longest]:.4f} at a lead of {fine}"
+        remedy = f"a frame's action must be the one sent after its observation: {_AGAIN}"
         yield warning(s.ACTION, f"actions {how} frames ({figures})", remedy)
 
 
 def _correlate(left: F64, right: F64) -> F64:
-    """Return the correlations (n,) of columns (T, n); 0 if one does not move."""
+    """Return the correlations (n,) of columns (T, n), 0 for a constant one."""
     left, right = left - left.mean(axis=0), right - right.mean(axis=0)
     return (left * right).sum(axis=0) / np.maximum(np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0), 1e-9)
 
 
 def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: NDArray[np.str_]) -> Iterator[Finding]:
-    """A joint whose zero or sign differs between episodes: by where it starts, and by how it follows its action."""
+    """Find joints whose zero or sign differs between episodes, by their start and their correlation with actions."""
     starts = np.array([found[span.start] for span in rows.values()])
     agree = np.array([_correlate(told[span], found[span]) for span in rows.values()])
     against = (agree < -0.8) & (np.median(agree, axis=0) > 0.8)
@@ -102,13 +102,13 @@ def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: ND
         measures = (("starts at", starts, apart), ("correlates with its action by", agree, against[:, place]))
         for what, values, odd in measures:
             if odd.any():
-                means = f"{values[odd, place].mean():.3g}, elsewhere {values[~odd, place].mean():.3g}"
+                means = f"{values[odd, place].mean():.3g}, in others {values[~odd, place].mean():.3g}"
                 text = f"{name} {what} {means}: its zero or sign differs"
                 yield of_episodes(dataset.root, s.STATE, text, np.array([*rows])[odd])
 
 
 def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
-    """Return which of the numbers (E,) stand apart from most, by a gap of `least` and `times` what those differ by."""
+    """Return which numbers (E,) are outliers, separated by a gap of `least` and `times` the range of the others."""
     ranked = np.sort(values)
     cut = int(np.argmax(np.diff(ranked)))
     gap, extent = ranked[cut + 1] - ranked[cut], max(ranked[cut] - ranked[0], ranked[-1] - ranked[cut + 1])
@@ -117,9 +117,9 @@ def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
 
 
 def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_], arm: Mask) -> Iterator[Finding]:
-    """Commands, of the gripper as a rule, that are never reached; those of the arm that are cut off at a limit.
+    """Find commands that are never reached, mostly of the gripper, and arm commands that are clipped at a limit.
 
-    Units of both are the same, or a joint follows by a small share. At rest at an episode's end nothing is cut off.
+    Actions and joints have the same units, or a joint follows by a small share. Rest at the ends is not clipping.
     """
     for name, told, found, is_arm in zip(names, action.T, state.T, arm, strict=True):
         (low, high), (below, above) = np.quantile(told, [0.01, 0.99]), np.quantile(found, [0.01, 0.99])
@@ -127,18 +127,18 @@ def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_]
         stuck = share < 0.05 and abs(_correlate(told, found)) < 0.5
         inside = 0.05 <= share < 0.5 and min(below - low, high - above) > 0.1 * (high - low)
         if high - low > 1e-6 and (stuck or inside):
-            text = f"{name} is told {low:.3g} to {high:.3g}, and is {below:.3g} to {above:.3g}: commands never reached"
+            text = f"{name} is commanded {low:.3g} to {high:.3g}, but only moves from {below:.3g} to {above:.3g}"
             yield warning(s.ACTION, text, f"calibrate or free that joint: {_AGAIN}")
         for limit in {told.min(), told.max()} if is_arm and len(np.unique(told)) > 50 else ():
             at = [told[span] == limit for span in rows.values()]
             share = sum(int(one.sum()) for one in at if not one[0] and not one[-1]) / len(told)
             if share > _CLIPPED:
-                text = f"{name} is cut off at {limit:.6g} in {share:.0%} of the frames"
+                text = f"{name} is clipped at {limit:.6g} in {share:.0%} of the frames"
                 yield warning(s.ACTION, text, f"widen that limit: {_AGAIN}")
 
 
 def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
-    """Two different motions, with nothing between, that neither text nor first observation tells apart."""
+    """Find two distinct motions that neither the text nor the first observation tells apart."""
     points = np.array([np.linspace(span.start, span.stop - 1, 12).astype(int) for span in rows.values()])
     paths = (state / np.maximum(state.std(axis=0), 1e-9))[points].reshape(len(points), -1)
     seen = [one.key for one in dataset.info.of_dtype(*NUMBERS) if one.key.startswith("observation.")]
@@ -153,22 +153,22 @@ def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
         apart = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
         here, there, episodes = firsts[same[apart]], firsts[same[~apart]], np.array([*rows])[same[apart]]
         if 5 * len(here) < len(same) or (here.max(0) < there.min(0)).any() or (there.max(0) < here.min(0)).any():
-            continue  # few, or the first observation tells which
-        what = f"{len(here)} of {len(same)} episodes ({list_first(episodes)}) move in another way than the rest"
+            continue  # too few, or the first observation tells them apart
+        what = f"{len(here)} of {len(same)} episodes ({list_first(episodes)}) move differently from the rest"
         own = json.dumps(dict.fromkeys(map(str, episodes), "NEW TEXT"))
         command = f"{edit(dataset.root, 'modify_tasks')} --operation.episode_tasks='{own}'"
-        yield warning("task", f"{what}, for one text {text[:60]!r}", f"give them a text of their own: {command}")
+        yield warning("task", f"{what}, but share the text {text[:60]!r}", f"give them their own text: {command}")
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
-    """Check some pictures of every episode: they are decoded and have their size, and show what they should."""
-    table, _ = dataset.episodes, dataset.data_files  # what raises here is said once
+    """Check some pictures of every episode: size, black or frozen pictures, and swapped cameras."""
+    table, _ = dataset.episodes, dataset.data_files  # an error here is reported once
     chosen = np.flatnonzero(table.length > 1)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(_EPISODES, len(chosen))).astype(int)]
     rows = np.linspace(table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1)
     cameras = [key for key in dataset.cameras if dataset.features[key].is_rgb and len(rows)]
     seen = {key: np.stack([_thumbnails(dataset.frames(key, one)) for one in rows]) for key in cameras}
-    moved = np.zeros((len(rows), _PICTURES - 1), bool)  # by a tenth of a joint's range, from picture to picture
+    moved = np.zeros((len(rows), _PICTURES - 1), bool)  # a tenth of a joint's range between pictures
     if seen and s.STATE in dataset.features:
         state = dataset.columns([s.STATE])[s.STATE].reshape(len(dataset), -1).astype(np.float64)
         moved = (np.abs(np.diff(state[rows], axis=1)) > 0.1 * np.maximum(np.ptp(state, axis=0), 1e-9)).any(axis=2)
@@ -176,7 +176,7 @@ def check_cameras(dataset: Dataset) -> Iterator[Finding]:
         dark = (pictures.mean(axis=(2, 3, 4)) < _DARK).mean(axis=1) > 0.5
         still = np.abs(np.diff(pictures, axis=1)).max(axis=(2, 3, 4)) < _SAME
         frozen = (still & moved).sum(axis=1) > np.maximum(1, moved.sum(axis=1) / 2)
-        odd = {"is black": dark, "stands still while the joints move": frozen & ~dark}
+        odd = {"is black": dark, "is frozen while the joints move": frozen & ~dark}
         odd |= {f"is swapped with {other}": _find_swapped(pictures, seen[other]) for other in seen if other > key}
         for what, which in odd.items():
             if which.any():
@@ -190,7 +190,7 @@ def _thumbnails(pictures: NDArray[np.uint8]) -> F64:
 
 
 def _find_swapped(left: F64, right: F64) -> Mask:
-    """Return the episodes, (E,), in which two cameras look like each other in the other episodes."""
+    """Return the episodes, (E,), in which each of two cameras looks like the other one in most episodes."""
     pictures = np.stack([left.mean(axis=1), right.mean(axis=1)])
     typical = np.median(pictures, axis=1, keepdims=True)
     straight, crossed = (np.abs(pictures - one).mean(axis=(2, 3, 4)).sum(axis=0) for one in (typical, typical[::-1]))

@@ -39,12 +39,12 @@ _RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE}
 class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
-    task: one of gymnasium's names (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with a task of your own.
-    robot: for a task of any robot (`PickPlace-v0`, a file), by name or a YAML; panda if none is named.
-    observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
-    with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
+    task: a name in gymnasium (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with a task of your own.
+    robot: for tasks of any robot (`PickPlace-v0`, a file), a name or YAML file; by default panda.
+    observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras:
+    comma-separated names. observation_height, observation_width: size of their pictures [pixels]. fps, episode_length,
     tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
-    render_mode: `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
+    render_mode: with `none` the films of lerobot-eval are black, which needs neither OpenGL nor time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
     """
@@ -60,7 +60,7 @@ class ManipILEnv(EnvConfig):
     tolerance: float = option_of(SimConfig, "tolerance")
     success_steps: int = option_of(SimConfig, "success_steps")
     object: str = option_of(SimConfig, "object")
-    reward: str = ""  # of carry; only in files of earlier versions
+    reward: str = ""  # of the task carry, only in files of older versions
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class ManipILEnv(EnvConfig):
             if name not in known:
                 raise UnknownName(kind, name, known)
         if self.reward:
-            raise UsageError(f"--env.reward has a new name: --env.task={self.task}:{self.reward}")
+            raise UsageError(f"--env.reward was replaced by --env.task={self.task}:{self.reward}")
         self.fps = self._simulation().control_hz
         self.features = self._features()
         self.features_map = {key: _RENAMED.get(key, key) for key in self.features}
@@ -81,20 +81,20 @@ class ManipILEnv(EnvConfig):
     @property
     @override
     def gym_id(self) -> str:
-        """Id in gymnasium's registry, of every task: its robot and task are in the arguments."""
+        """Id in gymnasium's registry, the same for all tasks: robot and task are arguments."""
         return _ID
 
     @property
     @override
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make` beside the id."""
+        """Arguments of `gymnasium.make` besides the id."""
         return {"config": self._simulation(), "film": self.render_mode != "none", "cameras": self._cameras()}
 
     @override
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Return LeRobot's environments, processes forked from one that has imported what each would take seconds for.
+        """Return LeRobot's environments, in processes forked from one that has done the slow imports.
 
-        Python 3.12 means to preload the running command by itself, but does not (its fork server drops the path).
+        Python 3.12 intends to preload the running command itself, but fails to (its fork server drops the path).
         """
         commands = [name for name in _COMMANDS if name in sys.modules]
         multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
@@ -108,7 +108,7 @@ class ManipILEnv(EnvConfig):
         robot, task = TASKS.get(base) or (robot, ANY_ROBOTS.get(base, base))
         if self.robot and self.robot != robot:
             raise UsageError(
-                f"--env.robot is {self.robot!r}, and --env.task={name} is {robot}'s; leave one of them out"
+                f"--env.robot is {self.robot!r}, but --env.task={name} is for {robot}; leave one of them out"
             )
         limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.episode_length}
         return make_config(robot, task + colon + argument, self.fps, **limits, object=self.object)
@@ -120,7 +120,7 @@ class ManipILEnv(EnvConfig):
         return CameraConfig(names, self.observation_height, self.observation_width)
 
     def _features(self) -> dict[str, PolicyFeature]:
-        """Features by the environment's names; a camera by its column, as LeRobot's recorder wants."""
+        """Return the features by the environment's names; cameras by their columns, as LeRobot's recorder requires."""
         simulation, cameras = self._simulation(), self._cameras()
         joints = (len(get_robot(simulation.robot).joint_names),)
         features = {
@@ -137,7 +137,7 @@ class ManipILEnv(EnvConfig):
 
 
 class FilmedEnv(ManipEnv):
-    """The environment; without `film` small black pictures where lerobot-eval films, which it cannot be told not to."""
+    """The environment; without `film` it renders small black pictures for lerobot-eval, which always films."""
 
     def __init__(self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any):
         task = get_task(config.task, config.object)

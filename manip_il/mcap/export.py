@@ -1,7 +1,7 @@
-"""Export any LeRobot v3.0 dataset as MCAP: one file an episode, one topic a column, every number bit for bit.
+"""Export any LeRobot v3.0 dataset as MCAP: one file per episode, one topic per column, bit for bit.
 
-States and actions become `foxglove.JointStates`, other numbers LeRobot's scalars, pictures `foxglove.RawImage` as
-decoded, text `foxglove.Log`. `mapping.yaml` beside the files is what an import needs to make the dataset again.
+States and actions become `foxglove.JointStates`, other numbers LeRobot's scalars, decoded pictures `foxglove.RawImage`,
+text `foxglove.Log`. With `mapping.yaml`, next to the files, an import makes the dataset again.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ _HEADER = """\
 # Pictures are kept as they are (video: false); with video: true they are re-encoded, with loss.
 """
 _JOINTS = (s.STATE, s.ACTION, s.EXECUTED_ACTION)
-_TOLERANCE = 0.25  # of a frame: our own stamps are exact
-_BATCH = 64  # decoded pictures held at a time
+_TOLERANCE = 0.25  # [frames]; our own stamps are exact
+_BATCH = 64  # decoded pictures in memory at a time
 
 
 def left_out(info: Info) -> list[str]:
-    """Return the columns that are not exported: depth, other pictures that are not RGB, and language."""
+    """Return the columns that are not exported: language, depth and other pictures that are not RGB."""
     return [key for key in info.features if key not in INDEX_FEATURES and info.features[key] not in _columns(info)]
 
 
 def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
-    """Write every episode to `folder/episode_<index>.mcap` and yield its path, then write the mapping.
+    """Write every episode to `folder/episode_<index>.mcap`, yield its path, then write the mapping.
 
-    The same dataset gives the same bytes. Raises `NotFiniteError` for a number that JSON has not, and what
+    The same dataset gives the same bytes. Raises `NotFiniteError` for NaN and infinity, which JSON lacks, and what
     `Dataset.columns` and `Dataset.camera` raise.
     """
     columns, texts = _columns(dataset.info), dataset.tasks
@@ -52,7 +52,7 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
     for key in numbers:
         require_finite(f"{dataset.root}, column {key!r}", table[key])
     if missing := set(table[layout.TASK_INDEX].tolist()) - set(texts):
-        raise ManipError(f"{dataset.root}: rows have the task {min(missing)}, which {layout.TASKS} does not hold")
+        raise ManipError(f"{dataset.root}: rows have task {min(missing)}, which {layout.TASKS} lacks")
     cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
     about, rate = (dataset.root / layout.INFO).read_text(encoding="utf-8"), exact_rate(dataset.fps)
     episodes = dataset.episodes
@@ -77,7 +77,7 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
 
 
 def _mapping_of(info: Info) -> dict[str, Any]:
-    """Return the mapping by which an import makes the dataset again."""
+    """Return the mapping with which an import makes the dataset again."""
     near = {"resample": "nearest", "tolerance": round(_TOLERANCE / info.fps, 6)}
     features: dict[str, Any] = {}
     for one in _columns(info):
@@ -105,7 +105,7 @@ def _channel(column: Feature, values: Any, times: foxglove.Times) -> foxglove.Ch
     if _is_joints(column):
         return foxglove.joint_states(topic, column.labels, values, times)
     unnamed = [column.key] if column.size == 1 else [f"{column.key}_{place}" for place in range(column.size)]
-    labels = column.labels if column.names else unnamed  # as LeRobot labels them
+    labels = column.labels if column.names else unnamed  # as in LeRobot
     return foxglove.scalars(topic, labels, (values.astype(np.int64) if values.dtype == bool else values).tolist())
 
 
@@ -119,5 +119,5 @@ def _is_joints(column: Feature) -> bool:
 
 
 def _topic(key: str) -> str:
-    """Return a column's topic: a dot would part it in Foxglove's paths, and no column's name has a slash."""
+    """Return a column's topic, with slashes because a dot would split it in Foxglove's paths."""
     return "/" + key.replace(".", "/")

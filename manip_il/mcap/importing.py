@@ -1,6 +1,6 @@
-"""Import MCAP files as a LeRobot dataset: one episode a file, resampled to the dataset's rate, gaps refused.
+"""Import MCAP files as a LeRobot dataset: one episode per file, resampled to the dataset's rate, without gaps.
 
-An episode lasts from the latest of its topics' first messages to the earliest of their last ones, by log time.
+An episode lasts from the time when all topics have started to the time when the first one ends, by log time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from manip_il.data.atomic import new_folder
 from manip_il.data.foxglove import NANOSECONDS
 from manip_il.data.lerobot_write import TableWriter
 from manip_il.errors import ManipError, MismatchError, nearest
-from manip_il.mcap.mapping import TASK, TEXT, Mapping, Source, exact_rate, frame_times
+from manip_il.mcap.mapping import TASK, TEXT, Mapping, TopicSource, exact_rate, frame_times
 from manip_il.mcap.path import values_at
 from manip_il.mcap.read import read_messages, read_pictures, read_topics
 
@@ -29,18 +29,18 @@ Frame = dict[str, Any]  # column -> array or text, and `task`
 
 
 def list_files(source: Path) -> list[Path]:
-    """Return the MCAP file, or the folder's in the order of their names. Raises `ManipError` if there are none."""
+    """Return the MCAP file, or those of a folder in order of names. Raises `ManipError` if there are none."""
     paths = sorted(path for path in source.glob("*.mcap") if not path.name.startswith("."))
     if not paths and not source.is_file():
-        raise ManipError(f"{source} is no file, and holds no *.mcap files")
+        raise ManipError(f"{source} is not a file, and holds no *.mcap files")
     return paths or [source]
 
 
 def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[int]:
-    """Write the files as a dataset that appears at `root` when all are in; yield every episode's number of frames.
+    """Write the files as a dataset, which appears at `root` when it is complete; yield each episode's frame count.
 
-    All are read in a child process first, which is limited in memory and time. Raises `FolderExistsError` if `root`
-    holds something, `MismatchError` for files of different shapes, and what `checks.in_child` and `read_frames` raise.
+    All files are first read in a child process with limited memory and time. Raises `FolderExistsError` if `root` is
+    not empty, `MismatchError` if shapes differ between files, and what `checks.in_child` and `read_frames` raise.
     """
     checks.in_child(str(paths[0]), _read_all, paths, mapping)
     fps: Any = mapping.fps if mapping.fps % 1 else int(mapping.fps)
@@ -56,16 +56,16 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
 
 
 def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
-    """Yield a file's frames as LeRobot's writer takes them, pictures read as they are needed.
+    """Yield a file's frames in the form of LeRobot's writer; pictures are read on demand.
 
-    Raises `ManipError` naming file and topic for whatever the mapping asks for and the file does not give.
+    Raises `ManipError` naming file and topic if the file lacks something that the mapping names.
     """
-    columns: dict[str, dict[str, Source]] = {source.topic: {} for source in mapping.sources.values()}
+    columns: dict[str, dict[str, TopicSource]] = {source.topic: {} for source in mapping.sources.values()}
     for key, source in mapping.sources.items():
         columns[source.topic][key] = source
     found: dict[str, dict[int, Any]] = {key: {} for key in mapping.sources}
     for topic, stamp, content in read_messages(path, columns):
-        for key, source in columns[topic].items():  # of equal stamps the last message counts
+        for key, source in columns[topic].items():  # of messages with equal stamps the last one counts
             where = f"{path}, topic {topic}, {key} at {stamp} ns"
             found[key][stamp] = None if source.is_camera else _value(where, source, content)
     stamps: dict[str, I64] = {}
@@ -85,11 +85,11 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
         yield dict(zip(rows, values, strict=True))
 
 
-def pick(where: str, source: Source, stamps: I64, times: I64) -> I64:
-    """Return the number of the message, of those with `stamps` (N,), for each of the frames at `times`, (T,).
+def pick(where: str, source: TopicSource, stamps: I64, times: I64) -> I64:
+    """Return the index of the message in `stamps`, (N,), for each frame in `times`, (T,).
 
-    Both are [ns] and ascend, and no frame is before the first message. Raises `ManipError` with `where`, the gap's
-    place and the tolerance for the first frame whose message is farther away than that.
+    Both are ascending [ns], and no frame is before the first message. Raises `ManipError` with `where`, the place of
+    the gap and the tolerance if a frame's message is farther away than the tolerance.
     """
     chosen = np.searchsorted(stamps, times, side="right") - 1
     if source.resample == "nearest":
@@ -99,13 +99,13 @@ def pick(where: str, source: Source, stamps: I64, times: I64) -> I64:
     if far.any():
         frame = int(np.argmax(far))
         place = f"{(times[frame] - times[0]) / NANOSECONDS:g} s (stamp {times[frame]} ns, frame {frame})"
-        remedy = "raise its tolerance in the mapping, or leave out this file"
+        remedy = "raise the tolerance in the mapping, or leave out this file"
         raise ManipError(f"{where}: a gap at {place}; {source.resample} allows {source.tolerance:g} s: {remedy}")
     return chosen
 
 
 def _read_all(paths: list[Path], mapping: Mapping) -> None:
-    """Read everything that an import takes of the files. Raises `MismatchError` unless all have the same shapes."""
+    """Read all files as an import does. Raises `MismatchError` unless all have the same shapes."""
     wanted: dict[str, Any] = {}
     for path in paths:
         checks.opening(str(path))
@@ -118,7 +118,7 @@ def _read_all(paths: list[Path], mapping: Mapping) -> None:
 
 
 def _features(frame: Frame, mapping: Mapping) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's table."""
+    """Return LeRobot's table of features."""
     features: dict[str, dict[str, Any]] = {}
     for key, source in mapping.features.items():
         dtype = source.dtype if not source.is_camera else "video" if source.video else "image"
@@ -128,13 +128,13 @@ def _features(frame: Frame, mapping: Mapping) -> dict[str, dict[str, Any]]:
 
 
 def _column(values: NDArray[Any], feature: dict[str, Any]) -> NDArray[Any]:
-    """Values of one number or text a frame as (T,)."""
+    """Return a column's values, as (T,) if each frame has a single number or text."""
     values = values.reshape(-1) if feature["shape"] == (1,) else values
     return values.astype(object) if feature["dtype"] == TEXT else values
 
 
 def _times(path: Path, stamps: dict[str, I64], rate: Fraction) -> I64:
-    """Return the frames' times [ns], (T,): from the latest first stamp to the earliest last one."""
+    """Return the frames' times [ns], (T,), from the latest first stamp to the earliest last one."""
     last_to_start = max(stamps, key=lambda topic: stamps[topic][0])
     first_to_end = min(stamps, key=lambda topic: stamps[topic][-1])
     start, end = int(stamps[last_to_start][0]), int(stamps[first_to_end][-1])
@@ -144,8 +144,8 @@ def _times(path: Path, stamps: dict[str, I64], rate: Fraction) -> I64:
     return start + np.array(frame_times(math.ceil((end - start + 1) * rate / NANOSECONDS), rate), np.int64)
 
 
-def _value(where: str, source: Source, content: Any) -> Any:
-    """Return a column's text or array (*shape) in a message. Raises `ManipError` for what its dtype cannot hold."""
+def _value(where: str, source: TopicSource, content: Any) -> Any:
+    """Return a column's text or array (*shape) from a message. Raises `ManipError` for values that do not fit."""
     try:
         values = [one for path in source.paths for one in values_at(path, content)]
         if source.width not in (None, len(values)):
@@ -155,7 +155,7 @@ def _value(where: str, source: Source, content: Any) -> Any:
         if source.dtype == TEXT:
             return values[0]
         given = np.array(values, object)
-        with np.errstate(over="ignore"):  # which the next line sees
+        with np.errstate(over="ignore"):  # the next line checks for infinity
             numbers = given.astype(source.dtype)
         if not np.isfinite(numbers).all() if numbers.dtype.kind == "f" else (numbers != given).any():
             raise ValueError(f"{checks.shorten(values)}; expected finite numbers of {source.dtype}")

@@ -1,4 +1,4 @@
-"""Mapping files of an import: which topics and fields make which columns. `configs/mcap/panda.yaml` explains one."""
+"""Mapping files of an import: the topics and fields of every column. `configs/mcap/panda.yaml` explains one."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from manip_il.data.schema import MOST_FPS
 from manip_il.errors import ManipError, UsageError
 from manip_il.mcap.path import check_path
 
-TEXT = "string"  # LeRobot's dtype of text
-TASK = "task"  # a frame's text, beside its columns
-_NTSC = 1001  # the denominator of its rates
+TEXT = "string"  # LeRobot's dtype for text
+TASK = "task"  # key of a frame's task text
+_NTSC = 1001  # denominator of NTSC frame rates
 
 
 @dataclass(frozen=True)
-class Source:
-    """The topic that a column comes from, and which of its messages a frame takes. tolerance: between the two [s].
+class TopicSource:
+    """The topic of a column, and which message a frame takes. tolerance: largest distance between them [s].
 
-    resample: `nearest` in time, the earlier of two, or `previous`, the last one that is not later. Numbers or text are
-    the values at all paths in `field`, in order; shape: (values,) if it is None. Pictures have `video` in place of
-    these: encoded with loss, or PNG. Raises `UsageError` for what does not fit together.
+    resample: `nearest` in time (of two, the earlier one), or `previous`, the last one that is not later. Numbers or
+    text are the values at all paths in `field`, in order; shape: by default (values,). Pictures have `video` instead:
+    whether to encode video, with loss, or PNG. Raises `UsageError` for options that contradict each other.
     """
 
     topic: str
@@ -53,17 +53,17 @@ class Source:
 
     @property
     def is_camera(self) -> bool:
-        """Whether the column has pictures."""
+        """Whether the column holds pictures."""
         return self.video is not None
 
     @property
     def paths(self) -> list[str]:
-        """Paths to the values; none of a camera."""
+        """Paths to the values; [] for a camera."""
         return [self.field] if isinstance(self.field, str) else self.field or []
 
     @property
     def width(self) -> int | None:
-        """Number of values in a message; None if the mapping leaves it open."""
+        """Number of values per message; None if the mapping does not fix it."""
         if self.dtype == TEXT or self.shape is not None:
             return math.prod(self.shape or ())
         return len(self.names) if isinstance(self.names, list) else None
@@ -71,11 +71,11 @@ class Source:
 
 @dataclass(frozen=True)
 class Mapping:
-    """A dataset in terms of topics. task: one text for all, or where the texts come from."""
+    """How topics become a dataset. task: one text for all frames, or the source of texts."""
 
     fps: float
-    task: str | Source
-    features: dict[str, Source]
+    task: str | TopicSource
+    features: dict[str, TopicSource]
     robot_type: str | None = None
 
     def __post_init__(self) -> None:
@@ -83,16 +83,16 @@ class Mapping:
         if not self.features:
             raise UsageError("features is empty; expected at least one column")
         for key, source in self.features.items():
-            checks.name("a column's name", key)  # LeRobot names folders and files by it
+            checks.name("a column's name", key)  # LeRobot names folders and files after it
             if key in (*INDEX_FEATURES, TASK):
-                raise UsageError(f"LeRobot fills {key} itself; leave it out")
+                raise UsageError(f"LeRobot fills in {key} itself; leave it out")
             if source.video and self.fps % 1:
-                raise UsageError(f"LeRobot writes videos at whole rates, not at {self.fps}; {key} needs video: false")
+                raise UsageError(f"LeRobot writes videos at whole rates, not {self.fps}; {key} needs video: false")
 
     @property
-    def sources(self) -> dict[str, Source]:
+    def sources(self) -> dict[str, TopicSource]:
         """All columns, and `task` if its texts come from a topic."""
-        return ({TASK: self.task} if isinstance(self.task, Source) else {}) | self.features
+        return ({TASK: self.task} if isinstance(self.task, TopicSource) else {}) | self.features
 
 
 def load_mapping(path: Path) -> Mapping:
@@ -110,18 +110,18 @@ def load_mapping(path: Path) -> Mapping:
 
 
 def exact_rate(fps: float) -> Fraction:
-    """Return the small fraction that a rate is the float of, NTSC's among them, else what its decimals say."""
+    """Return a rate as an exact fraction: one with a small denominator (up to NTSC's), else its decimals."""
     small = Fraction(fps).limit_denominator(_NTSC)
     return small if float(small) == fps else Fraction(str(fps))
 
 
 def frame_times(count: int, rate: Fraction) -> list[int]:
-    """Return the times of an episode's frames since its start [ns]."""
+    """Return the times of an episode's frames [ns], from 0."""
     return [frame * NANOSECONDS * rate.denominator // rate.numerator for frame in range(count)]
 
 
-def _source(what: str, table: Any) -> Source:
+def _source(what: str, table: Any) -> TopicSource:
     try:
-        return draccus.decode(Source, checks.mapping("it", table))
+        return draccus.decode(TopicSource, checks.mapping("it", table))
     except (ManipError, draccus.ParsingError) as error:
         raise UsageError(f"{what}: {checks.one_line(error)}") from error

@@ -1,4 +1,4 @@
-"""Read the messages of one MCAP file by the library's reader and decoders: their content, values and pictures."""
+"""Read messages and pictures of one MCAP file with the library's reader and decoders."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from manip_il.errors import ManipError
 
 U8 = NDArray[np.uint8]
 
-_ROS2 = "mcap_ros2"  # the module of the package mcap-ros2-support, which need not be installed
-_CHANNELS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}  # of raw pictures, as R, G, B
+_ROS2 = "mcap_ros2"  # module of the optional package mcap-ros2-support
+_CHANNELS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}  # encoding of raw pictures -> slice of channels to RGB
 
 
 def read_topics(path: Path) -> list[str]:
-    """Return the topics that a file's summary lists, or none if it has no summary."""
+    """Return the topics in a file's summary; [] without a summary."""
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     return sorted({channel.topic for channel in summary.channels.values()} if summary else ())
 
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, log time [ns] and decoded content of the messages of some topics, in the order of time.
+    """Yield topic, log time [ns] and decoded content of the messages of some topics, in order of time.
 
     Raises `ManipError` naming the file for every error of the library.
     """
@@ -56,13 +56,13 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, in
 
 
 def read_pictures(path: Path, topic: str, stamps: Sequence[int]) -> Iterator[U8]:
-    """Yield the pictures (height, width, 3) of a topic's messages with these stamps, (T,) [ns], which never descend.
+    """Yield the pictures (height, width, 3) of a topic's messages with these ascending stamps, (T,) [ns].
 
-    Raises `ManipError` naming file, topic and stamp for a message that holds no picture.
+    Raises `ManipError` naming file, topic and stamp for a message without a picture.
     """
     frames = Counter(stamps)
     for stamp, messages in itertools.groupby(read_messages(path, [topic]), lambda message: message[1]):
-        *_, (_, _, content) = messages  # of equal stamps the last one counts
+        *_, (_, _, content) = messages  # of messages with equal stamps the last one counts
         if stamp in frames:
             try:
                 picture = _picture(content)
@@ -72,7 +72,7 @@ def read_pictures(path: Path, topic: str, stamps: Sequence[int]) -> Iterator[U8]
 
 
 class _OtherFactory(DecoderFactory):
-    """Decodes JSON; another encoding, which no factory before it decodes, is an error."""
+    """Decodes JSON; raises for any encoding that earlier factories do not decode."""
 
     @override
     def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
@@ -85,12 +85,12 @@ class _OtherFactory(DecoderFactory):
 
 
 def _picture(message: Any) -> U8:
-    """Return the picture (height, width, 3) in a message of Foxglove or ROS. Raises `ValueError` for none."""
+    """Return the picture (height, width, 3) of a Foxglove or ROS message. Raises `ValueError` if there is none."""
     if hasattr(message, "format"):  # CompressedImage
         return decode_picture(bytes(message.data))
-    encoding = getattr(message, "encoding", "none")  # of RawImage; ROS calls it Image
+    encoding = getattr(message, "encoding", "none")  # RawImage of Foxglove, Image of ROS
     if encoding not in _CHANNELS:
         raise ValueError(f"a picture encoded as {encoding!r}; expected {' or '.join(_CHANNELS)}, PNG or JPEG")
     height, width, step = message.height, message.width, message.step or message.width * 3
-    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)  # they may be longer than their pixels
+    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)  # rows may be padded
     return np.ascontiguousarray(rows[:, : width * 3].reshape(height, width, 3)[:, :, _CHANNELS[encoding]])

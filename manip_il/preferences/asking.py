@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from manip_il.collect.edits import Source, open_source, render_states
+from manip_il.collect.edits import EditSource, open_source, render_states
 from manip_il.data import schema
 from manip_il.evaluation.film import encode_mp4
 from manip_il.preferences.answers import FORMAT, VERSION
@@ -70,6 +70,6 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
     )
 
 
-def _film(source: Source, states: NDArray[np.float64], fps: int) -> bytes:
+def _film(source: EditSource, states: NDArray[np.float64], fps: int) -> bytes:
     pictures = render_states(source.env, CameraConfig((_CAMERA,), SIDE, SIDE, FILM), states)
     return encode_mp4(list(pictures[schema.IMAGES + _CAMERA]), fps)

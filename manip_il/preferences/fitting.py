@@ -19,7 +19,7 @@ TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedReward:
     """A fit, and its agreement on held-out pairs; each network of the ensemble holds out some.
 
     answered: agreement with the answers left and right; true: agreement with true progress, without pairs that differ
@@ -42,7 +42,7 @@ class Fitted:
 
 def fit_answers(
     clips: Clips, answers: Answers, shape: RewardShape, seed: int, on_epoch: Callable[[], None] = lambda: None
-) -> Fitted:
+) -> FittedReward:
     """Fit a reward and measure it on held-out pairs. Raises what `fit_reward` raises."""
     rows = clips.rows[answers.pair]
     compared = Compared(rows[:, 0], rows[:, 1], answers.better, answers.pair)
@@ -53,7 +53,7 @@ def fit_answers(
         pairs, first = np.unique(answers.pair, return_index=True)
         clear = np.abs(difference[pairs]) >= TIE
         true = _proportion(((fit.logits[first] > 0) == (difference[pairs] > 0))[clear])
-    return Fitted(fit, shape, _proportion(right[answers.better != 0.5]), true)
+    return FittedReward(fit, shape, _proportion(right[answers.better != 0.5]), true)
 
 
 def true_difference(clips: Clips) -> F64 | None:
@@ -72,7 +72,7 @@ def _counts(one: Proportion) -> dict[str, Any]:
     return {"rate": one.rate, "interval": list(one.interval), "right": one.successes, "of": one.n}
 
 
-def summary_lines(found: Fitted, answers: Answers) -> list[str]:
+def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
     """Return a summary of the answers and the fit as plain lines."""
     given = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
     lines = [f"{given}, {answers.skipped:,} skipped, {answers.contradictory:,} pairs with contradictory answers"]

@@ -85,7 +85,7 @@ class Workspace:
 
 
 @dataclass(frozen=True)
-class Table:
+class TableTop:
     """Table of a scene: its lengths along x and y, and the height of its top over the floor [m]."""
 
     size: tuple[float, ...] = (0.9, 1.2)
@@ -161,7 +161,7 @@ class LeRobotConfig:
 
 UPRIGHT = Costs()
 SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # of an arm that cannot
-TABLE = Table()
+TABLE = TableTop()
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class Robot:
     yaw: str = "world"
     wrist_camera: tuple[float, ...] | str = WRIST_CAMERA
     cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
-    table: Table = TABLE
+    table: TableTop = TABLE
     base: tuple[float, ...] | None = None
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     max_joint_step: float = JOINT_STEP

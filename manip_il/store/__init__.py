@@ -1,16 +1,16 @@
 """Push and pull of datasets and policies: `manip-il push FOLDER REMOTE` and `manip-il pull REMOTE FOLDER`.
 
-huggingface_hub speaks to the Hub, fsspec to every other store; ours are the manifest, the order and the checks. What
-they promise, and the tests in `tests/store` that show it:
+huggingface_hub accesses the Hub, fsspec all other stores; we add the manifest, the order of writes and the checks. The
+guarantees, and the tests in `tests/store` for them:
 
-    a pull gives back what was pushed; only changes travel   test_a_run_comes_back_as_it_was_and_only_changes_travel
+    a pull returns what was pushed; only changes are sent    test_a_run_comes_back_as_it_was_and_only_changes_travel
     readers see the old version or the new one               test_a_reader_of_the_version_before_finishes_...
-    of two pushes one wins, and the other is told            test_of_two_pushes_one_wins_and_the_other_is_told
+    of two pushes one wins, and the other fails              test_of_two_pushes_one_wins_and_the_other_is_told
     a killed transfer leaves no half version                 test_a_killed_transfer
     a pull verifies every hash                               test_bytes_that_differ_are_refused
     nothing is written outside the target folder             test_a_hostile_manifest_is_refused_and_nothing_is_written
-    a dataset is examined first, links are not followed      test_a_dataset_is_examined_before_its_push_and_...
+    a dataset is checked first, links are not followed       test_a_dataset_is_examined_before_its_push_and_...
     only known hosts; a mistake is one line                  test_a_mistake_is_one_line
     secrets are never printed                                test_no_token_is_said, tests/cli/test_secrets.py
-    a card claims nothing of what others made                test_a_datasets_card_says_what_the_hub_reads_and_...
+    a card makes no claims about others' work                test_a_datasets_card_says_what_the_hub_reads_and_...
 """

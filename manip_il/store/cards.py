@@ -1,7 +1,7 @@
-"""Cards for the Hub: `README.md` of a dataset or policy, filled from its files into `card.md.jinja`, and a picture.
+"""Cards for the Hub: `README.md` of a dataset or policy, rendered from `card.md.jinja`, and a picture.
 
-No card holds an absolute path, a token or a date: the same folder gives the same bytes. The card of what another
-program made claims neither our licence nor our making.
+Cards hold no absolute path, token or date, so that the same folder gives the same bytes. A card of another program's
+dataset or policy claims neither our licence nor our authorship.
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ from manip_il.store.errors import redact
 from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
 
 PICTURE = "assets/episodes.png"
-_FRAMES, _EPISODES = 6, 50  # of each camera, whose paths are drawn
-_OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is made again
-_NOT_SHOWN = re.compile(  # lines of options that are places, concern one machine, or may be secrets
+_FRAMES, _EPISODES = 6, 50  # frames per camera, and episodes whose paths are drawn
+_OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is written again
+_NOT_SHOWN = re.compile(  # lines of options that are paths, concern one machine, or may be secrets
     r"/|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
     r"image_cache_gb|log_freq|save_freq|tensorboard):|(?i:token|secret|passw|credential|api_?key)"
 )
 
 
 def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, Path]:
-    """Write a card and a picture into `folder`; return them by their paths in the repository `place`, USER/NAME.
+    """Write a card and a picture into `folder`; return them by their paths in the repository. place: USER/NAME.
 
-    A `README.md` of another origin is kept: then the result holds none. Raises `ManipError` for a folder that cannot be
-    read.
+    A `README.md` that is not ours is kept, and the result has none. Raises `ManipError` if the folder cannot be read.
     """
     made, dataset = dict[str, Path](), Dataset.open(root) if kind == "dataset" else None
     if dataset and draw_picture(dataset, folder / "episodes.png"):
@@ -63,13 +62,13 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
 
 
 def policy_facts(root: Path) -> dict[str, Any]:
-    """Return what the template says of a policy, or of the run that it is in. Raises `ManipError` if there is none."""
+    """Return the template's values for a policy or its run. Raises `ManipError` if there is no policy."""
     inside = policy_folder(path.relative_to(root).as_posix() for path in root.rglob(CONFIG))
     if inside is None:
         raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
     found = {name: root / inside / f"{name}.json" for name in ("config", "manip_il", "train_config")}
     facts = {name: checks.read_json(path, "JSON") if path.is_file() else {} for name, path in found.items()}
-    evaluations = [  # with the most episodes; that of a round chose the policy
+    evaluations = [  # that of a round is not a test, because it chose the policy
         {**checks.read_json(path, "JSON"), "is_test": not path.parent.name.startswith("round_")}
         for path in root.rglob("eval.json")
     ]
@@ -80,7 +79,7 @@ def policy_facts(root: Path) -> dict[str, Any]:
 
 
 def options(folder: Path) -> str:
-    """Return our `config.yaml` in a folder, without places, options of one machine and secrets; "" without one."""
+    """Return the folder's `config.yaml`, without paths, options of one machine and secrets; "" if it is not ours."""
     path = folder / "config.yaml"
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     shown = [line for line in text.splitlines() if not _NOT_SHOWN.search(line)]
@@ -88,7 +87,7 @@ def options(folder: Path) -> str:
 
 
 def draw_picture(dataset: Dataset, path: Path) -> bool:
-    """Draw frames of the first episode, or without cameras the paths of the object; return False without either."""
+    """Draw frames of the first episode or, without cameras, the object's paths; return False if there are neither."""
     feature = dataset.features.get(s.ENVIRONMENT_STATE)
     names, figure = list(feature.labels) if feature else [], Figure((8, 4), layout="constrained")
     if dataset.cameras:
@@ -102,7 +101,7 @@ def draw_picture(dataset: Dataset, path: Path) -> bool:
 
 
 def _draw_frames(dataset: Dataset, figure: Figure) -> None:
-    """Draw one row for each camera: evenly spaced frames of the first episode."""
+    """Draw evenly spaced frames of the first episode, one row per camera."""
     rows, cameras = dataset.rows_of(0), dataset.cameras
     picked = rows[np.unique(np.linspace(0, len(rows) - 1, _FRAMES).round().astype(int))]
     figure.set_figheight(figure.get_figwidth() / _FRAMES * len(cameras))
@@ -112,7 +111,7 @@ def _draw_frames(dataset: Dataset, figure: Figure) -> None:
 
 
 def _draw_paths(dataset: Dataset, names: list[str], figure: Figure) -> None:
-    """Draw the object's paths in the first episodes, from above and from the side, and the goals [m]."""
+    """Draw the object's paths in the first episodes and the goals, from above and from the side [m]."""
     table = dataset.columns([s.ENVIRONMENT_STATE, EPISODE_INDEX])
     index, values = table[EPISODE_INDEX].reshape(-1), table[s.ENVIRONMENT_STATE]
     episodes = [values[index == episode] for episode in np.unique(index)[:_EPISODES]]

@@ -1,4 +1,4 @@
-"""Errors of remotes: one line that says what to do, without tokens, keys and passwords."""
+"""Errors of remotes: one line with a remedy, without tokens, keys and passwords."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from manip_il.checks import one_line
 from manip_il.errors import ManipError
 
 HIDDEN = "[hidden]"
-_SHORTEST, _LONGEST = 4, 400  # characters of a secret that no word has by chance, of a library's message
+_SHORTEST, _LONGEST = 4, 400  # [characters]: shortest secret that is hidden, longest printed message
 _SECRET_VARIABLE = re.compile(r"TOKEN$|SECRET|PASSW|ACCESS_KEY|S3_KEY")
 _SECRETS = (
     re.compile(r"\b()(?:hf_[A-Za-z0-9]{8,}|(?:AKIA|ASIA)[A-Z0-9]{12,})"),
@@ -20,23 +20,23 @@ _SECRETS = (
     re.compile(r"(?i)((?:signature|credential|security-token|awsaccesskeyid)=)[^&\s'\"]+"),
     re.compile(r"(?i)(authorization['\"]?\s*[:=]\s*['\"]?)(?:bearer |basic |aws4[\w-]* )?[^\s'\"]+"),
 )
-_REMEDIES = {  # by HTTP status or by the name of a library's error, whichever comes first in its ancestry
+_REMEDIES = {  # by HTTP status, else by the name of the error's class or nearest base class
     "401": "log in with `hf auth login`, or set HF_TOKEN",
-    "403": "use a token that may do this, or a name of your own",
-    "404": "check the name; if that server has no xet, set HF_HUB_DISABLE_XET=1",
+    "403": "use a token with write access, or a repository of your own",
+    "404": "check the name; if the server does not support xet, set HF_HUB_DISABLE_XET=1",
     "412": "another push has changed it in the meantime: push again",
     "ConnectError": "check HF_ENDPOINT and the network",
     "NoCredentialsError": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile in ~/.aws",
     "EndpointConnectionError": "check AWS_ENDPOINT_URL and the network",
     "SSHException": "run `ssh HOST` once: its key must be in ~/.ssh/known_hosts, yours in the agent or ~/.ssh/config",
     "FileNotFoundError": "check the name: a bucket must exist",
-    "PermissionError": "check your credentials, or choose another place",
-    "OSError": "check the address, the network and the space there, and try again",
+    "PermissionError": "check your credentials, or choose another address",
+    "OSError": "check the address, the network and the free space there, and try again",
 }
 
 
 class RemoteError(ManipError):
-    """Failure of a remote; the message is cleaned of secrets."""
+    """A remote failed; secrets are removed from the message."""
 
     def __init__(self, message: str):
         super().__init__(redact(message))
@@ -44,7 +44,7 @@ class RemoteError(ManipError):
 
 @contextmanager
 def explained(what: str) -> Generator[None]:
-    """Raise whatever a library raises inside as `RemoteError`. what: is being done, with the remote's name."""
+    """Turn a library's errors into `RemoteError`. what: the attempted action, with the remote's name."""
     try:
         yield
     except ManipError:
@@ -58,7 +58,7 @@ def explained(what: str) -> Generator[None]:
 
 
 def redact(text: str, words: Iterable[str] = ()) -> str:
-    """Hide in `text` what looks like a secret, secrets of the environment, and passwords of addresses in `words`."""
+    """Hide likely secrets in `text`, secrets in environment variables, and passwords in the addresses in `words`."""
     secrets = {value for name, value in os.environ.items() if _SECRET_VARIABLE.search(name)}
     for word in words:
         password = (word.partition("://")[2] or word).partition(":")[2].rpartition("@")[0]

@@ -1,7 +1,7 @@
-"""A repository of the Hugging Face Hub, or of the server at HF_ENDPOINT, through huggingface_hub.
+"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
 
 Files keep their paths, so that LeRobot reads them. A push is one commit on top of the one that it read; then the tag
-`v3.0`, by which LeRobot finds datasets, is moved there. The Hub itself says sizes and hashes of all files of a commit.
+`v3.0`, by which LeRobot finds datasets, is moved there. The Hub provides sizes and hashes of all files of a commit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from manip_il import checks
 from manip_il.data.lerobot_layout import VERSION
 from manip_il.errors import UsageError
 from manip_il.store.errors import RemoteError, explained
-from manip_il.store.manifest import CARD, CONFIG, MANIFEST_FILE, File, Kind, Manifest, Plan, policy_folder
+from manip_il.store.manifest import CARD, CONFIG, MANIFEST_FILE, File, Kind, Manifest, PushPlan, policy_folder
 
 _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?")
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
@@ -29,14 +29,14 @@ _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 class Hub:
-    """A repository, at a branch, tag or commit. The library shows the progress of its transfers, unless `quiet`."""
+    """A repository at a branch, tag or commit. quiet: show no progress of transfers."""
 
     def __init__(self, address: str, revision: str | None = None, *, private: bool = False, quiet: bool = False):
-        """Take what follows `hf://`. Raises `UsageError` if it cannot be read."""
+        """address: the part after `hf://`. Raises `UsageError` if it is invalid."""
         found = _ADDRESS.fullmatch(address)
         if not found or ".." in address or (revision and found[3] not in (None, revision)):
             text = "expected hf://datasets/USER/NAME[@REVISION] or hf://USER/NAME[@REVISION], and one revision"
-            raise UsageError(f"the hf:// address cannot be read; {text}")
+            raise UsageError(f"the hf:// address is invalid; {text}")
         self.kind: Kind = "dataset" if found[1] == "datasets/" else "policy"
         self._place, self._revision, self._private = found[2], revision or found[3], private
         self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
@@ -46,13 +46,13 @@ class Hub:
             disable_progress_bars()
 
     def read(self) -> Manifest | None:
-        """Return what readers see now; None without such a repository, or without the revision in it."""
+        """Return the current version; None if the repository or the revision does not exist."""
         with explained(f"read {self.name}"):
             try:
                 head = self._api.repo_info(**self._repo, revision=self._revision).sha or ""
             except (RepositoryNotFoundError, RevisionNotFoundError):
                 return None
-            if not _COMMIT.fullmatch(head):  # it becomes part of paths
+            if not _COMMIT.fullmatch(head):  # becomes part of paths
                 raise RemoteError(f"{self.name} has the commit {checks.shorten(head)}; is HF_ENDPOINT a Hub?")
             tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
             files = {
@@ -65,15 +65,15 @@ class Hub:
             return Manifest(self.kind, files, head, copies=frozenset(copies if are_equal else ()))
 
     def additions(self, source: Path, local: Mapping[str, Path], folder: Path) -> dict[str, Path]:
-        """Write the card and its picture into `folder`; return them, and a run's policy at the root for LeRobot."""
-        from manip_il.store.cards import write_cards  # here: no other remote needs matplotlib
+        """Write the card and its picture into `folder`; return them, and copies of a run's policy for the root."""
+        from manip_il.store.cards import write_cards  # imported here because no other remote needs matplotlib
 
         added = write_cards(source, self.kind, self._place, folder)
         copies = root_copies(local) if self.kind == "policy" else {}
         return added if copies.keys() & local.keys() else added | {name: local[path] for name, path in copies.items()}
 
-    def write(self, plan: Plan) -> None:
-        """Make a commit on top of `plan.before`, which the Hub refuses if that is old; move the tag of a dataset."""
+    def write(self, plan: PushPlan) -> None:
+        """Commit on top of `plan.before`, which the Hub refuses if that is outdated; move a dataset's tag."""
         with explained(f"push to {self.name}"):
             before = plan.before or self._create()
             gone = before.files.keys() - plan.manifest.files.keys()
@@ -88,26 +88,26 @@ class Hub:
                 self._move_tag()
 
     def fetch(self, manifest: Manifest, paths: list[str], folder: Path) -> None:
-        """Write a commit's files into `folder`; their hashes are not looked at."""
+        """Download a commit's files into `folder`, without checking hashes."""
         left_out = [".*", "*/.*", *(glob.escape(path) for path in (*manifest.copies, MANIFEST_FILE))]
         with explained(f"pull from {self.name}"):
             self._api.snapshot_download(
                 **self._repo, revision=manifest.version, local_dir=folder, ignore_patterns=left_out, force_download=True
             )
-        shutil.rmtree(folder / ".cache")  # where the library notes what has arrived
+        shutil.rmtree(folder / ".cache")  # the library's records of the download
 
     def _create(self) -> Manifest:
-        """Make the repository and the branch; return what is on it: nothing, or what the main branch has."""
+        """Create the repository and the branch; return its content: nothing, or that of the main branch."""
         self._api.create_repo(**self._repo, private=self._private, exist_ok=True)
         if self._revision:
             self._api.create_branch(**self._repo, branch=self._revision, exist_ok=True)
         made = self.read()
         if made is None or (made.files and not self._revision):
-            raise RemoteError(f"{self.name} was made by another push in the meantime; push again")
+            raise RemoteError(f"{self.name} was created by another push in the meantime; push again")
         return made
 
     def _move_tag(self) -> None:
-        """Move LeRobot's tag to the main branch. A Hub cannot move tags: it is missing for a moment."""
+        """Move LeRobot's tag to the main branch. The Hub cannot move tags, so it is missing for a moment."""
         refs = self._api.list_repo_refs(**self._repo)
         head = next(one.target_commit for one in refs.branches if one.name == "main")
         tag = next((one.target_commit for one in refs.tags if one.name == VERSION), None)
@@ -118,7 +118,7 @@ class Hub:
 
 
 def root_copies(paths: Collection[str]) -> dict[str, str]:
-    """Return name at the root -> path of the files of a run's policy; none for a policy that is no run."""
+    """Return the files of a run's policy, name at the root -> path; {} for a policy without a run."""
     folder = policy_folder(path for path in paths if path != CONFIG)
     inside = {path.removeprefix(f"{folder}/"): path for path in paths if folder and path.startswith(f"{folder}/")}
     return {name: path for name, path in inside.items() if "/" not in name and name != CARD}

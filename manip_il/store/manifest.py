@@ -1,4 +1,4 @@
-"""The files of one version of a dataset or run, with sizes and hashes: listed, written as JSON, read from outside."""
+"""The files of one version of a dataset or run, with sizes and hashes, and their JSON form."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from manip_il.doctor.finding import journals_of
 from manip_il.store.errors import RemoteError
 
 MANIFEST_FILE = "manip_il_manifest.json"
-JOURNALS = "journals"  # folder of a pushed dataset's journals; in a run every folder of that name holds some
-CHECKPOINTS, LAST = "checkpoints", "last"  # the link to the newest checkpoint: not pushed, made again by a pull
+JOURNALS = "journals"  # folder of journals, of a pushed dataset or anywhere in a run
+CHECKPOINTS, LAST = "checkpoints", "last"  # the link `last` to the newest checkpoint is not pushed; a pull creates it
 CARD, CONFIG = "README.md", "config.json"  # of a repository, of every policy
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
@@ -31,14 +31,14 @@ Kind = Literal["dataset", "policy"]
 
 @dataclass(frozen=True)
 class File:
-    """Size [bytes] and hash of a file: its sha256, or git's id of it where a Hub says no other."""
+    """Size [bytes] and hash of a file: its sha256, or its git id if the Hub provides no sha256."""
 
     size: int
     sha256: str = ""
     git_sha1: str = ""
 
     def __post_init__(self) -> None:
-        """Raise `ManipError` for a size or hash that is none."""
+        """Raise `ManipError` for an invalid size or hash."""
         checks.whole("the size of a remote file", self.size, 0, 2**63)
         if not re.fullmatch("[0-9a-f]{64}|git:[0-9a-f]{40}", self.sha256 or f"git:{self.git_sha1}"):
             raise RemoteError(f"a remote file has the hash {checks.shorten(self.sha256)}; expected hexadecimal digits")
@@ -50,7 +50,7 @@ class File:
             return cls(os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
 
     def fits(self, path: Path) -> bool:
-        """Return whether a file, not a link, has these bytes."""
+        """Return whether a regular file has this size and hash."""
         if path.is_symlink() or not path.is_file() or path.stat().st_size != self.size:
             return False
         digest = hashlib.sha256() if self.sha256 else hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
@@ -61,7 +61,7 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Files by path. version: its name on the remote. copies: of a run's policy, which a pull leaves out."""
+    """Files by path. version: its id on the remote. copies: of a run's policy, which a pull leaves out."""
 
     kind: Kind
     files: Mapping[str, File]
@@ -74,25 +74,25 @@ class Manifest:
             check_path(path)
 
     def to_json(self) -> bytes:
-        """Return the text that a store keeps."""
+        """Return the content of the manifest file."""
         files = [{"path": path, "size": one.size, "sha256": one.sha256} for path, one in sorted(self.files.items())]
         return json.dumps({"version": 1, "kind": self.kind, "files": files}, indent=1).encode()
 
     @classmethod
     def from_json(cls, data: bytes, version: str) -> Manifest:
-        """Read what `to_json` writes. Raises `RemoteError` for anything else."""
+        """Read a manifest that `to_json` wrote. Raises `RemoteError` for anything else."""
         table = checks.parse_json("the manifest", data)
         try:
             if table["version"] != 1 or table["kind"] not in ("dataset", "policy"):
-                raise RemoteError("the manifest is of another version of manip-il; use a newer one")
+                raise RemoteError("the manifest was written by another version of manip-il; use a newer one")
             files = {one["path"]: File(one["size"], one["sha256"]) for one in table["files"]}
             return cls(table["kind"], files, version)
         except (LookupError, TypeError, AttributeError) as error:
-            raise RemoteError("the manifest is not what a push writes; push again, to an empty folder") from error
+            raise RemoteError("the manifest is invalid; push again, to an empty folder") from error
 
 
 @dataclass(frozen=True)
-class Plan:
+class PushPlan:
     """Difference between a folder and the version before. local: the manifest's files. upload, remove: paths."""
 
     manifest: Manifest
@@ -103,9 +103,9 @@ class Plan:
 
 
 def check_path(path: object) -> None:
-    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or names a pickle or code."""
+    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is a pickle or code."""
     parts = path.split("/") if isinstance(path, str) and path.isprintable() and "\\" not in path else [""]
-    text = "pickles and code are neither pushed nor pulled, as they run when they are opened"
+    text = "pickles and code are neither pushed nor pulled, because opening them can run code"
     if not all(part and not part.startswith(".") for part in parts):
         text = "expected a relative path inside the folder, without hidden files"
     elif not _PICKLE_OR_CODE.fullmatch(parts[-1]):
@@ -114,9 +114,9 @@ def check_path(path: object) -> None:
 
 
 def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
-    """Return the files of a dataset or run by their paths in the manifest, without hidden and unfinished ones.
+    """Return the files of a dataset or run by their paths in the manifest, except hidden and unfinished ones.
 
-    journals: include `<root>.journals` of a dataset as `journals/`, and those inside a run. Raises `RemoteError` for
+    journals: include a dataset's `<root>.journals` as `journals/`, and those inside a run. Raises `RemoteError` for
     links.
     """
     local: dict[str, Path] = {}
@@ -135,21 +135,21 @@ def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, P
 
 
 def datasets_in(folder: Path) -> list[Path]:
-    """Return the datasets in a folder: itself, or those of a run's rounds."""
+    """Return the datasets in a folder: the folder itself, or those of a run's rounds."""
     found = [path.parents[1] for path in folder.rglob(INFO)]
     return sorted(root for root in found if not any(map(_LEFT_OUT.fullmatch, root.relative_to(folder).parts)))
 
 
 def newest(checkpoints: Path) -> str | None:
-    """Return the name of the checkpoint with the highest step in a run's `checkpoints`; None in any other folder."""
+    """Return the name of the newest checkpoint in a run's `checkpoints`; None for any other folder."""
     steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal() and path.is_dir()]
     return max(steps, key=int, default=None) if checkpoints.name == CHECKPOINTS else None
 
 
 def policy_folder(paths: Iterable[str]) -> str | None:
-    """Return the folder of a run's policy among its files' `paths`: empty for the root, None without a policy.
+    """Return the folder of a run's policy, given its files' `paths`: "" for the root, None without a policy.
 
-    The best one, if the run has chosen it; else that of the newest checkpoint.
+    It is the best policy, if the run has chosen one, else that of the newest checkpoint.
     """
     folders = {path.rpartition("/")[0] for path in paths if path.rpartition("/")[2] == CONFIG}
     steps = sorted((int(found[1]), folder) for folder in folders if (found := _CHECKPOINT.fullmatch(folder)))

@@ -1,10 +1,10 @@
-"""Every remote but the Hub, through fsspec: objects named by the sha256 of their bytes, and one manifest.
+"""Remotes other than the Hub, through fsspec: objects named by the sha256 of their bytes, and one manifest.
 
-    PLACE/manip_il_manifest.json       replaced last, in one step: readers see the old version or the new one
+    PLACE/manip_il_manifest.json       replaced last, atomically: readers see the old version or the new one
          /objects/3f/3f9a...           each file's bytes, never changed
 
-Objects of the version before stay until the next push, so that whoever is reading it can finish; what no version names
-is removed by the push after.
+Objects of the previous version stay until the next push, so that its readers can finish; a push removes objects that
+neither version names.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from fsspec.implementations.sftp import SFTPFileSystem
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.store.errors import RemoteError, explained
-from manip_il.store.manifest import MANIFEST_FILE, Kind, Manifest, Plan
+from manip_il.store.manifest import MANIFEST_FILE, Kind, Manifest, PushPlan
 
-TIMEOUT = 30.0  # of connecting to an ssh server, and of any one answer [s]
-_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # of object stores: what others push is seen
+TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
+_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # object stores: see others' pushes
 _S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
 _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, "sftp": {}}
 _SFTP = re.compile(
     r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
 )
-_AT_ONCE, _SMALL_AT_ONCE = 4, 10  # files; s3fs holds as many parts of large ones in memory, and has ten connections
-_SMALL = 10_000_000  # bytes of the largest file
+_AT_ONCE, _SMALL_AT_ONCE = 4, 10  # concurrent files; s3fs keeps parts of large ones in memory, and has ten connections
+_SMALL = 10_000_000  # limit of a small file [bytes]
 
 
 class Sftp(SFTPFileSystem):
-    """Files of a host whose key is in ~/.ssh/known_hosts, with the user's ~/.ssh/config; fsspec's takes any key."""
+    """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only; fsspec's class accepts any host key."""
 
     cachable = False
-    put: Any = fsspec.AbstractFileSystem.put  # fsspec's takes one file alone
+    put: Any = fsspec.AbstractFileSystem.put  # that of fsspec's SFTP takes a single file
 
     def _connect(self) -> None:
-        logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # its errors are raised, too
+        logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # its errors are also raised
         config, login = Path.home() / ".ssh" / "config", self.ssh_kwargs
         known = dict(paramiko.SSHConfig.from_path(str(config)).lookup(self.host)) if config.is_file() else {}
         self.client = paramiko.SSHClient()
@@ -66,18 +66,18 @@ class Sftp(SFTPFileSystem):
 
     @override
     def put_file(self, lpath: Any, rpath: Any, callback: Any = None, mode: str = "", **kwargs: Any) -> None:
-        """Upload a file, and make its folder."""
+        """Upload a file and make its folder."""
         self.makedirs(self._parent(rpath), exist_ok=True)
         self.ftp.put(str(lpath), str(rpath))
 
 
 class Objects:
-    """A folder of any file system that fsspec knows. quiet: show no progress."""
+    """A folder in any file system that fsspec supports. quiet: show no progress."""
 
-    kind: Kind | None = None  # no address says it
+    kind: Kind | None = None  # the address does not tell
 
     def __init__(self, scheme: str, url: str, *, quiet: bool = False):
-        """Take an address. Raises `UsageError` for a scheme without a package, and for what cannot be read."""
+        """Raises `UsageError` for a scheme without a package, and for an invalid address."""
         self._scheme, self._quiet = scheme, quiet
         self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
         try:
@@ -89,7 +89,7 @@ class Objects:
             raise UnknownName("scheme", f"{scheme}://", known) from None
         if scheme == "sftp" and not _SFTP.fullmatch(url):
             text = "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40, : as %3A"
-            raise UsageError(f"the sftp:// address cannot be read; {text}")
+            raise UsageError(f"the sftp:// address is invalid; {text}")
         self._login, place = self._class._get_kwargs_from_urls(url), self._class._strip_protocol(url)
         self._root = place.removeprefix("/~/").rstrip("/")  # relative to the user's home
         self._manifest = f"{self._root}/{MANIFEST_FILE}"
@@ -99,7 +99,7 @@ class Objects:
         return self._class(**self._login, **_OPTIONS.get(self._scheme, _FRESH))
 
     def read(self) -> Manifest | None:
-        """Return the version that readers see now; None if there is none."""
+        """Return the current version; None if there is none."""
         with explained(f"read {self.name}"):
             try:
                 info, data = self._fs.info(self._manifest), self._fs.cat_file(self._manifest)
@@ -107,19 +107,19 @@ class Objects:
                 return None
             return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
 
-    def write(self, plan: Plan) -> None:
-        """Upload the objects that are not there, then replace the manifest; remove what no reader can need."""
+    def write(self, plan: PushPlan) -> None:
+        """Upload missing objects, then replace the manifest and remove unused objects."""
         with explained(f"push to {self.name}"):
             found = self._fs.find(f"{self._root}/objects", detail=True)
             there = {name.rpartition("/")[2]: info["size"] for name, info in found.items()}
             files, before = plan.manifest.files, plan.before.files if plan.before else {}
             missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
             sources = [str(plan.local[path]) for path in missing.values()]
-            how = self._how("push", max([files[path].size for path in missing.values()], default=0))
+            how = self._transfer_options("push", max([files[path].size for path in missing.values()], default=0))
             self._fs.put(sources, [self._object(key) for key in missing], **how)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
-                    raise RemoteError(f"{plan.local[path]} was written to while it was pushed; push again after that")
+                    raise RemoteError(f"{plan.local[path]} was modified during the push; push again after that")
             if files != before:
                 self._switch(plan.manifest, plan.before)
                 named = {one.sha256 for one in (*files.values(), *before.values())}
@@ -127,25 +127,25 @@ class Objects:
                     self._fs.rm([self._object(key) for key in unused])
 
     def fetch(self, manifest: Manifest, paths: list[str], folder: Path) -> None:
-        """Write objects to where their files belong in a folder; their hashes are not looked at."""
+        """Download objects to the paths of their files in a folder, without checking hashes."""
         with explained(f"pull from {self.name}"):
             sources = [self._object(manifest.files[path].sha256) for path in paths]
-            how = self._how("pull", max(manifest.files[path].size for path in paths))
+            how = self._transfer_options("pull", max(manifest.files[path].size for path in paths))
             self._fs.get(sources, [str(folder / path) for path in paths], **how)
 
-    def _how(self, what: str, largest: int) -> dict[str, Any]:
-        """Return options of a transfer: a bar on a terminal, and how many files travel at once."""
+    def _transfer_options(self, what: str, largest: int) -> dict[str, Any]:
+        """Return options of a transfer: a progress bar, and the number of concurrent files."""
         bar = TqdmCallback({"desc": what, "unit": " files", "disable": True if self._quiet else None})
         at_once = _SMALL_AT_ONCE if largest <= _SMALL else _AT_ONCE
         return {"callback": bar, **({"batch_size": at_once} if self._fs.async_impl else {})}
 
     def _switch(self, new: Manifest, before: Manifest | None) -> None:
-        """Replace the manifest if it is still `before`: S3 sees to that itself; elsewhere it is read just before."""
+        """Replace the manifest if it is still `before`: on S3 atomically; elsewhere it is read just before."""
         found, version = self.read(), before.version if before else None
         try:
             if (found.version if found else None) != version:
                 raise FileExistsError
-            if self._scheme in ("file", "sftp"):  # others replace a file in one step
+            if self._scheme in ("file", "sftp"):  # others replace a file atomically
                 partial = f"{self._root}/.{MANIFEST_FILE}.{secrets.token_hex(8)}.partial"
                 self._fs.pipe_file(partial, new.to_json())
                 self._fs.mv(partial, self._manifest)
@@ -155,7 +155,7 @@ class Objects:
         except OSError as error:
             found = self.read()
             if found and found.files == new.files:
-                return  # it had worked, and only the answer was lost
+                return  # it succeeded, and only the response was lost
             if (found.version if found else None) != version:
                 text = "was changed by another push in the meantime; nothing of this push is visible there; push again"
                 raise RemoteError(f"{self.name} {text}") from error

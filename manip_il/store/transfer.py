@@ -1,4 +1,4 @@
-"""Push: a folder to a remote, examined, uploaded, and only then visible. Pull: back, verified, in one rename."""
+"""Push a folder to a remote, checked and visible only when complete; pull it back, verified, in one rename."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from manip_il.store.manifest import (
     File,
     Kind,
     Manifest,
-    Plan,
+    PushPlan,
     datasets_in,
     list_files,
     newest,
 )
 from manip_il.store.objects import Objects
 
-TRIES = 2  # to fetch a file with the right hash
-_LARGE = 50_000_000  # bytes of a file that is written to the disk by itself; smaller ones all together
+TRIES = 2  # downloads of a file until its hash is right
+_LARGE = 50_000_000  # files from this size on are synced one by one, smaller ones all together [bytes]
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")
 _OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
 
 
 def open_remote(url: str, *, revision: str | None = None, private: bool = False, quiet: bool = False) -> Hub | Objects:
-    """Return the remote of a URL, without connecting yet. Raises `UsageError` for what is no such URL.
+    """Return the remote of a URL, without connecting yet. Raises `UsageError` for an invalid URL.
 
-    revision: a Hub's branch, tag or commit. private: of a repository that a push creates on a Hub.
+    revision: branch, tag or commit on the Hub. private: whether a push creates a private repository on the Hub.
     """
     found = _ADDRESS.fullmatch(url)
     if not found:
@@ -52,16 +52,16 @@ def open_remote(url: str, *, revision: str | None = None, private: bool = False,
     return Objects(found[1], url, quiet=quiet)
 
 
-def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> Plan:
-    """Push a folder, or with `dry_run` nothing; return what is different there.
+def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> PushPlan:
+    """Push a folder, or with `dry_run` nothing; return the differences.
 
-    journals: include them. Raises `NotWhole` for a dataset in which the doctor finds errors, in a run too, `UsageError`
-    for a dataset in place of a policy or the other way round, and `RemoteError`.
+    journals: include them. Raises `NotWhole` for a dataset, also in a run, in which a check finds errors, `UsageError`
+    if a dataset is pushed to a policy's address or vice versa, and `RemoteError`.
     """
     kind: Kind = "dataset" if (source / INFO).is_file() else "policy"
     if kind == "policy" and not any((source / name).exists() for name in _OF_A_RUN):
         text = f"neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_OF_A_RUN)})"
-        raise UsageError(f"{source} is {text}; name the folder that holds one")
+        raise UsageError(f"{source} is {text}; give the folder of one")
     if remote.kind not in (None, kind):
         text = "datasets go to hf://datasets/USER/NAME, runs to hf://USER/NAME"
         raise UsageError(f"{source} is a {kind}, {remote.name} is for a {remote.kind}; {text}")
@@ -71,7 +71,7 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
             raise NotWhole(f"{text}; see all with manip-il data check, and try manip-il data repair {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         local = list_files(source.absolute(), kind, journals=journals)
-        if isinstance(remote, Hub):  # elsewhere a pull gives the folder back as it was
+        if isinstance(remote, Hub):  # from elsewhere, a pull returns the unchanged folder
             local |= remote.additions(source, local, Path(folder))
         before = remote.read()
         if before and before.kind != kind:
@@ -80,16 +80,16 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
             manifest = Manifest(kind, dict(zip(local, pool.map(File.of, local.values()), strict=True)))
         old, new = before.files if before else {}, manifest.files
         same = {path for path in old.keys() & new.keys() if old[path] == new[path] or old[path].fits(local[path])}
-        plan = Plan(manifest, before, local, sorted(new.keys() - same), sorted(old.keys() - new.keys()))
+        plan = PushPlan(manifest, before, local, sorted(new.keys() - same), sorted(old.keys() - new.keys()))
         if not dry_run:
             remote.write(plan)
     return plan
 
 
 def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_run: bool = False) -> Manifest:
-    """Fetch what readers of the remote see now into `target`, whole, or leave it as it is; return its manifest.
+    """Download the remote's current version to `target`, completely or not at all; return its manifest.
 
-    overwrite: replace what is there, in one step. Raises `FolderExistsError` if something is there and may not be
+    overwrite: replace an existing folder, atomically. Raises `FolderExistsError` if a folder exists and may not be
     replaced, `ManipError` for a dataset that `check_arrived` refuses, and `RemoteError`.
     """
     manifest = remote.read()
@@ -103,7 +103,7 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
     beside, skip = journals_of(target), len(f"{JOURNALS}/")
     journals = [path for path in files if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")]
     if beside.exists() and not overwrite and not all(files[path].fits(beside / path[skip:]) for path in journals):
-        raise FolderExistsError(beside)  # else what a killed pull has left
+        raise FolderExistsError(beside)  # unless it is left from a killed pull
     with atomic.new_folder(target, replace=overwrite) as partial:
         _fetch(partial, remote, manifest)
         for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:
@@ -118,21 +118,21 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
 
 
 def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
-    """Fill a folder with all files of a version, each verified and, of datasets, opened in a child process."""
+    """Download all files of a version into a folder, verify their hashes, and open datasets in a child process."""
     wrong = list(manifest.files)
     for _ in range(TRIES):
         for path in wrong:
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
         remote.fetch(manifest, wrong, folder)
         with ThreadPoolExecutor() as pool:
-            # large ones go to the disk while they are hashed, which takes as long
+            # large files are synced while they are hashed, which takes as long
             pool.map(atomic.sync, [folder / path for path in wrong if manifest.files[path].size >= _LARGE])
             fits = pool.map(lambda path: manifest.files[path].fits(folder / path), wrong)
             wrong = [path for path, is_right in zip(wrong, fits, strict=True) if not is_right]
         if not wrong:
             break
     else:
-        text = f"{checks.shorten(wrong[0])} twice did not have the hash that it should have"
+        text = f"{checks.shorten(wrong[0])} had the wrong hash twice"
         raise RemoteError(f"{remote.name}: {text}; nothing was kept; push to an empty folder, and pull from there")
     for dataset in datasets_in(folder):
         check_arrived(dataset)

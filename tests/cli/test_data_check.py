@@ -65,7 +65,7 @@ def test_repair_builds_again_and_exits_0_or_1_if_something_stays_wrong(root, cap
     root.with_name("d.before-repair").rename(root.with_name("kept"))
     (root / layout.TASKS).unlink()
     assert main(["data", "repair", str(root)]) == 1
-    assert "without journals beside it: pull or record it again" in capsys.readouterr().out
+    assert "there are no journals to repair it from: pull or record it again" in capsys.readouterr().out
 
 
 def test_the_robots_joints_are_compared(root, capsys):
@@ -84,4 +84,4 @@ def test_two_datasets_become_one_with_the_episodes_of_both(root, capsys):
     assert main(words) == 0
     assert Dataset.open(root.with_name("both")).info.episodes == 4
     assert main(words) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err

@@ -170,7 +170,7 @@ def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     assert main(["eval", "e", "--replay=4000001"]) == 1
     assert "what is drawn for the episode differs" in error()
     assert main(["eval", "e", "--replay=2"]) == 2
-    assert "has the seeds 4000000 to 4000001" in error()
+    assert "has seeds 4000000 to 4000001" in error()
 
 
 def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, capsys, error):

@@ -38,7 +38,7 @@ def test_the_module_runs_as_a_program():
         (
             ["fake", "--act=stop"],
             130,
-            "\nstopping after the step in hand (Ctrl-C again to stop at once)\n"
+            "\nstopping after the current step (press Ctrl-C again to stop at once)\n"
             "manip-il: interrupted; kept: 1 of 50 episodes in x; continue with --resume=true",
         ),
         (

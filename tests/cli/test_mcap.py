@@ -36,7 +36,7 @@ def test_what_is_exported_is_imported_and_what_the_mapping_leaves_out_is_said(da
     mapping.write_text(f"fps: 10\ntask: t\nfeatures:\n  action: {feature}\n")
     assert main(["data", "from-mcap", str(out), str(tmp_path / "new"), f"--mapping={mapping}"]) == 0
     rest, done = capsys.readouterr().out.splitlines()
-    assert rest.startswith("topics that the mapping does not name: /actor, /beta, ")
+    assert rest.startswith("topics not in the mapping: /actor, /beta, ")
     assert done.startswith("imported 2 episodes, 4 frames")
     np.testing.assert_array_equal(
         Dataset.open(tmp_path / "new").columns()["action"], Dataset.open(dataset).columns()["action"][::2, 1]

@@ -64,7 +64,7 @@ def test_a_mistyped_command_or_option_imports_nothing_heavy(tmp_path):
 TRAIN, EXPERT = "train --dataset.root=SAMPLE", "eval --policy.type=expert"
 MISTAKES = {
     "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: data build, ",
-    "doctor x --repair": "'doctor' has a new name: manip-il data check, and manip-il data repair",
+    "doctor x --repair": "'doctor' was renamed: manip-il data check, or manip-il data repair",
     "train": "--dataset.root is missing",
     "train --dataset.root=missing": "missing does not exist; expected a LeRobot v3.0 dataset",
     f"train --dataset.root={ROOT / 'docs'}": "is not a LeRobot dataset: meta/info.json is missing",
@@ -75,7 +75,7 @@ MISTAKES = {
     f"{TRAIN} --wandb.projekt=a --policy.type=act": "did you mean 'project'",
     "eval": "--policy.path=DIR",
     "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://lerobot/act_aloha FOLDER",
-    "eval missing --replay=1": "missing does not exist; expected evaluations: one, with --replay",
+    "eval missing --replay=1": "missing does not exist; expected evaluations: one with --replay",
     "eval SAMPLE": "expected two or more evaluations to merge, or one and --replay=SEED",
     f"{EXPERT} --suite=nominall": "did you mean 'nominal'?",
     f"{EXPERT} --until_width=2": "--until_width is 2.0; expected 0.0001 to 1",

@@ -110,7 +110,7 @@ def test_a_folder_that_holds_something_is_refused(here, error):
     words = [*EVAL, f"--output_dir={here / 'full'}"]
     write_file(here / "full" / "thesis.tex", b"years of work")
     assert main(words) == 2
-    assert "full exists already; " in error()
+    assert "full already exists; " in error()
     assert main([*words, "--overwrite=true"]) == 2
     assert "did not make" in error()
 

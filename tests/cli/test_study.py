@@ -130,7 +130,7 @@ def test_a_study_goes_on_with_its_own_file_alone(here, runs, capsys, error):
             "metod: cloning",
             "x.yaml: arm 'cloning': unknown key in its options: 'metod'",
         ),
-        ("rounds: 2", "seed: 2", "x.yaml: arm 'cloning': seed is set by the study itself"),
+        ("rounds: 2", "seed: 2", "x.yaml: arm 'cloning': seed is set by the study for every run"),
         ("  dagger:", "  ../dagger:", "its name, which becomes a folder, is '../dagger'"),
         ("method: cloning", "env.horizon: 9", "horizon differs: cloning has 9, dagger has 8"),
         ("at: labels", "expert: {a: {n_episodes: 3}}", "expert is now measured by manip-il eval --policy.type=expert"),

@@ -78,14 +78,14 @@ def test_no_file_may_say_it_and_the_resolved_options_do_not(command, tmp_path):
     assert said.trust is True  # pyright: ignore[reportAttributeAccessIssue]
     assert "trust" not in dump_yaml(said)
     (tmp_path / "c.yaml").write_text("trust: true\n")
-    with pytest.raises(UsageError, match=r"c\.yaml: trust: this can only be set on the command line; give --trust="):
+    with pytest.raises(UsageError, match=r"c\.yaml: trust can only be set on the command line; give --trust="):
         parse(cls, [*REQUIRED.get(command, []), f"--config_path={tmp_path / 'c.yaml'}"])
 
 
 def test_a_study_trusts_for_its_runs_what_its_file_may_not(tmp_path):
     path = tmp_path / "s.yaml"
     path.write_text("arms: {a: {rounds: 1}, b: {trust: true}}\ntraining_seeds: 1\n")
-    with pytest.raises(UsageError, match=r"its options: trust: this can only be set on the command line"):
+    with pytest.raises(UsageError, match=r"its options: trust can only be set on the command line"):
         read_plan(path, None)
     path.write_text("arms: {a: {rounds: 1}}\ntraining_seeds: 1\n")
     for trust in (False, True):

@@ -13,8 +13,8 @@ import pytest
 from kept import label_all
 
 from manip_il.collect.edits import (
-    Source,
-    Target,
+    EditSource,
+    EditTarget,
     open_source,
     redraw_dataset,
     relabel_dataset,
@@ -68,7 +68,7 @@ def demos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def visited(tmp_path_factory) -> Source:
+def visited(tmp_path_factory) -> EditSource:
     """What the expert does with a third of its steps random."""
     episodes = recorded(ENV, conditions=(NOISE,))
     return open_source(write(episodes, tmp_path_factory.mktemp("visited") / "visited", ENV))
@@ -93,7 +93,7 @@ def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvC
     bare = {key: np.zeros_like(second.columns[key]) for key in (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)}
     root = write([changed(first, **older), changed(second, **bare)], tmp_path / "older", env)
     whole = write([first, second], tmp_path / "whole", env)
-    assert relabel_dataset(open_source(root), Target(tmp_path / "new", workers=2)) == 2 + len(second)
+    assert relabel_dataset(open_source(root), EditTarget(tmp_path / "new", workers=2)) == 2 + len(second)
     new, expected = Dataset.open(tmp_path / "new"), Dataset.open(whole)
     for key, column in expected.columns().items():
         np.testing.assert_array_equal(new.columns()[key], column)
@@ -117,9 +117,9 @@ def test_pictures_made_afterwards_are_those_made_while_recording(robot: str):
 @pytest.mark.slow
 def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path):
     dim, once = CameraConfig(("wrist",), 32, 48, Look(brightness=0.5)), tmp_path / "pictured"
-    render_dataset(open_source(demos), CAMERAS, Target(once, workers=2))
-    render_dataset(open_source(once), dim, Target(tmp_path / "dim"))
-    relabel_dataset(open_source(once), Target(tmp_path / "relabelled"))
+    render_dataset(open_source(demos), CAMERAS, EditTarget(once, workers=2))
+    render_dataset(open_source(once), dim, EditTarget(tmp_path / "dim"))
+    relabel_dataset(open_source(once), EditTarget(tmp_path / "relabelled"))
     assert digests(once / "videos") == digests(tmp_path / "relabelled" / "videos") != {}
     before = Dataset.open(demos)
     for root, cameras in ((once, CAMERAS), (tmp_path / "dim", dim)):
@@ -134,12 +134,12 @@ def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path
                 assert np.abs(episode.columns[key].astype(int) - exact[key]).mean() < 4
 
 
-def redrawn(source: Source, root: Path, frames: int, workers: int = 1, **settings) -> list[Episode]:
-    redraw_dataset(source, Scenes(SMALL, frames, **settings), Target(root, workers))
+def redrawn(source: EditSource, root: Path, frames: int, workers: int = 1, **settings) -> list[Episode]:
+    redraw_dataset(source, Scenes(SMALL, frames, **settings), EditTarget(root, workers))
     return list(Dataset.open(root).read_episodes())
 
 
-def originals(source: Source, seed: int = 0) -> list[State]:
+def originals(source: EditSource, seed: int = 0) -> list[State]:
     states = source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE]
     order = rng_for(seed, "order of redrawn states").permutation(len(states))
     return [State.from_vector(row) for row in states[order]]

@@ -66,7 +66,7 @@ def names(root: Path, rng: Rng) -> str | None:
     wrong = [None, ["width", "height", "channels"], ["channels", "height", "width"]][rng.integers(3)]
     for key in Dataset.open(root).cameras:
         edit_json(root / layout.INFO, lambda info, key=key: info["features"][key].update(names=wrong))
-        return f"error    meta/info.json: {key}: .* LeRobot does not train; set .*channels"
+        return f"error    meta/info.json: {key}: .* LeRobot cannot train; set .*channels"
     return None
 
 
@@ -87,13 +87,13 @@ def frames(root: Path, rng: Rng) -> str:
 def finite(root: Path, rng: Rng) -> str:
     key, row, value = str(rng.choice([s.STATE, s.ACTION])), int(rng.integers(100)), rng.choice([np.nan, np.inf])
     edit_table(root / DATA, lambda table: table[key].__setitem__(row, [float(value)] * 5))
-    return f"data: {key}: no number in row {row} "
+    return f"data: {key}: not finite in row {row} "
 
 
 def times(root: Path, rng: Rng) -> str:
     scale = float(rng.choice([0.5, 0.97, 1.1]))
     edit_table(root / DATA, lambda table: table.update(timestamp=[time * scale for time in table["timestamp"]]))
-    return r"data: timestamp at \d+ frames a second: .*; expected"
+    return r"data: timestamp at \d+ frames per second: .*; expected"
 
 
 def statistics(root: Path, rng: Rng) -> str:
@@ -106,7 +106,7 @@ def died(root: Path, rng: Rng) -> str:
     name = str(rng.choice([DATA, EPISODES, "images/x/frame.png", "tmpab12cd_9/x.mp4", "meta/.x.partial"]))
     if (root / name).exists():
         cut(root / name, float(rng.uniform(0.3, 0.95)))
-        return f"{name}: .*(recorder had died|writer died)"
+        return f"{name}: .*(crash of the recorder|writer died)"
     (root / name).parent.mkdir(parents=True, exist_ok=True)
     (root / name).write_bytes(b"x")
     return "left by a recorder, writer or download that died"
@@ -126,7 +126,7 @@ def own(root: Path, rng: Rng) -> str | None:
     key = str(rng.choice([s.LABEL_VALID, s.ACTOR, s.SEED, "spec"]))
     if key == "spec":
         edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "other"))
-        return "meta/manip_il.json: .*; meta/info.json says"
+        return "meta/manip_il.json: .*, but meta/info.json has"
     edit_table(root / DATA, lambda table: table[key].__setitem__(9, 77))
     return f"data: {key}: 77 at 9"
 
@@ -153,7 +153,7 @@ def lag(root: Path, rng: Rng) -> str:
 
 def cameras(root: Path, rng: Rng) -> str | None:
     """Frozen, black or swapped in some episodes."""
-    dataset, what = Dataset.open(root), str(rng.choice(["stands still", "is black", "is swapped with"]))
+    dataset, what = Dataset.open(root), str(rng.choice(["is frozen", "is black", "is swapped with"]))
     if not dataset.cameras:
         return None
     seen = {key: dataset.frames(key, np.arange(len(dataset))).copy() for key in dataset.cameras}
@@ -162,7 +162,7 @@ def cameras(root: Path, rng: Rng) -> str | None:
         if what == "is swapped with":
             left[part], right[part] = right[part].copy(), left[part].copy()
         else:
-            left[part] = left[part[0]] if what == "stands still" else rng.integers(0, 8, left[part].shape, np.uint8)
+            left[part] = left[part[0]] if what == "is frozen" else rng.integers(0, 8, left[part].shape, np.uint8)
     show(root, seen)
     return f"{dataset.cameras[0]}: {what} .*3 of 12 episodes"
 
@@ -181,21 +181,21 @@ def joint(root: Path, rng: Rng) -> str:
 
 
 def commands(root: Path, rng: Rng) -> str:
-    """A gripper that does not follow, actions cut off, or one text for two motions."""
-    what = str(rng.choice(["never reached", "cut off", "another way"]))
+    """A gripper that does not follow, clipped actions, or one text for two motions."""
+    what = str(rng.choice(["but only moves", "is clipped", "move differently"]))
     place, follows = int(rng.integers(4)), float(rng.choice([0.0, 0.4]))
     low, high = np.quantile(Dataset.open(root).columns([s.ACTION])[s.ACTION][:, place], [0.3, 0.7])
 
     def change(state: np.ndarray, action: np.ndarray) -> None:
-        if what == "never reached":
+        if what == "but only moves":
             state[:, 4] = 0.04 + (state[:, 4] - 0.04) * follows
-        elif what == "cut off":
+        elif what == "is clipped":
             limits: Any = (low, None) if action[0, place] > low else (None, high)
             action[:, place] = action[:, place].clip(*limits)
         else:
             state[:, :4], action[:, :4] = 2 * state[0, :4] - state[:, :4], 2 * action[0, :4] - action[:, :4]
 
-    move(root, change, some(rng, 3) if what == "another way" else range(COUNT))
+    move(root, change, some(rng, 3) if what == "move differently" else range(COUNT))
     return f"(action|task): .*{what}"
 
 

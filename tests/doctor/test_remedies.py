@@ -43,7 +43,7 @@ def test_a_damaged_dataset_is_rebuilt_from_its_journals_and_kept(ours):
     cut(ours / DATA, 0.5)
     damaged = digests(ours)
     kept = ours.with_name("ours.before-repair")
-    assert mend(ours) == ["rebuilt from ours.journals: 12 episodes", f"what was replaced or moved is kept in {kept}"]
+    assert mend(ours) == ["rebuilt from ours.journals: 12 episodes", f"replaced and moved files are kept in {kept}"]
     assert (digests(ours), digests(kept)) == (whole, damaged)
 
 
@@ -51,7 +51,7 @@ def test_journals_that_hold_less_than_the_dataset_replace_nothing(ours):
     list_episodes(ours.with_name("ours.journals"))[0].unlink()
     (ours / layout.TASKS).unlink()
     before = digests(ours)
-    assert mend(ours)[0] == "not rebuilt: ours.journals makes 11 episodes, and 12 are still readable"
+    assert mend(ours)[0] == "not rebuilt: ours.journals holds 11 episodes, but 12 are still readable"
     assert digests(ours) == before
 
 
@@ -75,15 +75,15 @@ def test_what_a_link_leads_to_is_not_changed(theirs):
     elsewhere = info.rename(theirs.with_name("info.json"))
     info.symlink_to(elsewhere)
     edit_json(elsewhere, lambda info: info.update(total_frames=3))
-    with pytest.raises(ManipError, match=r"info\.json is a link to elsewhere"):
+    with pytest.raises(ManipError, match=r"info\.json is a link out of the dataset"):
         mend(theirs)
     assert json.loads(elsewhere.read_text())["total_frames"] == 3
 
 
 def test_lerobots_tool_deletes_the_episodes_that_a_remedy_names(theirs, warm_lerobot: Warm):
     edit_table(theirs / DATA, lambda table: table[s.ACTION].__setitem__(4, [float("nan")] * 5))
-    [finding] = [one for one in examine_folder(theirs) if "no number" in one.text]
-    done = warm_lerobot.run(*shlex.split(finding.remedy.partition("out: ")[2]), folder=theirs.parent)
+    [finding] = [one for one in examine_folder(theirs) if "not finite" in one.text]
+    done = warm_lerobot.run(*shlex.split(finding.remedy.partition("delete them: ")[2]), folder=theirs.parent)
     assert done.returncode == 0, done.stderr
     assert lines(theirs.with_name("theirs_kept")) == []
 

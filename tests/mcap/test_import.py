@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from manip_il.errors import ManipError
 from manip_il.mcap.importing import import_files, pick, read_frames
-from manip_il.mcap.mapping import Source
+from manip_il.mcap.mapping import TopicSource
 
 from ..damage import digests
 from ..pictures import encoded
@@ -82,7 +82,7 @@ def test_every_frame_gets_what_a_full_search_finds(method: Any, stamps, later, t
     before = [max(stamp for stamp in stamps if stamp <= time) for time in times]
     wanted = near if method == "nearest" else before
     gaps = [frame for frame, time in enumerate(times) if abs(wanted[frame] - time) > tolerance]
-    source, second = Source("/t", method, tolerance, "x", "float32"), 10**9
+    source, second = TopicSource("/t", method, tolerance, "x", "float32"), 10**9
     arrays = np.array(stamps) * second, np.array(times) * second
     if gaps:
         place = f"a gap at {times[gaps[0]] - times[0]} s"

@@ -11,7 +11,7 @@ import pytest
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 
 from manip_il.errors import ManipError
-from manip_il.mcap.mapping import Mapping, Source, exact_rate, frame_times, load_mapping
+from manip_il.mcap.mapping import Mapping, TopicSource, exact_rate, frame_times, load_mapping
 from manip_il.mcap.path import values_at
 
 from .use import load
@@ -23,7 +23,7 @@ TREE: dict[str, Any] = {"fps": 20, "task": "do it", "features": {"action": NUMBE
 
 
 def test_a_mapping_is_its_file_and_the_example_loads(tmp_path: Path) -> None:
-    number, camera = Source("/a", "previous", 0.1, "x", "float32"), Source("/c", "nearest", 0, video=True)
+    number, camera = TopicSource("/a", "previous", 0.1, "x", "float32"), TopicSource("/c", "nearest", 0, video=True)
     assert load(tmp_path, **TREE) == Mapping(20, "do it", {"action": number, "observation.images.c": camera})
     example = load_mapping(ROOT / "configs/mcap/panda.yaml")
     assert [one.topic for one in example.sources.values()][:3] == ["/joint_states", "/tf", "/action"]
@@ -49,7 +49,7 @@ def test_a_path_leads_to_values_or_says_where_it_ends() -> None:
     for path, why in (
         ("joint", r"no field 'joint' \(did you mean 'joints'\?\); known: timestamp, joints"),
         ("joints[name=elbo].name", r"\[name=elbo\] fits 0 of 2 elements"),
-        ("joints.position", r"in a list; choose its elements by \[0\], \[:\]"),
+        ("joints.position", r"in a list; select elements by \[0\], \[:\]"),
         ("joints[0].velocity", "velocity is not set in this message"),
     ):
         with pytest.raises(ManipError, match=why):

@@ -32,7 +32,7 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     assert run("reward fit pairs.json a.json b.json --members=3 --output_dir=reward") == 0
     out, err = capsys.readouterr()
     assert "80 answers about 40 pairs" in out
-    assert "are answered left and right: both answers count" in err
+    assert "have contradictory answers; both count" in err
     found = json.loads((here / "reward" / "fit.json").read_text())
     assert 30 <= found["agreement_with_progress"]["of"] <= 40
     assert run("data score bad --reward=reward --output_dir=scores") == 0

@@ -83,4 +83,4 @@ def test_the_command_writes_a_yaml_that_is_a_robot_and_says_what_it_can_do(tmp_p
     assert "arm has starts for 12 of 12 tasks" in said
     assert read_robot(path).joints
     assert main(words) == 2  # there is one
-    assert "exists already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
