@@ -27,11 +27,11 @@ Batch = dict[str, torch.Tensor]
 
 def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> Batch:
     """Return frames of a dataset as a policy takes them."""
-    keys = [IMAGES + camera for camera in cameras]
-    frames = {key: Dataset.open(root).camera(key).decode() for key in keys}
-    table = Dataset.open(root).columns([STATE, ENVIRONMENT_STATE])
+    keys, dataset = [IMAGES + camera for camera in cameras], Dataset.open(root)
+    frames = {key: dataset.camera(key).rows(rows).transpose(0, 3, 1, 2) for key in keys}
+    table = dataset.columns([STATE, ENVIRONMENT_STATE])
     numbers = {key: torch.from_numpy(np.array(column[rows])) for key, column in table.items()}
-    return numbers | {key: torch.from_numpy(frames[key][rows]).float() / 255 for key in keys}
+    return numbers | {key: torch.from_numpy(frames[key]).float() / 255 for key in keys}
 
 
 def read_off(policy: CNNPolicy, batch: Batch) -> torch.Tensor:
