@@ -62,6 +62,8 @@ def test_a_round_leaves_its_episodes_dataset_policy_and_evaluation_and_the_run_i
         assert (results[round_].policy / "model.safetensors").is_file()
         assert EvalResult.read(here / "eval.json") == results[round_].validation
     assert digests(folder / "best" / "pretrained_model") == digests(best_result(results).policy)
+    for path in (folder / "best" / "pretrained_model").glob("*.json"):
+        assert str(folder) not in path.read_text(), f"{path.name} names a folder of this machine"
 
 
 def test_the_numbers_of_a_round_are_those_of_its_data(run):
