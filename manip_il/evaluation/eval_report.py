@@ -23,7 +23,7 @@ from manip_il.evaluation.figures import (
 from manip_il.evaluation.report import Film, Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.tables import BASELINE, PolicyRow, Table, evaluation_table, policy_table
-from manip_il.sim.task import NO_PHASE
+from manip_il.sim.task import NO_PHASE, phases
 from manip_il.tasks.table import TASKS
 
 _NO_PHASE = "not even the expert can continue: an object is off the table, or something is out of reach"
@@ -145,20 +145,14 @@ def phase_table(policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: s
     found = {name for counts in counted for name in counts}
     if not found:
         return None
-    meanings = phase_meanings(task)
-    names = [*meanings, *sorted(found - meanings.keys())]
-    rows = (
-        (f"{_spaced(name)}\n{meanings.get(name, '')}".rstrip(), *(f"{counts[name]:,}" for counts in counted))
-        for name in names
-    )
+    known = phases(TASKS[task]) if task in TASKS else ()
+    names = [*known, *sorted(found.difference(known))]
+    rows = ((_phase_words(name), *(f"{counts[name]:,}" for counts in counted)) for name in names)
     return Table(("phase that it ended in", *(name for name, _ in policies)), tuple(rows))
 
 
-def phase_meanings(task: str) -> dict[str, str]:
-    """Return phase -> meaning, from the first to the last; empty for a task that is not known here."""
-    if task not in TASKS:
-        return {}
-    return {rung.name: rung.words for rung in reversed(TASKS[task].rungs)} | {NO_PHASE: _NO_PHASE}
+def _phase_words(name: str) -> str:
+    return _spaced(name) if name != NO_PHASE else f"{name}\n{_NO_PHASE}"
 
 
 def evaluation_verdict(result: EvalResult) -> str:

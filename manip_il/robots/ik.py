@@ -28,32 +28,59 @@ _LEVENBERG = 1e-8  # added to J J^T, so that a singular posture gives a short st
 _LARGEST = 0.5  # of a joint in one step of `moved` [rad]
 
 
+class PoseProgram:
+    """mink's quadratic program of a site's pose [m] and [rad] and of a posture, within the joints' limits.
+
+    Stateless: every solution starts from the posture in `data`, after `update`, and from a fixed `home` (n,). costs: of
+    the rotation [1/rad], where the position has 1 [1/m], and of joints off `home` [1/rad].
+    """
+
+    def __init__(self, model: mujoco.MjModel, site: str, home: F64, costs: tuple[float, float]):
+        self._configuration = mink.Configuration(model)
+        self.model, self.data = model, self._configuration.data
+        orientation, posture = costs
+        self.frame = mink.FrameTask(site, "site", _POSITION_COST, orientation, lm_damping=_LM_DAMPING)
+        self._target = self.frame.transform_target_to_world = mink.SE3.identity()
+        self.posture = mink.PostureTask(model, posture)  # else a label depends on the path that led to the posture
+        self.posture.set_target(home)
+        limit = mink.ConfigurationLimit(model)
+        self._bounded, self._gain = limit.indices.astype(int), limit.gain
+        rows = np.eye(model.nv)[self._bounded]
+        self._rows, self._lower = np.vstack([rows, -rows]), np.full(2 * len(rows), -_UNBOUNDED)
+        self._low, self._high = limit.lower[self._bounded], limit.upper[self._bounded]
+        self._sense = np.zeros(2 * len(rows), np.intc)
+
+    def update(self) -> None:
+        """Compute what `data.qpos` changes, Jacobians included."""
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+
+    def solve(self, position: F64, rotation: F64) -> F64 | None:
+        """Return the joints' displacement (n,) [rad] towards a pose, (3,) [m] and (3, 3); None without a solution."""
+        mujoco.mju_mat2Quat(self._target.wxyz_xyz[:4], rotation.ravel())
+        self._target.wxyz_xyz[4:] = position
+        program: Any = mink.build_ik(self._configuration, [self.frame, self.posture], 1.0, _DAMPING, [])
+        q = self.data.qpos[self._bounded]
+        upper = self._gain * np.concatenate([self._high - q, q - self._low])
+        # DAQP itself: through qpsolvers, and with mink's limits, a label takes a half longer.
+        x, _, exit_flag, _ = daqp.solve(program.P, program.q, self._rows, upper, self._lower, self._sense)
+        return x if exit_flag > 0 else None
+
+
 class ArmIK:
     """Stateless use of mink: every call starts from the measured `q` and a fixed posture target."""
 
     def __init__(self, robot: Robot):
         model = arm_model(robot)
-        self._configuration = mink.Configuration(model)
         self._address = np.array([model.joint(name).qposadr[0] for name in robot.joints])
         home = np.zeros(model.nq)
         home[self._address] = robot.home
         self._site = model.site("ee").id
-        self._costs = costs = robot.costs
-        self._frame = mink.FrameTask("ee", "site", _POSITION_COST, costs.orientation, lm_damping=_LM_DAMPING)
-        self._target = self._frame.transform_target_to_world = mink.SE3.identity()
-        posture = mink.PostureTask(model, costs.posture)  # else a label depends on the path that led to the posture
-        posture.set_target(home)
-        limit = mink.ConfigurationLimit(model)
-        self._tasks, self._bounded, self._gain = [self._frame, posture], limit.indices.astype(int), limit.gain
-        rows = np.eye(model.nv)[self._bounded]
-        self._rows, self._lower = np.vstack([rows, -rows]), np.full(2 * len(rows), -_UNBOUNDED)
-        self._ends, self._sense = (
-            (limit.lower[self._bounded], limit.upper[self._bounded]),
-            np.zeros(2 * len(rows), np.intc),
-        )
+        self._costs = robot.costs
+        self._program = PoseProgram(model, "ee", home, (robot.costs.orientation, robot.costs.posture))
         joints = [model.joint(name) for name in robot.joints]
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
-        data = self._configuration.data  # views of which each says what the posture is now
+        self._data = data = self._program.data  # views of which each says what the posture is now
         self._ee, self._ee_flat = data.site_xpos[self._site], data.site_xmat[self._site]
         self._ee_rotation, self._qpos = self._ee_flat.reshape(3, 3), data.qpos
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
@@ -63,7 +90,7 @@ class ArmIK:
 
     def ahead(self, position: F64) -> float:
         """Return the yaw that counts as none for a hand at a position (3,) [m]; [rad]."""
-        return yaw_ahead(self._robot, self._configuration.data.xanchor[self._shoulder], position)
+        return yaw_ahead(self._robot, self._data.xanchor[self._shoulder], position)
 
     def smallest_singular_value(self, q: F64) -> float:
         """Return how far a posture (arm,) [rad] is from one in which the hand cannot be moved some way."""
@@ -73,7 +100,7 @@ class ArmIK:
     def lowest_link(self, q: F64) -> float:
         """Return the height of the lowest joint beyond the shoulder in a posture (arm,) [rad]; [m]."""
         self.ee_pose(q)
-        return float(self._configuration.data.xpos[self._links, 2].min()) if self._links else 0.0
+        return float(self._data.xpos[self._links, 2].min()) if self._links else 0.0
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
         """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
@@ -82,23 +109,15 @@ class ArmIK:
 
     def _at(self, q: F64) -> tuple[F64, F64]:
         """`ee_pose` as views, which the next posture overwrites."""
-        model, data = self._configuration.model, self._configuration.data
         self._qpos[self._address] = q
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)  # for Jacobians
+        self._program.update()
         return self._ee, self._ee_rotation
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
         """Return the displacement of `step` alone, (arm,) [rad]; weight: of the rotation, by default as upright."""
-        mujoco.mju_mat2Quat(self._target.wxyz_xyz[:4], rotation.ravel())
-        self._target.wxyz_xyz[4:] = position
-        self._frame.cost[3:] = self._costs.orientation if weight is None else weight
-        program: Any = mink.build_ik(self._configuration, self._tasks, 1.0, _DAMPING, [])
-        q, (low, high) = self._qpos[self._bounded], self._ends
-        upper = self._gain * np.concatenate([high - q, q - low])
-        # DAQP itself: through qpsolvers, and with mink's limits, a label takes a half longer.
-        x, _, exit_flag, _ = daqp.solve(program.P, program.q, self._rows, upper, self._lower, self._sense)
-        if exit_flag <= 0:
+        self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
+        x = self._program.solve(position, rotation)
+        if x is None:
             return None
         dq = x[self._address]
         longest = max(map(abs, dq.tolist()))
@@ -120,7 +139,7 @@ class ArmIK:
         if before < _CONVERGED:
             return dq, 0.0
         self._qpos[self._address] += dq
-        mujoco.mj_kinematics(self._configuration.model, self._configuration.data)
+        mujoco.mj_kinematics(self._program.model, self._data)
         return dq, self._pose_error(position, rotation, weight) / before
 
     def moved(self, q: F64, motions: F64) -> F64:
@@ -153,8 +172,8 @@ class ArmIK:
 
     def _site_jacobian(self) -> F64:
         """Position over rotation of `ee` by the arm's joints at the posture last given to `ee_pose`, (6, arm)."""
-        configuration, jacobian = self._configuration, self._jacobian
-        mujoco.mj_jacSite(configuration.model, configuration.data, jacobian[:3], jacobian[3:], self._site)
+        jacobian = self._jacobian
+        mujoco.mj_jacSite(self._program.model, self._data, jacobian[:3], jacobian[3:], self._site)
         return jacobian[:, self._dofs]
 
     def _pose_error(self, position: F64, rotation: F64, weight: float) -> float:

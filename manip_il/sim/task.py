@@ -38,10 +38,9 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class Rung:
-    """One rung of a ladder. name: the phase; words: what the world is like there; holds: whether it is."""
+    """One rung of a ladder. name: the phase; holds: whether the world is in it."""
 
     name: str
-    words: str
     holds: Callable[[World], bool]
     target: Callable[[World], Target]
 

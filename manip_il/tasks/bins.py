@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from manip_il.sim.task import Rung
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
-from manip_il.tasks.ladder import Lift, Place, Which, carry, carry_progress, held, let_go
+from manip_il.tasks.ladder import Lift, Place, Which, carry, carry_progress, hand_is_at, held, let_go
 from manip_il.tasks.objects import WOOD, add_furniture, add_part
 
 F64 = NDArray[np.float64]
@@ -57,21 +57,11 @@ def drop_rungs(
 
     def at_done(world: World) -> bool:
         name = nearest(world)
-        return _hand_is_at(world, name) and is_done(world, name)
+        return hand_is_at(world, name, *_AT) and is_done(world, name)
 
     return (
-        Rung(
-            "let_go",
-            "an object is in its box, and the hand lets go of it",
-            at_done,
-            lambda w: let_go(w, nearest(w), _RISE),
-        ),
-        Rung(
-            "carry",
-            "the object is in the hand, on its way to its box",
-            lambda w: held(w, which(w)),
-            lambda w: carry(w, which(w), to(w), OVER_WALL),
-        ),
+        Rung("let_go", at_done, lambda w: let_go(w, nearest(w), _RISE)),
+        Rung("carry", lambda w: held(w, which(w)), lambda w: carry(w, which(w), to(w), OVER_WALL)),
     )
 
 
@@ -84,8 +74,3 @@ def drop_place(world: World, name: str, box: str, offset: Sequence[float] = (0.0
     """Return where an object's centre is let go over a box's floor, `offset` (2,) from its middle; (3,) [m]."""
     height = 2 * THIN + lie_of(world, name).tall / 2 + DROP
     return world.pose(box).position + [offset[0], offset[1], height]
-
-
-def _hand_is_at(world: World, name: str) -> bool:
-    x, y, z = (world.ee.position - world.pose(name).position).tolist()
-    return math.hypot(x, y) < _AT[0] and z < _AT[1]

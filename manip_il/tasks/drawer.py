@@ -12,28 +12,36 @@ from numpy.typing import NDArray
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
-from manip_il.tasks.cabinet import (
-    BAR,
-    BAR_HALF,
-    BAR_Z,
-    CABINET,
-    INSIDE,
-    OPEN,
-    WALL,
-    add_cabinet,
-    hand_at_handle,
-    middle_of_drawer,
-    pulled,
-)
 from manip_il.tasks.grasp import lie_of
-from manip_il.tasks.ladder import Lift, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go, nearness
-from manip_il.tasks.objects import add_cube
+from manip_il.tasks.ladder import (
+    Lift,
+    carry,
+    carry_progress,
+    grasp_progress,
+    grasp_rungs,
+    hand_is_at,
+    held,
+    let_go,
+    nearness,
+    rise_first,
+)
+from manip_il.tasks.objects import GREY, WOOD, add_cube, add_furniture, add_part
 from manip_il.tasks.pick_place import OBJECT, observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
 
 F64 = NDArray[np.float64]
 
+CABINET, TRAY, BAR = "cabinet", "drawer", "handle"
+# The cabinet's frame lies on the table under the handle of the closed drawer, x into the cabinet.
+GAP = 0.056  # of the handle's middle from the drawer's front [m]
+INSIDE = (0.05, 0.06)  # half the drawer's inner length and width [m]
+WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # of the drawer: height of walls, floor, front; half a wall [m]
+ROOF = 0.080  # of the cabinet, over the table, on the inside [m]
+MIDDLE = GAP + 2 * THIN + INSIDE[0]  # of the drawer's inside from its handle [m]
+BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # of the handle: height, half its thickness, half its length [m]
+OPEN = 0.12  # how far the drawer is pulled [m]
+HAND_Z = BAR_Z - 0.005  # of the hand at the handle [m]
 HALF = 0.02  # of the cube's edge [m]
 OPEN_ENOUGH, SHUT = 0.09, 0.008  # how far the drawer is pulled for the object to go in, and is shut at most [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
@@ -51,6 +59,52 @@ LEFT = (0.03, 0.06, 0.03)  # of the hand off the handle where it need not rise f
 # drawer, x; and where it is put aside [m].
 WAY_X, WAY_Y, BEFORE, ASIDE = (-0.20, 0.07), 0.12, -0.06, (-0.04, 0.17)
 _STEP = 0.04  # how far ahead of the hand its target runs while it moves the drawer [m]
+
+
+def add_cabinet(spec: mujoco.MjSpec) -> None:
+    """Add a cabinet with a drawer that slides out towards the robot."""
+    cabinet = add_furniture(spec, CABINET)
+    front = GAP + 2 * THIN  # where the drawer's inside begins
+    length, width = INSIDE
+    deep, wide = length + 2 * THIN, width + 3 * THIN  # of the cabinet, half
+    back = front + 2 * deep
+    for side, sign in (("left", 1), ("right", -1)):
+        add_part(
+            cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, sign * (wide + THIN), ROOF / 2), WOOD
+        )
+    add_part(cabinet, "cabinet back", (THIN, wide + 2 * THIN, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
+    add_part(cabinet, "cabinet top", (deep + THIN, wide + 2 * THIN, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD)
+    tray = cabinet.add_body(name=TRAY)
+    tray.add_joint(
+        name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN],
+        damping=[5.0, 0, 0], frictionloss=0.5, armature=0.05,
+    )  # fmt: skip
+    middle = front + length
+    add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
+    for side, sign in (("left", 1), ("right", -1)):
+        add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, sign * (width + THIN), WALL / 2), WOOD)
+    back_z, back_half = (ROOF - THIN + FLOOR) / 2, (ROOF - THIN - FLOOR) / 2  # so high that nothing gets behind it
+    add_part(tray, "drawer back", (THIN, width, back_half), (front + 2 * length + THIN, 0, back_z), WOOD)
+    add_part(tray, "drawer front", (THIN, wide + 2 * THIN, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
+    add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
+    for side, sign in (("left", 1), ("right", -1)):
+        add_part(tray, f"{BAR} {side}", (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, sign * BAR_LENGTH, BAR_Z), GREY)
+    spec.add_exclude(bodyname1=CABINET, bodyname2=TRAY)
+
+
+def pulled(world: World) -> float:
+    """Return how far the drawer is open [m]."""
+    return float(world.pose(CABINET).position[0] - world.pose(TRAY).position[0])
+
+
+def middle_of_drawer(world: World) -> F64:
+    """Return the middle of the drawer's floor, (3,) [m]."""
+    return world.pose(TRAY).position + [MIDDLE, 0.0, FLOOR]
+
+
+def hand_at_handle(world: World) -> F64:
+    """Return where the hand has the handle between its fingers, (3,) [m]."""
+    return world.pose(TRAY).position + [0.0, 0.0, HAND_Z]
 
 
 def is_inside(world: World) -> bool:
@@ -87,9 +141,7 @@ def _to_bar(world: World) -> Target:
     height = min(HOVER, SLOPE * max(0.0, off - 0.006))
     if abs(world.opening - FINGERS) > 0.012:
         height = max(height, 0.05)
-    sideways = min(1.0, max(0.0, 1.0 - (bar[2] + height - ee.position[2]) / 0.03))
-    position = np.append(ee.position[:2] + sideways * (bar - ee.position)[:2], bar[2] + height)
-    return Target(position, hand_down(yaw), FINGERS)
+    return Target(rise_first(ee.position, (*bar[:2], bar[2] + height)), hand_down(yaw), FINGERS)
 
 
 def _move_drawer(world: World, to: float) -> Target:
@@ -108,18 +160,11 @@ def _is_open(world: World) -> bool:
 
 
 def _hand_is_in(world: World) -> bool:
-    """Whether the hand is at the object."""
-    x, y, z = (world.ee.position - world.pose(OBJECT).position).tolist()
-    return math.hypot(x, y) < 0.05 and z < 0.07
+    return hand_is_at(world, OBJECT, 0.05, 0.07)
 
 
 def _let_go(world: World) -> Target:
     return let_go(world, OBJECT, HOVER)
-
-
-def _carry(world: World) -> Target:
-    """Lift the object, move it over the drawer and lower it."""
-    return carry(world, OBJECT, _place(world), OVER_FRONT)
 
 
 def _place(world: World) -> F64:
@@ -140,26 +185,23 @@ def _is_around_bar(world: World) -> bool:
     return abs(x) < LEFT[0] and abs(y) < LEFT[1] and z < LEFT[2]
 
 
-def _from_cabinet(world: World) -> tuple[float, float]:
-    """The object in the cabinet's frame, x and y [m]."""
+def _is_in_way(world: World, farthest: float = WAY_X[1]) -> bool:
+    """Whether the object lies where the handle passes over it, so that the hand cannot grasp it there.
+
+    farthest: of the object along the cabinet's x [m].
+    """
     x, y = (world.pose(OBJECT).position - world.pose(CABINET).position)[:2].tolist()
-    return x, y
-
-
-def _is_in_way(world: World) -> bool:
-    """Whether the object lies where the handle passes over it, so that the hand cannot grasp it there."""
-    x, y = _from_cabinet(world)
-    return WAY_X[0] < x < WAY_X[1] and abs(y) < WAY_Y
+    return WAY_X[0] < x < farthest and abs(y) < WAY_Y
 
 
 def _must_shut(world: World) -> bool:
     """Whether the object lies in the way of a drawer that is out, and before the handle of one that is shut."""
-    return _is_in_way(world) and _from_cabinet(world)[0] < BEFORE and not _is_shut(world)
+    return _is_in_way(world, BEFORE) and not _is_shut(world)
 
 
 def _must_open(world: World) -> bool:
     """Whether the drawer is to be opened: always, unless the object lies before it and must be moved first."""
-    return not _is_open(world) and not (_is_in_way(world) and _from_cabinet(world)[0] < BEFORE)
+    return not _is_open(world) and not _is_in_way(world, BEFORE)
 
 
 def _is_set_down(world: World) -> bool:
@@ -176,58 +218,18 @@ def _put_aside(world: World) -> Target:
 
 
 _RUNGS = (
-    Rung("done", "the object is in the drawer, and it is shut", lambda w: is_inside(w) and _is_shut(w), _to_bar),
-    Rung(
-        "let_go",
-        "the object is in the drawer, and the hand lets go of it",
-        lambda w: is_inside(w) and _hand_is_in(w),
-        _let_go,
-    ),
-    Rung(
-        "push",
-        "the object is in the drawer, and the hand pushes it shut",
-        lambda w: is_inside(w) and _at_bar(w),
-        lambda w: _move_drawer(w, -0.01),
-    ),
-    Rung("to_push", "the object is in the drawer, and the hand goes to the handle", is_inside, _to_bar),
-    Rung(
-        "carry",
-        "the object is in the hand, on its way to the open drawer",
-        lambda w: held(w, OBJECT) and _is_open(w),
-        _carry,
-    ),
-    Rung(
-        "set_down",
-        "the object is in the hand on the table, and the drawer is not open",
-        lambda w: held(w, OBJECT) and _is_set_down(w),
-        _let_go,
-    ),
-    Rung(
-        "put_aside",
-        "the object is in the hand, on its way to beside the drawer, which is not open",
-        lambda w: held(w, OBJECT),
-        _put_aside,
-    ),
-    Rung(
-        "make_way",
-        "the object lies in the way of the open drawer, and the hand pushes it shut",
-        lambda w: _must_shut(w) and _at_bar(w),
-        lambda w: _move_drawer(w, -0.01),
-    ),
-    Rung(
-        "to_make_way",
-        "the object lies in the way of the open drawer, and the hand goes to the handle",
-        _must_shut,
-        _to_bar,
-    ),
-    Rung(
-        "pull",
-        "the hand is at the handle and pulls the drawer open",
-        lambda w: _must_open(w) and _at_bar(w),
-        lambda w: _move_drawer(w, OPEN),
-    ),
-    Rung("to_pull", "the drawer is not open, and the hand goes to the handle", _must_open, _to_bar),
-    Rung("leave", "the drawer is as it should be, and the hand rises from its handle", _is_around_bar, _leave),
+    Rung("done", lambda w: is_inside(w) and _is_shut(w), _to_bar),
+    Rung("let_go", lambda w: is_inside(w) and _hand_is_in(w), _let_go),
+    Rung("push", lambda w: is_inside(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+    Rung("to_push", is_inside, _to_bar),
+    Rung("carry", lambda w: held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
+    Rung("set_down", lambda w: held(w, OBJECT) and _is_set_down(w), _let_go),
+    Rung("put_aside", lambda w: held(w, OBJECT), _put_aside),
+    Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+    Rung("to_make_way", _must_shut, _to_bar),
+    Rung("pull", lambda w: _must_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
+    Rung("to_pull", _must_open, _to_bar),
+    Rung("leave", _is_around_bar, _leave),
     *grasp_rungs(lambda w: OBJECT, OVER),
 )
 

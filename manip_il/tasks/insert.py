@@ -99,12 +99,11 @@ def _hold(world: World) -> Target:
 
 
 _RUNGS = (
-    Rung("inserted", "the peg is at the floor of the hole", is_in, _hold),
-    Rung("insert", "the peg hangs from the hand and goes down into the hole",
-         lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
-    Rung("carry", "the peg hangs from the hand, on its way to over the hole", hangs, _bring),
+    Rung("inserted", is_in, _hold),
+    Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
+    Rung("carry", hangs, _bring),
     *PEG_RUNGS,
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)

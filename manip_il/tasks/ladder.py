@@ -8,7 +8,7 @@ learner can fit. Whether an object is held is read off the fingers that touch it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ Which = Callable[[World], str]  # the object that it is about now
 Place = Callable[[World], F64]  # where its centre is to go, (3,) [m]
 
 CLEAR = 0.03  # of the hand over the object's top: the fingertips are above it [m]
-RISE_FIRST = 0.03  # this far under the funnel, the hand only rises [m]
+RISE_FIRST = 0.03  # this far under its way, a hand only rises [m]
 AT_GRASP = (0.015, 0.015, 0.015)  # object's centre in the ee frame, x y z: start to close [m]
 AT_GRASP_ANGLE = 0.3  # [rad]
 EMPTY = 0.4  # of a mesh's width: fingers so near to each other have nothing between them
@@ -91,19 +91,24 @@ def at_grasp(world: World, name: str) -> bool:
     return is_inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.settled
 
 
-def approach(world: World, name: str, hover: float = 0.0) -> Target:
+def rise_first(at: F64, to: Sequence[float]) -> F64:
+    """Return where something at a point (3,) goes on its way to another, (3,) [m]: straight up if it is far too low."""
+    (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
+    sideways = min(1.0, max(0.0, 1.0 - (to_z - z) / RISE_FIRST))
+    return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
+
+
+def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
     """Approach from above: over the object and down around it, fingers open; straight up if too low beside it.
 
-    hover: least height over the object on the way there, where that is more than it takes to clear its top [m].
+    hover: least height over the object on the way there, where that is more than it takes to clear its top; rise: least
+    height over the grasp [m].
     """
-    g, (ee_x, ee_y, ee_z) = grasp_of(world, name), world.ee.position.tolist()
+    g = grasp_of(world, name)
     x, y, z = g.at
-    height = max(g.height, min(hover, g.funnel))
+    height = max(g.height, min(hover, g.funnel), rise)
     height = height if g.open_enough and g.settled else max(height, g.half + CLEAR)
-    too_low = z + height - ee_z
-    sideways = min(1.0, max(0.0, 1.0 - too_low / RISE_FIRST))
-    position = np.array([ee_x + sideways * (x - ee_x), ee_y + sideways * (y - ee_y), z + height])
-    return Target(position, hand_down(g.yaw), g.wide, lean=g.lean)
+    return Target(rise_first(world.ee.position, (x, y, z + height)), hand_down(g.yaw), g.wide, lean=g.lean)
 
 
 def close_on(world: World, name: str) -> Target:
@@ -140,6 +145,12 @@ def let_go(world: World, name: str, height: float) -> Target:
     return Target(at, hand_down(world.hand_yaw), g.width + beyond)
 
 
+def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
+    """Return whether the hand is at an object, so far aside of it and above it at most [m]."""
+    x, y, z = (world.ee.position - world.pose(name).position).tolist()
+    return math.hypot(x, y) < aside and z < above
+
+
 def grasp_rungs(which: Which, hover: float = 0.0) -> tuple[Rung, ...]:
     """Return the ladder that gets the fingers around an object and closes them; hover: see `approach`."""
 
@@ -151,20 +162,10 @@ def grasp_rungs(which: Which, hover: float = 0.0) -> tuple[Rung, ...]:
         return approach(world, which(world), hover)
 
     return (
-        Rung(
-            "grasp",
-            "the fingers are around the object and close, but do not hold it yet",
-            lambda w: at_grasp(w, which(w)),
-            lambda w: close_on(w, which(w)),
-        ),
-        Rung(
-            "open",
-            "the fingers are closed, or not open wide enough to go around the object",
-            lambda w: not grasp_of(w, which(w)).open_enough,
-            approaching,
-        ),
-        Rung("descend", "the hand goes down to the object", near, approaching),
-        Rung("approach", "the hand is on its way to above the object", lambda w: True, approaching),
+        Rung("grasp", lambda w: at_grasp(w, which(w)), lambda w: close_on(w, which(w))),
+        Rung("open", lambda w: not grasp_of(w, which(w)).open_enough, approaching),
+        Rung("descend", near, approaching),
+        Rung("approach", lambda w: True, approaching),
     )
 
 
@@ -178,17 +179,17 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
         return carry(world, name, world.goal)
 
     return (
-        Rung("at_goal", "the object is in the hand, at the goal", at_goal, to_goal),
-        Rung("carry", "the object is in the hand, on its way to the goal", lambda w: held(w, name), to_goal),
+        Rung("at_goal", at_goal, to_goal),
+        Rung("carry", lambda w: held(w, name), to_goal),
         *grasp_rungs(lambda w: name),
     )
 
 
-def grasp_progress(world: World, name: str, hover: float = 0.0) -> float:
-    """Return progress of getting the fingers around an object, 0 to 1, by the way left; hover: see `approach`."""
+def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> float:
+    """Return progress of getting the fingers around an object, 0 to 1, by the way left; hover, rise: see `approach`."""
     g = grasp_of(world, name)
     above = float(world.ee.position[2]) - g.at[2]
-    height = max(g.height, min(hover, g.funnel))
+    height = max(g.height, min(hover, g.funnel), rise)
     return nearness(g.off + abs(above - height) + height)
 
 

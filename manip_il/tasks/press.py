@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
-from manip_il.tasks.ladder import CLOSED, nearness
+from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import draw_resting_place, draw_yaw
@@ -44,12 +44,11 @@ def _off(world: World) -> float:
 
 def _aim(world: World) -> Target:
     """Go over the button, the nearer the lower, and through its stop once over it."""
-    ee, off = world.ee.position, _off(world)
-    to = world.pose(BUTTON).position[:2]
+    off = _off(world)
+    x, y, _ = world.pose(BUTTON).position
     height = min(HOVER, SLOPE * max(0.0, off - OVER)) if off > OVER else -TRAVEL - DEEPER
     height += TOP + TIP
-    sideways = min(1.0, max(0.0, 1.0 - (height - ee[2]) / 0.03))
-    at = np.append(ee[:2] + sideways * (to - ee[:2]), height)
+    at = rise_first(world.ee.position, (x, y, height))
     return Target(at, hand_down(world.ahead(at)), CLOSED)
 
 
@@ -58,9 +57,9 @@ def _is_down(world: World) -> bool:
 
 
 _RUNGS = (
-    Rung("pressed", "the button is at its stop", _is_down, _aim),
-    Rung("press", "the hand is over the button and presses it", lambda w: _off(w) < OVER, _aim),
-    Rung("approach", "the hand is on its way to over the button", lambda w: True, _aim),
+    Rung("pressed", _is_down, _aim),
+    Rung("press", lambda w: _off(w) < OVER, _aim),
+    Rung("approach", lambda w: True, _aim),
 )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.ladder import AT_GOAL, nearness
+from manip_il.tasks.ladder import AT_GOAL, nearness, rise_first
 from manip_il.tasks.objects import RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, resting_height
@@ -127,8 +127,7 @@ def _around(world: World) -> Target:
     to = world.pose(PUCK).position[:2] - direction * _style(world).behind
     off = math.hypot(*(to - hand[:2]))
     height = world.robot.ee.lowest + LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))
-    sideways = min(1.0, max(0.0, 1.0 - (height - hand[2]) / 0.03))
-    return _to(world, np.append(hand[:2] + sideways * (to - hand[:2]), height), direction)
+    return _to(world, rise_first(hand, (*to, height)), direction)
 
 
 def _near(world: World) -> bool:
@@ -138,10 +137,10 @@ def _near(world: World) -> bool:
 
 
 _RUNGS = (
-    Rung("at_goal", "the puck is at the goal", _at_goal, _stay),
-    Rung("push", "the hand is behind the puck and pushes it", _pushes, _push),
-    Rung("descend", "the hand goes down behind the puck", _near, _around),
-    Rung("approach", "the hand is on its way to behind the puck", lambda w: True, _around),
+    Rung("at_goal", _at_goal, _stay),
+    Rung("push", _pushes, _push),
+    Rung("descend", _near, _around),
+    Rung("approach", lambda w: True, _around),
 )
 
 

@@ -24,8 +24,8 @@ def _to_goal(world: World) -> Target:
 
 
 _RUNGS = (
-    Rung("at_goal", "the hand is at the goal", lambda w: math.dist(w.goal, w.ee.position) < AT_GOAL, _to_goal),
-    Rung("carry", "the hand is on its way to the goal", lambda w: True, _to_goal),
+    Rung("at_goal", lambda w: math.dist(w.goal, w.ee.position) < AT_GOAL, _to_goal),
+    Rung("carry", lambda w: True, _to_goal),
 )
 
 

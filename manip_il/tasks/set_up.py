@@ -13,7 +13,7 @@ from manip_il.robots.rotations import rotation_matrix, rotation_vector
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
-from manip_il.tasks.ladder import CLOSED, nearness
+from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 from manip_il.tasks.peg import (
     AT_ANGLE,
     AT_GRIP,
@@ -209,12 +209,11 @@ def _close(world: World) -> Target:
 
 def _approach(world: World) -> Target:
     """Over the grip and down to it, fingers open; straight up if too low beside it."""
-    grip, ee = grip_of(world), world.ee.position
+    grip = grip_of(world)
+    x, y, z = grip.position
     height = grip.height if grip.open_enough else max(grip.height, OVER)
-    too_low = grip.position[2] + height - ee[2]
-    sideways = min(1.0, max(0.0, 1.0 - too_low / 0.03))
-    position = np.append(ee[:2] + sideways * (grip.position - ee)[:2], grip.position[2] + height)
-    return Target(position, grip.rotation, world.gripper.most, max_turn=TURN)
+    at = rise_first(world.ee.position, (x, y, z + height))
+    return Target(at, grip.rotation, world.gripper.most, max_turn=TURN)
 
 
 def hangs(world: World) -> bool:
@@ -238,12 +237,11 @@ def peg_progress(world: World) -> float:
 
 
 PEG_RUNGS = (
-    Rung("let_stand", "the peg has been set up on the table, and the hand lets go of it", is_up, _let_stand),
-    Rung("set_up", "the peg is held aslant, and set up on the table", held, _set_up),
-    Rung("catch", "the peg falls between the open fingers, and they close", _falls, _catch),
-    Rung("grasp", "the fingers are around the peg and close, but do not hold it yet", _at_grip, _close),
-    Rung("open", "the fingers are closed, or not open wide enough to go around the peg",
-         lambda w: not grip_of(w).open_enough, _approach),
-    Rung("descend", "the hand goes down to the peg", lambda w: grip_of(w).height < OVER, _approach),
-    Rung("approach", "the hand is on its way to above the peg", lambda w: True, _approach),
-)  # fmt: skip
+    Rung("let_stand", is_up, _let_stand),
+    Rung("set_up", held, _set_up),
+    Rung("catch", _falls, _catch),
+    Rung("grasp", _at_grip, _close),
+    Rung("open", lambda w: not grip_of(w).open_enough, _approach),
+    Rung("descend", lambda w: grip_of(w).height < OVER, _approach),
+    Rung("approach", lambda w: True, _approach),
+)

@@ -164,9 +164,9 @@ _LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS))
 _GRASP, *_APPROACH = grasp_rungs(asked, OVER)
 _RUNGS = (
     _LET_GO,
-    Rung("done", "the cube is in its bin", lambda w: _is_sorted(w, asked(w)), _rise),
+    Rung("done", lambda w: _is_sorted(w, asked(w)), _rise),
     replace(_CARRY, target=lambda w: _CARRY.target(w)._replace(max_step=STEP)),
-    Rung("put_back", "another cube is in the hand", lambda w: bool(_other_held(w)), _put_back),
+    Rung("put_back", lambda w: bool(_other_held(w)), _put_back),
     _GRASP,
     *(replace(rung, target=_approach) for rung in _APPROACH),
 )

@@ -71,9 +71,9 @@ def _is_done(world: World) -> bool:
 
 
 _RUNGS = (
-    Rung("done", "the cube stands on the other, and the hand is away", _is_done, _let_go),
-    Rung("let_go", "the cube stands on the other, and the hand lets go of it", _may_let_go, _let_go),
-    Rung("carry", "the cube is in the hand, on its way to the other", lambda w: held(w, TOP), _carry),
+    Rung("done", _is_done, _let_go),
+    Rung("let_go", _may_let_go, _let_go),
+    Rung("carry", lambda w: held(w, TOP), _carry),
     *grasp_rungs(lambda w: TOP),
 )
 

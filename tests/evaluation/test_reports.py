@@ -6,19 +6,12 @@ from pathlib import Path
 import pytest
 
 from manip_il.evaluation.arm import Arm
-from manip_il.evaluation.eval_report import (
-    compare_report,
-    eval_report,
-    phase_meanings,
-    run_report,
-)
+from manip_il.evaluation.eval_report import compare_report, eval_report, run_report
 from manip_il.evaluation.figures import Bar, Curve, curve_figures, rates_figure
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.report import Film, Still
 from manip_il.evaluation.rounds import history
 from manip_il.evaluation.tables import CLONING, PolicyRow
-from manip_il.sim.task import phases
-from manip_il.tasks.table import TASKS
 
 from .made_evals import far_corner, made_eval, made_pair, without_detail
 from .page import EVIL, Page, page_of
@@ -119,9 +112,3 @@ def test_a_figure_is_the_same_bytes_and_starts_above_0_only_if_nothing_is_left_o
     assert rates_figure(bars).width <= 480  # or it would not be readable on a phone
     seeds = Curve("two", (RUN, history(records((0.5, 0.6)), "x")))
     assert len(curve_figures([seeds], target=0.9)) == 3
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_every_phase_of_every_task_has_its_meaning(task: str):
-    assert set(phase_meanings(task)) == set(phases(TASKS[task]))
-    assert all(phase_meanings(task).values())

@@ -126,17 +126,6 @@ class Layout:
         return self.room(points.reshape(-1, 3)).reshape(len(starts), -1).min(axis=1) >= spare
 
 
-def path_features(layout: Layout, positions: F64) -> F64:
-    """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along it, (K,)."""
-    if len(positions) < 2:
-        return np.zeros(len(FEATURES))
-    starts, ways = positions[:-1], np.diff(positions, axis=0)
-    count = _pieces(starts, positions[1:])
-    points = starts[:, None] + ((np.arange(count) + 0.5) / count)[:, None] * ways[:, None]
-    densities = layout.densities(points.reshape(-1, 3)).reshape(len(starts), count, -1).mean(axis=1)
-    return np.linalg.norm(ways, axis=1) @ densities
-
-
 def _pieces(starts: F64, ends: F64) -> int:
     longest = float(np.linalg.norm(ends - starts, axis=1).max(initial=0.0))
     return max(1, int(np.ceil(longest / (2 * STEP))))

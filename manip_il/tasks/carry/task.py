@@ -35,15 +35,7 @@ from manip_il.tasks.carry.things import (
     scale_of,
 )
 from manip_il.tasks.grasp import grasp_of
-from manip_il.tasks.ladder import (
-    AT_GOAL,
-    CLOSED,
-    RISE_FIRST,
-    approach,
-    grasp_rungs,
-    held,
-    nearness,
-)
+from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
 from manip_il.tasks.pick_place import OBJECT, PickPlace, observe_cube
 from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying
 
@@ -98,21 +90,7 @@ def _rise(world: World) -> float:
 
 def _approach(world: World) -> Target:
     """Approach as any object is, but above all things until the hand is over it."""
-    target, g, ee = approach(world, OBJECT), grasp_of(world, OBJECT), world.ee.position
-    x, y, z = g.at
-    rise = _rise(world)
-    if z + rise <= target.position[2]:
-        return target
-    sideways = min(1.0, max(0.0, 1.0 - (z + rise - ee[2]) / RISE_FIRST))
-    position = np.array([ee[0] + sideways * (x - ee[0]), ee[1] + sideways * (y - ee[1]), z + rise])
-    return target._replace(position=position)
-
-
-def _approach_progress(world: World) -> float:
-    """Progress of getting the fingers around the object, 0 to 1, by the way that is left, over the things."""
-    g = grasp_of(world, OBJECT)
-    height = max(g.height, _rise(world))
-    return nearness(g.off + abs(float(world.ee.position[2]) - g.at[2] - height) + height)
+    return approach(world, OBJECT, rise=_rise(world))
 
 
 def _hand_fits(world: World) -> bool:
@@ -124,8 +102,8 @@ def _hand_fits(world: World) -> bool:
 
 
 _RUNGS = (
-    Rung("at_goal", "the object is in the hand, at the goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
-    Rung("carry", "the object is in the hand, on its way past the things", lambda w: held(w, OBJECT), _to_goal),
+    Rung("at_goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
+    Rung("carry", lambda w: held(w, OBJECT), _to_goal),
     *(rung if rung.name == "grasp" else replace(rung, target=_approach) for rung in grasp_rungs(lambda world: OBJECT)),
 )
 
@@ -205,7 +183,7 @@ class Carry(PickPlace):
     def progress(self, world: World) -> float:
         """Return progress by the way to the grasp, then by the cost-to-go in metres of path at the goal."""
         if not held(world, OBJECT):
-            return 0.9 * _GRASPED * _approach_progress(world)
+            return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
         if _at_goal(world):
             return 1.0
         down = descent_of(world)

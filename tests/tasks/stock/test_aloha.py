@@ -136,6 +136,15 @@ def test_a_state_without_a_sound_label_says_why_and_holds_still(task, name, plac
     assert np.allclose(label.action, env.measured())
 
 
+def test_arms_that_touch_have_no_label():
+    env = AlohaEnv(TRANSFER)
+    env.data.qpos[[0, 8]] = 0.0
+    for joint in (1, 9):
+        env.data.qpos[joint : joint + 2] = 0.55, 0.2  # both arms straight ahead, into each other
+    label = make_expert(config(TRANSFER)).label(env.get_state())
+    assert (label.valid, label.reason) == (False, "the arms touch")
+
+
 @every_task
 def test_names_and_numbers_are_those_of_lerobots_datasets(task: str):
     [episode] = RolloutJob(config(task), hold=3).run(stream_seeds("training", 1))

@@ -18,7 +18,7 @@ from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.gl import remedy
-from manip_il.tasks.stock.aloha.scene import Parts, Scene
+from manip_il.tasks.stock.aloha.ladder import Scene
 from manip_il.tasks.stock.base import WHOLE, StockBase
 from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
 
@@ -57,7 +57,6 @@ class AlohaEnv(StockBase):
         self.physics.render = lambda **_: _BLANK  # it would draw three pictures in every step, whatever is observed
         self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
         self.actions = _actions(self.model)
-        self._parts = Parts(self.model, found)
         self.start(0)
 
     def start(self, seed: int) -> None:
@@ -78,7 +77,7 @@ class AlohaEnv(StockBase):
 
     def scene(self, kind: type[Scene] = Scene) -> Scene:
         """Return what is read of the state."""
-        return kind(self._parts, self.data)
+        return kind(self.task, self.model, self.data)
 
     def measured(self) -> F64:
         """Return joints [rad] and grippers, 0 to 1, (14,)."""

@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.mdp import Label, State
+from manip_il.robots.ik import PoseProgram
 from manip_il.robots.rotations import turned_towards
-from manip_il.robots.site_ik import SiteIK
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
-from manip_il.tasks.stock.aloha.ladder import Target
-from manip_il.tasks.stock.aloha.scene import Hand, Scene
-from manip_il.tasks.stock.table import SIDES, AlohaTask
+from manip_il.tasks.stock.aloha.ladder import Hand, Scene, Target
+from manip_il.tasks.stock.table import SIDES
 
 F64 = NDArray[np.float64]
 
-POSITION, ORIENTATION, POSTURE = 1.0, 0.3, 0.003  # costs [1/m], [1/rad], [1/rad]
+ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], where the position has 1 [1/m]
 ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # pull on the forearm's roll where the wrist is straight, for a wrist up and down
 FOREARM_ROLL, WRIST = 3, 4
 MOST_STEP, MOST_TURN = 0.10, 0.5  # of a hand, towards its target [m], [rad]
@@ -59,8 +58,9 @@ class AlohaExpert:
         return Label(np.clip(action, env.actions.low, env.actions.high), phase, True, 0.0)
 
     def _unsound(self, scene: Scene) -> str:
-        task: AlohaTask = scene.task
-        for name, side in task.grasped.items():
+        if scene.arms_touch:
+            return "the arms touch"
+        for name, side in scene.task.grasped.items():
             position = scene.things[name].position
             if position[2] < FALLEN:
                 return f"{name} off the table"
@@ -83,7 +83,7 @@ class _Arm:
         self.foot = model.body(f"vx300s_{side}").pos[:2].tolist()
         constants = import_module("gym_aloha.constants")
         home = np.array(constants.START_ARM_POSE[:6])
-        self._ik = SiteIK(_alone(side), f"cali_{side}_site1", home, (POSITION, ORIENTATION), _posture_costs)
+        self._ik = PoseProgram(_alone(side), f"cali_{side}_site1", home, (ORIENTATION, POSTURE))
         self._gain = model.actuator_gainprm[joints, 0]
         self._breakaway = model.dof_frictionloss[joints] / self._gain  # lead at which a joint overcomes friction [rad]
         # Below it MuJoCo's friction, an impedance of 0.9 within 0.02 s, lets through what makes a joint creep.
@@ -95,7 +95,10 @@ class _Arm:
         way = target.position - hand.position
         length = float(np.linalg.norm(way))
         position = hand.position + way * min(1.0, MOST_STEP / max(length, MOST_STEP))
-        step = self._ik.step(hand.q, position, turned_towards(hand.rotation, target.rotation, MOST_TURN))
+        self._ik.data.qpos[:] = hand.q
+        self._ik.update()
+        self._ik.posture.set_cost(_posture_costs(hand.q))
+        step = self._ik.solve(position, turned_towards(hand.rotation, target.rotation, MOST_TURN))
         if step is None:
             return None
         step *= min(1.0, target.longest / max(float(np.abs(step).max()), target.longest))

@@ -9,8 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.rotations import angle_between
-from manip_il.tasks.stock.aloha.ladder import ARM, PITCH, Rung, Target, always, approach, close_on, move_object
-from manip_il.tasks.stock.aloha.scene import Scene, Thing, Z, cross, pitched
+from manip_il.tasks.stock.aloha.ladder import (
+    ARM,
+    PITCH,
+    Rung,
+    Scene,
+    Target,
+    Thing,
+    Z,
+    cross,
+    move_object,
+    pitched,
+    take_rungs,
+)
 
 F64 = NDArray[np.float64]
 
@@ -30,9 +41,10 @@ CARRIED = 0.04  # and before that [rad]
 class Insertion(Scene):
     """A state of the peg's insertion."""
 
-    def __init__(self, *of: object):
-        super().__init__(*of)  # type: ignore[arg-type]
-        self.has = {side: self.holds(side, name) for side, name in OF.items()}
+    @cached_property
+    def has(self) -> dict[str, bool]:
+        """Whether each hand holds its object."""
+        return {side: self.holds(side, name) for side, name in OF.items()}
 
     @cached_property
     def grasps(self) -> dict[str, F64]:
@@ -84,26 +96,13 @@ def _insert(scene: Insertion) -> Target:
     return move_object(scene, "right", PEG, socket.position + scene.depth * frame[:, 0], frame, INSERTED)
 
 
-def _before(side: str) -> tuple[Rung, ...]:
-    """The rungs of either hand that has not got its object."""
-    name = OF[side]
-    return (
-        Rung(
-            "grasp",
-            lambda scene: scene.is_at_grasp(side, name, scene.grasps[side]),
-            lambda scene: close_on(scene, side, name, scene.grasps[side]),
-        ),
-        Rung("approach", always, lambda scene: approach(scene, side, name, scene.grasps[side])),
-    )
-
-
 RUNGS = {
-    "left": (_carry("left", MEETING), *_before("left")),
+    "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
         Rung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
         Rung("align", lambda one: one.has["right"] and one.ready, _insert),
         _carry("right", MEETING + WAITING),
-        *_before("right"),
+        *take_rungs("right", PEG, lambda one: one.grasps["right"]),
     ),
 }
 

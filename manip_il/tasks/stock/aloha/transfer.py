@@ -10,15 +10,22 @@ from numpy.typing import NDArray
 from manip_il.tasks.stock.aloha.ladder import (
     CLOSED,
     FAST,
+    LIFTED,
     OPEN,
     PITCH,
     Rung,
+    Scene,
     Target,
+    X,
+    Z,
+    ahead_across,
     always,
     approach,
     close_on,
+    nearest,
+    pitched,
+    take_rungs,
 )
-from manip_il.tasks.stock.aloha.scene import LIFTED, Scene, X, Z, ahead_across, nearest, pitched
 
 F64 = NDArray[np.float64]
 
@@ -116,19 +123,14 @@ def _wait(scene: Transfer) -> Target:
 RUNGS = {
     "left": (
         Rung("hold", lambda one: one.left_holds, lambda one: Target(one.left.position, one.left.rotation, CLOSED)),
-        Rung("close", _left_may_close, lambda one: close_on(one, "left", CUBE, one.left_grasp, CARRIED)),
+        Rung("close", _left_may_close, lambda one: close_on(one, CUBE, one.left_grasp, CARRIED)),
         Rung("come", _is_brought, _come),
         Rung("wait", always, _wait),
     ),
     "right": (
         Rung("release", _is_handed, _let_go),
         Rung("carry", lambda one: one.right_holds, _carry),
-        Rung(
-            "grasp",
-            lambda one: one.is_at_grasp("right", CUBE, one.right_grasp),
-            lambda one: close_on(one, "right", CUBE, one.right_grasp),
-        ),
-        Rung("approach", always, lambda one: approach(one, "right", CUBE, one.right_grasp)),
+        *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
 }
 
