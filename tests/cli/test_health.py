@@ -15,9 +15,3 @@ def test_a_healthy_machine_says_what_it_has(capsys):
     out, err = capsys.readouterr()
     assert err == ""
     assert re.fullmatch(r"healthy: \S.*; torch 2\.\d\S+; cores [1-9]\d*\n", out)
-
-
-def test_a_wrong_backend_is_named_with_the_right_ones(monkeypatch, error):
-    monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    assert main(["eval", "--check"]) == 1
-    assert "MUJOCO_GL is 'nonsense'; expected egl or osmesa" in error()

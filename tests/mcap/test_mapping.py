@@ -48,7 +48,7 @@ def test_a_path_leads_to_values_or_says_where_it_ends() -> None:
     assert values_at("position", ros) == [1.5, 2.5]
     for path, why in (
         ("joint", r"no field 'joint' \(did you mean 'joints'\?\); known: timestamp, joints"),
-        ("joints[name=elbo].name", r"\[name=elbo\] fits 0 of 2 elements"),
+        ("joints[name=elbo].name", r"\[name=elbo\] matches 0 of 2 elements"),
         ("joints.position", r"in a list; select elements by \[0\], \[:\]"),
         ("joints[0].velocity", "velocity is not set in this message"),
     ):
