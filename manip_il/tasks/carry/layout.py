@@ -138,3 +138,11 @@ def _beside(points: F64, middle: F64, half: F64) -> F64:
 
 def _bump(off: F64, width: float) -> F64:
     return np.exp(-0.5 * np.square(off / width))
+
+
+def path_features(layout: Layout, positions: F64) -> F64:
+    """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along it, (K,)."""
+    pieces, steps = 20, np.diff(positions, axis=0)
+    points = positions[:-1, None] + (np.arange(pieces) + 0.5)[:, None] / pieces * steps[:, None]
+    densities = layout.densities(points.reshape(-1, 3)).reshape(len(steps), pieces, -1).mean(axis=1)
+    return np.linalg.norm(steps, axis=1) @ densities

@@ -14,11 +14,10 @@ from manip_il.rewards.paths import cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid, descent, reaches
-from manip_il.tasks.carry.layout import Edge, Layout, Part
+from manip_il.tasks.carry.layout import Edge, Layout, Part, path_features
 from manip_il.tasks.carry.reward import FEATURES, TASTES, Reward
 
 from ...tables import every_robot
-from .paths import path_features
 
 PARTS = (Part(-0.025, 0.036), Part(-0.018, 0.072), Part(0.07, 0.105), Part(0.19, 0.139))
 LAYOUT = Layout(

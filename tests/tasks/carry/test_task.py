@@ -9,7 +9,7 @@ from manip_il.collect.expert import Expert
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry.layout import THINGS
+from manip_il.tasks.carry.layout import THINGS, path_features
 from manip_il.tasks.carry.reward import TASTES
 from manip_il.tasks.carry.task import OBJECT, descent_of
 from manip_il.tasks.carry.things import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
@@ -19,7 +19,6 @@ from manip_il.tasks.table import TASKS
 
 from ...scenes import SEED, drive_until, started
 from ...tables import every_robot
-from .paths import path_features
 
 STARTS = range(SEED, SEED + 6)
 PHASES = phases(TASKS["carry"])
