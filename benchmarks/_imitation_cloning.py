@@ -1,8 +1,8 @@
-"""What the `imitation` library takes to clone 200 demonstrations of gymnasium-robotics' FetchPickAndPlace.
+"""Time that the `imitation` library takes to clone 200 demonstrations of gymnasium-robotics' FetchPickAndPlace.
 
-Run by `time_to_policy.py` in an environment of its own, as `imitation` needs other versions than this project; prints
-one line of JSON. Demonstrations are an expert's of four rungs, collected in two processes; success is that of the last
-step, on 200 unseen seeds.
+Run by `time_to_policy.py` in a separate environment, as `imitation` needs other versions than this project; prints one
+line of JSON. Demonstrations are from a scripted expert of four rules, collected in two processes; success is measured
+at the last step, on 200 unseen seeds.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 import time
 
 import gymnasium
-import gymnasium_robotics  # noqa: F401  # pyright: ignore[reportUnusedImport]  it registers the environments
+import gymnasium_robotics  # noqa: F401  # pyright: ignore[reportUnusedImport]  registers the environments
 import numpy as np
 import torch
 from gymnasium.wrappers import FlattenObservation
@@ -23,12 +23,12 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 TASK, DEMONSTRATIONS, EPISODES = "FetchPickAndPlace-v2", 200, 200
-GOAL, GRIPPER, CUBE, FINGERS = slice(3, 6), slice(6, 9), slice(9, 12), slice(15, 17)  # of the flat observation
-OPEN, CLOSE, STEP = 1.0, -1.0, 0.1  # STEP: way of an action of 1, about [m]
+GOAL, GRIPPER, CUBE, FINGERS = slice(3, 6), slice(6, 9), slice(9, 12), slice(15, 17)  # slices of the flat observation
+OPEN, CLOSE, STEP = 1.0, -1.0, 0.1  # STEP: displacement by an action of 1, approximately [m]
 
 
 def expert(seen: np.ndarray) -> np.ndarray:
-    """Actions (B, 4) of observations (B, 31): over the cube, down, close, carry."""
+    """Return actions (B, 4) for observations (B, 31): over the cube, down, close, carry."""
     actions = []
     for one in seen:
         to_cube = one[CUBE] - one[GRIPPER]

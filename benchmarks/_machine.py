@@ -1,4 +1,4 @@
-"""What a measurement ran on: printed above every table."""
+"""The machine that a measurement ran on, printed above every table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PACKAGES = ("mujoco", "mink", "daqp", "torch", "lerobot")
 
 
 def describe_machine() -> str:
-    """One line: cores this process may use, CPU model, load, versions."""
+    """Return one line: cores that this process may use, CPU model, load, versions."""
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     return f"{cores} cores of {_cpu_model()}, load {load:.1f}; Python {platform.python_version()}, {versions}"

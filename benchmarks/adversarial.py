@@ -3,8 +3,8 @@
 python benchmarks/adversarial.py [--seeds 10] [--env NAME] [--algorithm gail|airl] [--quick]
 
 The loops are those of `algorithms/gail.py` and `algorithms/airl.py`, with the same discriminators, PPO and network as
-on robots. Every training seed begins with a new policy and demonstrations of its own; its last policy acts without
-exploring on 100 episodes, the same for everybody. With the mean returns R, the share is
+for robots. Every training seed begins with a new policy and its own demonstrations; its last policy acts without
+exploring on 100 episodes, the same for all. With the mean returns R, the share is
 
     (R of the policy - R of random actions) / (R of the expert - R of random actions)
 
@@ -44,13 +44,13 @@ Acting = Callable[[F32], F32]  # raw inputs (B, d) to raw targets (B, 1)
 Kept = TypeVar("Kept", bound=Discriminator)
 LOOPS: dict[str, Callable[..., Iterator[Any]]] = {"gail": gail, "airl": airl}
 LIMITS = {"gail": 0.95, "airl": 0.90}
-_TORQUE, _GRAVITY, _TOP = 2.0, 10.0, 0.5  # of Pendulum-v1 [N m], [m/s^2]; where its expert balances [rad]
+_TORQUE, _GRAVITY, _TOP = 2.0, 10.0, 0.5  # Pendulum-v1's [N m], [m/s^2]; angle at which the expert balances [rad]
 
 
 class Pendulum:
-    """Pendulum-v1: observes cos, sin of the angle from the top and the speed [rad/s]; a target is a torque [N m].
+    """Pendulum-v1: observes cos and sin of the angle from the top, and the speed [rad/s]; targets are torques [N m].
 
-    Every episode has 200 steps; nothing ends it and nothing solves it.
+    Every episode has 200 steps; nothing ends or solves it.
     """
 
     name, steps, ended, solved = "Pendulum-v1", 200, False, False
@@ -71,9 +71,9 @@ class Pendulum:
 
     @staticmethod
     def expert(inputs: F32) -> F32:
-        """Pump energy up to that of standing still on top, balance there by feedback (Astrom & Furuta, 2000)."""
+        """Pump energy up to that of resting at the top, and balance there by feedback (Astrom & Furuta, 2000)."""
         angle, speed = np.arctan2(inputs[:, 1], inputs[:, 0]), inputs[:, 2]
-        energy = speed**2 / 6 + _GRAVITY / 2 * (inputs[:, 0] - 1)  # [J], 0 on top
+        energy = speed**2 / 6 + _GRAVITY / 2 * (inputs[:, 0] - 1)  # [J], 0 at the top
         pumping = np.where(speed >= 0, -1.0, 1.0) * energy * 10
         balancing = -(15.0 * angle + 4.0 * speed)
         return np.where(np.abs(angle) < _TOP, balancing, pumping).clip(-_TORQUE, _TORQUE).astype(np.float32)[:, None]
@@ -84,9 +84,9 @@ class Pendulum:
 
 
 class CartPole:
-    """CartPole-v1: observes place, speed, angle and its speed; the sign of a target says whether to push right or left.
+    """CartPole-v1: observes position, velocity, angle and angular velocity; the sign of a target is the push direction.
 
-    An episode has 500 steps and a return of 1 for each; a fall ends it before, in a state that nobody demonstrated.
+    An episode has 500 steps, each with a reward of 1; a fall ends it early, in a state that no demonstration has.
     """
 
     name, steps = "CartPole-v1", 500
@@ -111,7 +111,7 @@ class CartPole:
 
     @staticmethod
     def expert(inputs: F32) -> F32:
-        """Push against the sum of what is off, as a linear controller does: 1 or -1."""
+        """Push against the weighted sum of errors, as a linear controller does: 1 or -1."""
         return np.where(inputs @ np.array([0.3, 0.7, 10.0, 2.0], np.float32) > 0, 1.0, -1.0).astype(np.float32)[:, None]
 
     @staticmethod
@@ -124,7 +124,7 @@ ENVIRONMENTS: dict[str, type[Pendulum] | type[CartPole]] = {one.name: one for on
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What a run learns with, by the names of `LearningConfig`. demonstrations: episodes of `episode_steps`."""
+    """Hyperparameters of a run, named as in `LearningConfig`. demonstrations: episodes of `episode_steps`."""
 
     steps: int
     episodes: int = 16
@@ -136,7 +136,7 @@ class Settings:
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
 
 
-# What is not here is as on robots. Chosen on training seeds from 100 on.
+# All other values are those for robots. Chosen on training seeds from 100 on.
 SETTINGS = {
     "Pendulum-v1": Settings(steps=100_000, ppo=PPOConfig(lr=2e-3, minibatches=8)),
     "CartPole-v1": Settings(steps=30_000, ppo=PPOConfig(lr=1e-3, minibatches=8)),
@@ -146,7 +146,7 @@ _QUICK = {"steps": 1_000, "episode_steps": 20, "demonstrations": 2}
 
 
 class Run:
-    """The steps that `gail` and `airl` are made of, as `Agent` has them, with nothing on disk."""
+    """The steps that `gail` and `airl` call, as in `Agent`, with nothing on disk."""
 
     def __init__(self, name: str, settings: Settings, seed: int):
         self.simulated, self.metrics = 0, dict[str, float]()
@@ -203,7 +203,7 @@ class Run:
         return self._network.act(torch.from_numpy(inputs)).numpy()
 
     def _stream(self, purpose: str) -> int:
-        """A seed for one purpose of an iteration."""
+        """Return a seed for one purpose in an iteration."""
         return int(rng_for(stream_base("reinforcement", self._seed) + self._number, purpose).integers(2**63))
 
 
@@ -229,7 +229,7 @@ def main() -> int:
 
 
 def measure(algorithm: str, ends: dict[str, tuple[float, float]], seeds: Sequence[int], *, quick: bool) -> bool:
-    """Print shares of every environment and of all; return whether a limit was missed. ends: by `references`."""
+    """Print shares per environment and overall; return whether a limit was missed. ends: returned by `references`."""
     shares: dict[str, list[float]] = {}
     for name, (random, expert) in ends.items():
         begin, settings = time.process_time(), replace(SETTINGS[name], **(_QUICK if quick else {}))
@@ -252,7 +252,7 @@ def _missed(algorithm: str, name: str, shares: Sequence[float]) -> bool:
 
 
 def trained(algorithm: str, name: str, settings: Settings, seed: int) -> Acting:
-    """Return the last policy of a run, which acts without exploring."""
+    """Return the last policy of a run, acting without exploration."""
     run = Run(name, settings, seed)
     for _ in LOOPS[algorithm](run, settings):
         pass
@@ -260,19 +260,19 @@ def trained(algorithm: str, name: str, settings: Settings, seed: int) -> Acting:
 
 
 def references(name: str, quick: bool) -> tuple[float, float]:
-    """Mean returns of random actions and of the expert."""
+    """Return the mean returns of random actions and of the expert."""
     made, rng = ENVIRONMENTS[name], rng_for(stream_base("test"), name)
     return mean_return(name, lambda inputs: made.random(inputs, rng), quick), mean_return(name, made.expert, quick)
 
 
 def mean_return(name: str, acting: Acting, quick: bool) -> float:
-    """Mean return on whole episodes, the same for everybody."""
+    """Return the mean return over whole episodes, the same for all policies."""
     _, _, returns = play(name, acting, stream_seeds("test", 2 if quick else 100), ENVIRONMENTS[name].steps)
     return float(returns.mean())
 
 
 def demonstrations(name: str, settings: Settings, seed: int) -> Demonstrations:
-    """Episodes of the expert."""
+    """Return episodes of the expert."""
     seeds = stream_seeds("demonstrations", settings.demonstrations, seed)
     inputs, targets, _ = play(name, ENVIRONMENTS[name].expert, seeds, settings.episode_steps)
     return Demonstrations(tuple(inputs.swapaxes(0, 1)), tuple(targets.swapaxes(0, 1)), None)

@@ -1,10 +1,10 @@
-"""Labelled control steps a second on one core, as a share of what raw physics allows.
+"""Labelled control steps per second on one core, as a share of what raw physics allows.
 
 python benchmarks/control_speed.py [--quick]
 
-Ours is a recording rollout's step: observe, read the state, label it, advance. The limit is `mj_step` replaying the
-same controls from the same starts and nothing else. Episode by episode by turns in the same run; the median ratio
-over the repeats counts.
+Ours is a step of a recording rollout: observe, read the state, label it, advance. The limit is `mj_step` alone,
+replaying the same controls from the same starts. Both alternate episode by episode in the same run; the result is the
+median ratio over the repeats.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
 from manip_il.tasks.envs import make_env
 
-STEPS = 30  # of an episode: the expert's way from the start to the goal
+STEPS = 30  # steps per episode: how many the expert takes from the start to the goal
 
 
 def main() -> int:
@@ -45,7 +45,7 @@ def main() -> int:
 
 
 def repeat(env: ManipEnv, expert: Expert, episodes: int) -> tuple[float, float]:
-    """Control steps a second, ours and raw, over the same episodes taken by turns."""
+    """Return control steps per second, ours and raw, alternating over the same episodes."""
     ours = raw = 0.0
     replay = mujoco.MjData(env.scene.model)
     for seed in stream_seeds("certificate", episodes):
@@ -60,7 +60,7 @@ def repeat(env: ManipEnv, expert: Expert, episodes: int) -> tuple[float, float]:
 
 
 def record(env: ManipEnv, expert: Expert) -> tuple[np.ndarray, float]:
-    """The controls of one labelled episode, (STEPS, actuators), and the seconds it took."""
+    """Return the controls of one labelled episode, (STEPS, actuators), and the seconds it took."""
     controls = np.empty((STEPS, env.scene.model.nu))
     started = time.perf_counter()
     for step in range(STEPS):

@@ -2,9 +2,9 @@
 
 python benchmarks/dagger_round.py [--seed N] [--validation N] [--quick]
 
-Panda pick_place, the mlp on state, labels in every state. Limit: 30 s a round on two cores, of which labelling takes at
-most 15 %: the time that one core needs to label every state of the round again, shared out over the workers, against
-the round's wall-clock in the same run.
+Panda pick_place, the mlp on state, labels in every state. Limit: 30 s per round on two cores, of which labelling takes
+at most 15 %: the time that one core needs to label every state of the round again, divided by the number of workers,
+relative to the round's wall-clock in the same run.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
 from manip_il.tasks.envs import scene_of
 
-LIMIT, SHARE = 30.0, 0.15  # [s], of it
+LIMIT, SHARE = 30.0, 0.15  # [s], and share of it for labelling
 
 
 def main() -> int:
@@ -56,7 +56,7 @@ def main() -> int:
 
 
 def report(result: Result, folder: Path, config: RunConfig, workers: int) -> None:
-    """One line a round."""
+    """Print one line per round."""
     whole = sum(result.seconds.values())
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in result.seconds.items())
     line = f"round {result.number}: {whole:.1f} s ({stages}), {whole / LIMIT:.2f} of the limit"
@@ -67,7 +67,7 @@ def report(result: Result, folder: Path, config: RunConfig, workers: int) -> Non
 
 
 def seconds_to_label(root: Path, config: RunConfig) -> float:
-    """What one core takes to ask the expert in every state of a dataset."""
+    """Return how long one core takes to query the expert in every state of a dataset [s]."""
     expert = Expert(scene_of(config.env.robot, config.env.task))
     states = [State.from_vector(vector) for vector in Dataset.open(root).columns(("sim_state",))["sim_state"]]
     expert.label(states[0])

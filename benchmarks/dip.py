@@ -1,12 +1,12 @@
-"""Does DAgger's success dip when the data are aggregated, and what keeps it from doing so?
+"""Does DAgger's success dip when the data are aggregated, and what prevents it?
 
 python benchmarks/dip.py [--seed N] [--rounds N] [--quick]
 
-The same run three times: as it is; with the input's units frozen at the first round, as a normaliser that is fitted
-once has them; and with labels that jump straight to where the inverse kinematics wants the arm, unclipped. Prints the
-validation success of every round and the largest fall from the best round before.
+The same run three times: unchanged; with the input normalisation frozen at the first round, like a normaliser that is
+fitted once; and with labels that jump straight to the inverse kinematics' target, unclipped. Prints the validation
+success of every round and the largest drop from the best previous round.
 
-Peer: the `imitation` library's DAgger on stock FetchPickAndPlace fell from 91 to 6 % in its second round, and to
+Peer: the `imitation` library's DAgger on stock FetchPickAndPlace dropped from 91 to 6 % in its second round, and to
 37.5 % with its normaliser refreshed every round.
 """
 
@@ -46,7 +46,7 @@ def as_it_is() -> Iterator[None]:
 
 @contextmanager
 def frozen_units() -> Iterator[None]:
-    """Every fit takes the statistics of the first."""
+    """Use the statistics of the first fit in every fit."""
     plain, first = mlp.fit_statistics, list[Statistics]()
 
     def fit_statistics(*data: Any) -> Statistics:
@@ -59,7 +59,7 @@ def frozen_units() -> Iterator[None]:
 
 @contextmanager
 def jumping_labels() -> Iterator[None]:
-    """The hand's target is where it will have to be, however far, and joint steps are as long as the IK's."""
+    """Set the hand's target to its final pose, however far, and do not clip joint steps of the IK."""
     plain = ArmIK.step
 
     def unclipped(ik: ArmIK, position: F64, rotation: F64, _longest: float, lean: float) -> tuple[F64, float] | None:
@@ -98,7 +98,7 @@ def main() -> int:
 
 
 def validation(seed: int, rounds: int, quick: bool) -> list[float]:
-    """Validation success of every round of one run."""
+    """Return the validation success of every round of one run."""
     config = RunConfig(
         demonstrations=4 if quick else 50,
         rounds=1 if quick else rounds,
@@ -107,13 +107,13 @@ def validation(seed: int, rounds: int, quick: bool) -> list[float]:
         validation_episodes=2 if quick else 200,
         seed=seed,
     )
-    # In this process alone: what is patched here is not patched in others.
+    # in this process only, as other processes would not have the patches
     with tempfile.TemporaryDirectory() as folder, Engine(1) as engine:
         return [result.validation.success.rate for result in Run(config, Path(folder), engine).results()]
 
 
 def fall(rates: list[float]) -> float:
-    """The largest difference between a round and the best before it, 0 where none is worse."""
+    """Return the largest drop of a round below the best one before it, 0 if there is none."""
     best = np.maximum.accumulate(rates)
     return float((best - rates).max())
 

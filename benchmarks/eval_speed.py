@@ -1,12 +1,12 @@
-"""Evaluation of a state-based policy: control steps a second against raw physics, and episodes against lerobot-eval.
+"""Evaluation of a state-based policy: control steps per second against raw physics, episodes against lerobot-eval.
 
 python benchmarks/eval_speed.py [--quick]
 
-The first limit is `mj_step` replaying the same controls from the same starts and nothing else, on one core, by turns in
-the same run; the median ratio over the repeats counts. The peer is the whole command `lerobot-eval`, with films off, on
-the same checkpoint and seeds, in the faster of its two ways (environments in its own process, or in processes of their
-own), against the whole command `manip-il eval`; both may use every core. Outcomes must be the same, seed by seed; of a
-diffusion policy (`configs/diffusion_state.yaml`, a tenth of its steps) they cannot, as it draws by its own seeds.
+The limit is `mj_step` alone, replaying the same controls from the same starts on one core, alternating in the same run;
+the result is the median ratio over the repeats. The peer is the whole command `lerobot-eval`, with videos off, on the
+same checkpoint and seeds, in the faster of its two modes (environments in its own process, or in processes of their
+own), against the whole command `manip-il eval`; both may use every core. Outcomes must agree seed by seed, except for a
+diffusion policy (`configs/diffusion_state.yaml`, a tenth of its steps), which draws from its own seeds.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from manip_il.tasks.envs import make_env
 
 BIN = Path(sys.executable).parent
 TASK = "pick_place"
-BATCH = 50  # of lerobot-eval: its default; smaller ones took longer
+BATCH = 50  # lerobot-eval's default batch size; smaller ones took longer
 
 
 def main() -> int:
@@ -66,7 +66,7 @@ def main() -> int:
 
 
 def fitted(robot: str, folder: Path, quick: bool) -> Path:
-    """A policy cloned from 200 demonstrations: it solves nearly all, as what one evaluates in earnest does."""
+    """Return a policy cloned from 200 demonstrations, which solves nearly all episodes, like one in real use."""
     count, steps = (10, 50) if quick else (200, 4_000)
     config = make_config(robot, TASK)
     demos = RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count))
@@ -75,7 +75,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
 
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:
-    """Control steps a second on one core, ours and raw, over the same episodes."""
+    """Return control steps per second on one core, ours and raw, over the same episodes."""
     job = RolloutJob(make_config(robot, TASK), PolicyDriver((policy,)), label="last")
     started = time.perf_counter()
     found = list(job.run(stream_seeds("test", episodes)))
@@ -101,7 +101,7 @@ def replay_seconds(config: EnvConfig, episode: Episode) -> float:
 
 
 def denoising(folder: Path, quick: bool) -> Path:
-    """A diffusion policy from 50 demonstrations."""
+    """Return a diffusion policy trained on 50 demonstrations."""
     demos, steps = folder / "demos", 2 if quick else 1_600
     config = Path(__file__).parent.parent / "configs" / "diffusion_state.yaml"
     seconds(["manip-il", "record", f"--dataset.num_episodes={4 if quick else 50}", f"--dataset.root={demos}"])
@@ -111,7 +111,7 @@ def denoising(folder: Path, quick: bool) -> Path:
 
 
 def against_lerobot(policy: Path, folder: Path, episodes: int, draws: bool = False) -> None:
-    """Whole commands by turns. draws: the policy draws, so that outcomes differ."""
+    """Time whole commands, alternating. draws: whether the policy samples, so that outcomes differ."""
     ours: list[float] = []
     theirs: list[float] = []
     success = ""

@@ -1,7 +1,7 @@
-"""What a `cnn` sees in scenes that it has not learnt from: errors of what it reads off, and its heat maps as a picture.
+"""What a `cnn` sees in scenes that it was not trained on: errors of its predicted state, and a picture of heat maps.
 
-Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], of a dataset of `manip-il data redraw` with
-a seed of its own. The picture needs a policy that has learnt heat maps (`--policy.heatmap_weight`).
+Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], with a dataset from `manip-il data redraw` that
+has another seed. The picture needs a policy trained with heat maps (`--policy.heatmap_weight`).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.learn.cnn import CNNPolicy
 
-FRAMES, ROWS = 2_000, 4  # looked at, and drawn
+FRAMES, ROWS = 2_000, 4  # number of frames to evaluate, and to draw
 ENLARGED = 2
-COLOURS = np.array([[0.1, 0.9, 0.3], [1.0, 0.1, 0.6], [0.2, 0.4, 1.0], [1.0, 0.7, 0.0]])  # of points, in turn
+COLOURS = np.array([[0.1, 0.9, 0.3], [1.0, 0.1, 0.6], [0.2, 0.4, 1.0], [1.0, 0.7, 0.0]])  # colours of points, in turn
 Batch = dict[str, torch.Tensor]
 
 
 def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> Batch:
-    """Return frames of a dataset as a policy takes them."""
+    """Return frames of a dataset as inputs for a policy."""
     keys, dataset = [IMAGES + camera for camera in cameras], Dataset.open(root)
     frames = {key: dataset.camera(key).rows(rows).transpose(0, 3, 1, 2) for key in keys}
     table = dataset.columns([STATE, ENVIRONMENT_STATE])
@@ -35,13 +35,13 @@ def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> B
 
 
 def read_off(policy: CNNPolicy, batch: Batch) -> torch.Tensor:
-    """Return `observation.environment_state` as pictures and joints show it, (B, k), in its own units."""
+    """Return `observation.environment_state` as predicted from pictures and joints, (B, k), in its own units."""
     found, moves = policy.network_inputs(batch)[:, policy.seen_size :], policy.truth_scale > 0
     return policy.truth_mean + torch.where(moves, found / policy.truth_scale.clamp(min=1e-12), 0.0)
 
 
 def report(policy: CNNPolicy, batch: Batch, names: tuple[str, ...]) -> None:
-    """Print the median error of every place [mm] and yaw [mrad] that is read off."""
+    """Print the median error of every predicted position [mm] and yaw [mrad]."""
     with torch.no_grad():
         found = torch.cat(
             [read_off(policy, {k: v[i : i + 50] for k, v in batch.items()}) for i in range(0, FRAMES, 50)]
@@ -61,8 +61,8 @@ def report(policy: CNNPolicy, batch: Batch, names: tuple[str, ...]) -> None:
 
 
 def draw(policy: CNNPolicy, batch: Batch, points: tuple[str, ...]) -> Image.Image:
-    """Return pictures of all cameras side by side, one frame a row, with heat maps of the points over them."""
-    policy.train()  # only then heat maps are kept
+    """Return pictures of all cameras side by side, one frame per row, overlaid with the points' heat maps."""
+    policy.train()  # heat maps are kept only in training mode
     with torch.no_grad():
         policy.forward({key: value[:ROWS] for key, value in batch.items()} | {"action": batch[STATE][:ROWS]})
     columns: list[NDArray[np.float64]] = []

@@ -1,12 +1,12 @@
-"""What a CUDA card does: training from pictures against LeRobot's loader and loop, acting, and drawing by EGL.
+"""Speed on a CUDA GPU: training from pictures against LeRobot's loader and loop, acting, and rendering by EGL.
 
 python benchmarks/gpu.py
 
-Samples/s of ACT (two cameras of 96 and of 240 pixels), diffusion and cnn (96), batches of 32, mixed precision where the
-policy has it: `manip_il`'s trainer, whose pictures are decoded once, and LeRobot's DataLoader with a process a core (8
-at most), its processors and an update as `lerobot-train` makes it. Both after a warm-up, by turns, on one dataset of
-films. Then milliseconds an action for 25 episodes in lockstep, on the card and the CPU, and pictures/s of the renderer.
-8 minutes at most. Without a card it says so and ends with 0.
+Samples/s of ACT (two cameras of 96 and of 240 pixels), diffusion and cnn (96), batches of 32, mixed precision if the
+policy has it: for `manip_il`'s trainer, which decodes pictures once, and for LeRobot's DataLoader with one process per
+core (at most 8), its processors and updates as in `lerobot-train`. Both after a warm-up, alternating, on one dataset of
+videos. Then milliseconds per action for 25 episodes in lockstep, on GPU and CPU, and pictures/s of the renderer.
+At most 8 minutes. Without a GPU it prints a message and exits with 0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 
 from manip_il.tasks.envs import make_env
 
-os.environ.setdefault("MUJOCO_GL", "egl")  # before MuJoCo is imported
+os.environ.setdefault("MUJOCO_GL", "egl")  # must be set before MuJoCo is imported
 
 import numpy as np
 import torch
@@ -43,8 +43,8 @@ from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
 
 BATCH, EPISODES_AT_ONCE = 32, 25
-SECONDS, REPEATS = 5.0, 3  # of a measurement
-LIMIT = 7 * 60  # [s], after which no further row is begun
+SECONDS, REPEATS = 5.0, 3  # duration [s] and number of measurements
+LIMIT = 7 * 60  # [s] after which no further row is started
 ACT = {"type": "act", "use_amp": True, "pretrained_backbone_weights": None}
 DIFFUSION = {"type": "diffusion", "use_amp": True, "pretrained_backbone_weights": None, "crop_shape": [84, 84]}
 ROWS: dict[str, tuple[int, dict[str, Any]]] = {
@@ -76,7 +76,7 @@ def main() -> int:
             pairs = [tuple(BATCH * per_s(partial(next, step)) for step in steps) for _ in range(REPEATS)]
             trainer.save()
             saved = Path(folder) / name / "checkpoints/last/pretrained_model"
-            devices = ("cuda",) if options is DIFFUSION else ("cuda", "cpu")  # a minute a plan on a CPU
+            devices = ("cuda",) if options is DIFFUSION else ("cuda", "cpu")  # on a CPU a plan takes a minute
             times = [milliseconds_an_action(saved, device, size) for device in devices]
             print(row(name, pairs, times), flush=True)
         for size in (96, 240):
@@ -94,7 +94,7 @@ def record(root: Path, size: int) -> Path:
 
 
 def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
-    """Updates as lerobot-train makes them, with the same options."""
+    """Yield after each update as in lerobot-train, with the same options."""
     config: Any = ours.pipeline.policy
     meta: Any = LeRobotDataset("manip/benchmark", root=root).meta
     dataset = LeRobotDataset("manip/benchmark", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
@@ -121,7 +121,7 @@ def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
 
 
 def per_s(call: Callable[[], object]) -> float:
-    """Calls a second, after two of warm-up."""
+    """Return calls per second, after two warm-up calls."""
     for _ in range(2):
         call()
     count, started = 0, time.perf_counter()

@@ -1,12 +1,12 @@
-"""Samples a second into image training: decoded once and mapped into memory, against LeRobot's video DataLoader.
+"""Samples per second for image training: decoded once and memory-mapped, against LeRobot's video DataLoader.
 
 python benchmarks/image_loading.py [DATASET] [--quick]
 
-DATASET is the root of a dataset with cameras; without it one of two 128 x 128 cameras is recorded. Batches of 64 in
-shuffled order, every column of the dataset, pictures as float32 in [0, 1]; ours on one thread, LeRobot's in this
-process and in two of its own, of which the faster one counts. Each is warm: all frames are decoded once, every process
-has had an epoch. LeRobot's pictures are as they are in both rows: augmentation is extra work of ours. Then what
-decoding once costs, in LeRobot's epochs. All by turns in the same run; the median ratio of the repeats counts.
+DATASET is the root of a dataset with cameras; without it one with two 128 x 128 cameras is recorded. Batches of 64 in
+shuffled order, all columns of the dataset, pictures as float32 in [0, 1]; ours on one thread, LeRobot's in this process
+and in two worker processes, of which the faster counts. All are warm: frames are decoded once, every process has had an
+epoch. LeRobot's pictures are unchanged in both rows: augmentation is extra work of ours. Then the cost of decoding
+once, in LeRobot's epochs. All alternate in the same run; the result is the median ratio of the repeats.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from manip_il.learn.network import threads
 from manip_il.learn.samples import Samples, Windows
 
 BATCH = 64
-SECONDS = 2.0  # of ours, each time
+SECONDS = 2.0  # duration of each of our measurements [s]
 ROWS = {"plain": None, "augmented": Augment()}
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """Samples/s of LeRobot's two ways and of ours by row; seconds of decoding all frames."""
+    """Samples/s of LeRobot's two modes, and of ours by row; seconds to decode all frames."""
 
     peers: tuple[float, float]
     ours: dict[str, float]
@@ -71,7 +71,7 @@ def record(root: Path, episodes: int) -> Path:
 
 
 def measure(root: Path, repeats: int) -> list[Repeat]:
-    # its processes first: a fork of one that has decoded already would share its open files
+    # run its worker processes first: forked after decoding, they would share open files
     peers = [epochs(root, workers) for workers in (2, 0)]
     for peer in peers:
         next(peer)
@@ -88,7 +88,7 @@ def measure(root: Path, repeats: int) -> list[Repeat]:
 
 
 def epochs(root: Path, workers: int) -> Iterator[float]:
-    """Samples/s of epoch after epoch of LeRobot's loader, which its first one started."""
+    """Yield samples/s of LeRobot's loader for every epoch; the first one also starts it."""
     dataset = LeRobotDataset("manip/benchmark", root=root)
     loader = torch.utils.data.DataLoader(
         dataset, BATCH, shuffle=True, num_workers=workers, persistent_workers=workers > 0
@@ -108,7 +108,7 @@ def our_samples(root: Path) -> Samples:
 
 
 def our_epoch(samples: Samples, augment: Augment | None, number: Iterator[int]) -> int:
-    """One pass in an order of its own; the number of samples."""
+    """Run one epoch in a new order; return the number of samples."""
     count, seed = len(samples.windows.episodes), next(number)
     order = np.random.default_rng(seed).permutation(count)
     generator = torch.Generator().manual_seed(seed)
@@ -130,7 +130,7 @@ def samples_per_s(epoch: Callable[[], int]) -> float:
 
 
 def build_time(root: Path) -> float:
-    """Seconds that decoding all frames takes."""
+    """Return the seconds that decoding all frames takes."""
     started = time.perf_counter()
     our_samples(root)
     return time.perf_counter() - started

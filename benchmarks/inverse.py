@@ -1,10 +1,10 @@
-"""Inverse reinforcement learning on `carry`: what learnt rewards cost a demonstrator on layouts never seen.
+"""Inverse reinforcement learning on `carry`: regret of learnt rewards on unseen layouts.
 
 python benchmarks/inverse.py [--seed N] [--demonstrations N] [--layouts N] [--robot R] [--quick]
 
-Records demonstrations of three tastes on the arm, learns weights from each by each method, and plans with them on
-unseen layouts. Prints what the plans cost for the true weights above the demonstrator's own plans, with a plan for
-length alone beside them, and the time that learning took.
+Records demonstrations of three tastes on the arm, learns weights from each with every method, and plans with them on
+unseen layouts. Prints by how much the plans' cost under the true weights exceeds that of the demonstrator's own plans,
+next to plans for length alone, and the time that learning took.
 
 Limits: 3 % above for maximum entropy and Bayesian, 10 % for maximum margin; 60 s for maximum margin and maximum
 entropy, 300 s for Bayesian.
@@ -38,7 +38,7 @@ from manip_il.tasks.pick_place import OBJECT
 F64 = NDArray[np.float64]
 ABOVE = {"max_margin": 0.10, "bayesian": 0.03, "max_entropy": 0.03}
 SECONDS = {"max_margin": 60.0, "bayesian": 300.0, "max_entropy": 60.0}
-_LEAST = 1e-9  # of every weight, beside that of length, so that ties are broken
+_LEAST = 1e-9  # smallest weight relative to that of length, so that ties are broken
 
 
 def main() -> int:
@@ -66,7 +66,7 @@ def main() -> int:
 
 
 def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int]]:
-    """Yield the grids of layouts that no demonstration has, and the nodes at which their objects are."""
+    """Yield the grids of layouts that are in no demonstration, and the nodes of their objects."""
     env = env_of(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
@@ -77,7 +77,7 @@ def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int
 
 
 def _learn(robot: str, taste: str, count: int, seed: int) -> dict[str, tuple[F64, float]]:
-    """Weights and seconds of every method."""
+    """Return weights and seconds of every method."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / taste
         words = [f"--robot.type={robot}", f"--task.type={CARRY}:{taste}", f"--dataset.root={root}"]
@@ -94,7 +94,7 @@ def _learn(robot: str, taste: str, count: int, seed: int) -> dict[str, tuple[F64
 
 
 def _print(learnt: dict[str, dict[str, tuple[F64, float]]], costs: dict[tuple[str, str], float]) -> bool:
-    """Print a line a taste and method; return whether a limit was missed."""
+    """Print one line per taste and method; return whether a limit was missed."""
     missed = False
     for taste, found in learnt.items():
         own = costs[taste, "own"]

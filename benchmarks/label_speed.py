@@ -1,9 +1,9 @@
-"""Time of one expert label as a multiple of the bare quadratic program that it solves, and of pick_place's label.
+"""Time of one expert label relative to the bare quadratic program that it solves, and to a label of pick_place.
 
 python benchmarks/label_speed.py [--quick]
 
-The states are those of real episodes, driven by the expert and by chance. The limit is daqp on the same problems,
-built beforehand; both are timed in the same run, by turns, state by state, and all tasks by turns, task by task.
+The states are from real episodes, driven by the expert and by random actions. The limit is daqp on the same problems,
+built beforehand; both alternate in the same run, state by state, and the tasks alternate, too.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main() -> int:
 
 
 def compare_with_solver(episodes: int, repeats: int) -> None:
-    """Print the median label of pick_place beside the median of its bare quadratic program."""
+    """Print the median time of a pick_place label beside that of its bare quadratic program."""
     print("robot  states  label [us]  bare QP [us]  label / QP")
     for robot in ROBOTS:
         expert = Expert(scene_of(robot, "pick_place"))
@@ -59,9 +59,9 @@ def compare_with_solver(episodes: int, repeats: int) -> None:
 
 
 def compare_tasks(episodes: int, repeats: int) -> None:
-    """Print the median label of every task beside pick_place's."""
+    """Print the median label time of every task beside that of pick_place."""
     print("robot  task          states  label [us]  of pick_place's")
-    robot = next(iter(ROBOTS))  # not every task fits within every arm's reach
+    robot = next(iter(ROBOTS))  # some tasks are out of reach for other arms
     experts = {task: Expert(scene_of(robot, task)) for task in TASKS}
     states = {task: visited(robot, episodes, task)[:: episodes // 2] for task in TASKS}
     times = {task: np.empty((repeats, len(states[task]))) for task in TASKS}
@@ -75,7 +75,7 @@ def compare_tasks(episodes: int, repeats: int) -> None:
 
 
 def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
-    """States of `episodes` episodes that the expert drove, and as many that chance did."""
+    """Return states of `episodes` episodes driven by the expert, and of as many driven by random actions."""
     states: list[State] = []
     horizon = {"expert": TASKS[task].limits.horizon, "random": 50}
     for driver in ("expert", "random"):
@@ -86,7 +86,7 @@ def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
 
 
 def problem_of(expert: Expert, state: State) -> qpsolvers.Problem | None:
-    """The quadratic program that a label solves, caught on its way to the solver; None where it needs none."""
+    """Return the quadratic program of a label, intercepted on its way to the solver; None if it needs none."""
     caught: list[qpsolvers.Problem] = []
     plain = ik.daqp.solve
 

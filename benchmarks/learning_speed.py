@@ -1,11 +1,11 @@
-"""Simulated control steps a second of reinforcement learning, the whole loop, as a share of what raw physics allows.
+"""Simulated control steps per second of the whole reinforcement learning loop, as a share of what raw physics allows.
 
 python benchmarks/learning_speed.py [--quick]
 
 Ours is GAIL's iteration with 16 environments: act, inverse kinematics, step, observe, discriminator, PPO, checkpoint.
-The limit is `mj_step` replaying the same controls from the same starts and nothing else. Iteration by iteration by
-turns in the same run, in seconds of the processor; the median ratio counts. Beside it the share without PPO's and the
-discriminator's gradient steps.
+The limit is `mj_step` alone, replaying the same controls from the same starts. Both alternate iteration by iteration in
+the same run, in CPU seconds; the result is the median ratio. Also prints the share without the gradient steps of PPO
+and of the discriminator.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NEVER = 10**9
 
 
 class Recorded(RobotEpisode):
-    """Keeps where the episode began and its controls."""
+    """Stores an episode's start and its controls."""
 
     _env: ManipEnv
 
@@ -68,7 +68,7 @@ def main() -> int:
 
 
 def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[float, float, float]]:
-    """Steps a second of every iteration: the whole loop, rollouts alone, physics alone."""
+    """Return steps per second of every iteration: the whole loop, rollouts only, physics only."""
     demos = folder / "demos"
     words = [f"--robot.type={robot}", f"--task.type={task}", "--dataset.num_episodes=5", f"--dataset.root={demos}"]
     if command(["record", *words, "--workers=1", "--quiet"]):

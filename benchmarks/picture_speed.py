@@ -1,11 +1,11 @@
-"""Time of one picture against the physics model drawn as it is, and against the scene without its robot.
+"""Time to render one picture, against the unmodified physics model and against the scene without its robot.
 
 python benchmarks/picture_speed.py [--quick]
 
-Ours is `manip_il.sim.render.pictures`, pose and antialiasing included. The peer is `mujoco.Renderer` on the model that
-is simulated, with its shadow map and OpenGL's antialiasing; the limit is `mujoco.Renderer` without the robot's meshes,
-without shadows and with one sample a pixel. All draw the same states at the same size, by turns, one OpenGL context at
-a time; the median ratio over the repeats counts.
+Ours is `manip_il.sim.render.pictures`, pose and antialiasing included. The peer is `mujoco.Renderer` on the simulated
+model, with its shadow map and OpenGL's antialiasing; the limit is `mujoco.Renderer` without the robot's meshes, without
+shadows and with one sample per pixel. All render the same states at the same size, alternating, with one OpenGL context
+at a time; the result is the median ratio over the repeats.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from manip_il.sim.scene import camera_id
 from manip_il.tasks.envs import make_env
 
 SIZES = ((128, 128), (240, 320), (480, 640))
-STATES = 6  # of one expert episode, evenly apart
-APART = 5  # control steps
-HIDDEN = 5  # a geom group that is not drawn
+STATES = 6  # number of states from one expert episode, evenly spaced
+APART = 5  # control steps between them
+HIDDEN = 5  # a geom group that is not rendered
 
 
 def main() -> int:
@@ -61,7 +61,7 @@ def main() -> int:
 
 
 def summary(row: list[tuple[float, float, float]]) -> str:
-    """The two ratios, each with its range."""
+    """Return the two ratios, each with its range."""
     texts: list[str] = []
     for ratios in ([as_it_is / ours for ours, as_it_is, _ in row], [ours / no_robot for ours, _, no_robot in row]):
         texts.append(f"{statistics.median(ratios):4.1f} ({min(ratios):.1f} to {max(ratios):.1f})".ljust(20))
@@ -69,7 +69,7 @@ def summary(row: list[tuple[float, float, float]]) -> str:
 
 
 def visited(env: ManipEnv) -> list[State]:
-    """States of an expert episode."""
+    """Return states of an expert episode."""
     expert = Expert(env.scene)
     states: list[State] = []
     env.start(stream_seeds("certificate", 1)[0])
@@ -80,8 +80,8 @@ def visited(env: ManipEnv) -> list[State]:
 
 
 def repeat(env: ManipEnv, states: list[State], config: CameraConfig) -> tuple[float, float, float]:
-    """Seconds a picture: ours, the physics model as it is, the scene without its robot."""
-    import mujoco  # after ours, which chooses its OpenGL
+    """Return seconds per picture: ours, the unmodified physics model, the scene without its robot."""
+    import mujoco  # after our import, which chooses the OpenGL backend
 
     ours = seconds(env, states, lambda: render.pictures(env.scene, env.data, config))
     render.close()
@@ -92,7 +92,7 @@ def repeat(env: ManipEnv, states: list[State], config: CameraConfig) -> tuple[fl
 
 
 def plain(env: ManipEnv, states: list[State], config: CameraConfig, model: Any) -> float:
-    """Seconds a picture of `mujoco.Renderer`."""
+    """Return seconds per picture with `mujoco.Renderer`."""
     import mujoco
 
     with closing(mujoco.Renderer(model, config.height, config.width)) as renderer:
@@ -106,7 +106,7 @@ def plain(env: ManipEnv, states: list[State], config: CameraConfig, model: Any) 
 
 
 def seconds(env: ManipEnv, states: list[State], draw: Callable[[], object]) -> float:
-    """The median time of one call, over the states; a first call warms up."""
+    """Return the median time of one call over the states, after a warm-up call."""
     env.set_state(states[0])
     draw()
     times: list[float] = []

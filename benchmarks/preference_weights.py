@@ -1,16 +1,16 @@
-"""A reward from 200 answers, and what weighing frames by it is worth where half of the episodes are a bad policy's.
+"""A reward from 200 answers, and the gain from weighting frames by it if half of the episodes are a bad policy's.
 
 python benchmarks/preference_weights.py [--task NAME] [--output DIR] [--quick]
 
-Runs DAgger for policies of every kind, asks a teacher who is mistaken in a tenth of the answers about 100 pairs of its
-clips, learns a reward, asks about 100 more on which its networks disagree, and learns the reward from all 200. Measures
-its agreement with true progress on 2,000 pairs that nobody answered, for five draws of pairs and mistakes. Then records
-as many demonstrations as the clone of a few has episodes, joins both with what was executed as the label, scores the
-episodes with the first draw's reward, and clones the whole as it is and weighted, and the demonstrations alone. Prints
-agreement, the area under the ROC curve for failed episodes beside that of true progress, and the clones' success on the
-same unseen seeds.
+Runs DAgger for policies of varying quality, asks a teacher who errs in a tenth of the answers about 100 pairs of their
+clips, learns a reward, asks about 100 more on which its networks disagree, and relearns the reward from all 200. Takes
+its agreement with true progress on 2,000 pairs without answers, for five draws of pairs and errors. Then records as
+many demonstrations as a clone of a few has episodes, joins both with the executed actions as labels, scores the
+episodes with the first draw's reward, and clones the joined data unweighted, weighted, and the demonstrations alone.
+Prints agreement, the area under the ROC curve for failed episodes beside that of true progress, and the clones' success
+on the same unseen seeds.
 
-Limits: agreement at least 90 % on average, area at least 0.95, weighted ahead by at least 15 points with p < 0.001.
+Limits: mean agreement at least 90 %, area at least 0.95, weighted ahead by at least 15 points with p < 0.001.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def measure(folder: Path, task: str, *, quick: bool) -> int:
-    """Make everything in a folder; return 1 where a limit is missed."""
+    """Create everything in a folder; return 1 if a limit is missed."""
     few, episodes, steps, seeds = (2, 2, 20, 4) if quick else (30, 100, 2_000, 500)
     rounds, half = folder / "rounds", folder / "half"
     sizes = f"--demonstrations={few} --rounds={1 if quick else 5} --episodes_per_round={2 if quick else 40}"
@@ -92,7 +92,7 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
 
 
 def learn_reward(rounds: Path, folder: Path, draw: int, count: int) -> Path:
-    """Learn a reward from count answers, and again from these and as many where its networks disagree."""
+    """Learn a reward from `count` answers, and again with as many more on pairs on which its networks disagree."""
     made = folder / f"draw_{draw}"
     made.mkdir(parents=True, exist_ok=True)
     first, reward = made / "first", made / "reward"
@@ -117,7 +117,7 @@ def clone(folder: Path, name: str, source: object, steps: int, seeds: int) -> Ev
 
 
 def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
-    """Share of other pairs of clips in which the reward agrees with true progress, but for ties."""
+    """Return the share of new pairs of clips, without ties, on which the reward agrees with true progress."""
     clips = choose_pairs(find_datasets([rounds]), _CLIP, count, 0, np.random.default_rng(999))
     returns = LearnedReward.load(reward / PRETRAINED_MODEL).of_inputs(clips.inputs)[clips.rows].sum(-1)
     difference = true_difference(clips)
@@ -127,7 +127,7 @@ def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
 
 
 def join(good: Path, bad: Path, target: Path) -> None:
-    """Write the episodes of two datasets as one, with what was executed as the label, as a recorder knows no other."""
+    """Write the episodes of two datasets as one, labelled with the executed actions, the only ones a recorder knows."""
     spec, episodes = Dataset.open(good).spec, [[*Dataset.open(root).read_episodes()] for root in (good, bad)]
     count = min(map(len, episodes))
     fitted = (as_recorded(one) for group in episodes for one in group[:count])
@@ -135,7 +135,7 @@ def join(good: Path, bad: Path, target: Path) -> None:
 
 
 def as_recorded(episode: Episode) -> Episode:
-    """Return the episode with what was executed as its label."""
+    """Return the episode with the executed actions as labels."""
     columns = dict(episode.columns)
     columns[schema.ACTION] = columns[schema.EXECUTED_ACTION]
     columns[schema.LABEL_VALID] = np.ones_like(columns[schema.LABEL_VALID])

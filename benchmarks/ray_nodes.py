@@ -1,10 +1,10 @@
-"""Recording on four Ray nodes of one core each, all on this machine, against one such node and against two processes.
+"""Recording on four local Ray nodes of one core each, against one such node and against two processes.
 
 python benchmarks/ray_nodes.py [--quick]
 
-Journals of the same episodes, by turns, every worker warm; medians over the turns, with their range. Overhead: how much
-longer an episode takes on the four nodes than in two processes of the engine, whose cores they share. Over the wire:
-what a worker sends home, packed, an episode.
+Journals of the same episodes, alternating, with warm workers; medians over the turns, with their range. Overhead: how
+much longer an episode takes on the four nodes than in two processes of the engine, whose cores they share. Over the
+wire: packed size of what a worker sends back per episode.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def main() -> int:
 
 
 def recorder(engine: Engine, job: RolloutJob) -> Callable[[int], float]:
-    """Return what records that many episodes and says how long it took [s]."""
+    """Return a function that records a number of episodes and returns the time it took [s]."""
 
     def record(count: int) -> float:
         with tempfile.TemporaryDirectory() as folder:
@@ -78,7 +78,7 @@ def recorder(engine: Engine, job: RolloutJob) -> Callable[[int], float]:
 
 def measured(ways: dict[str, Callable[[int], float]], episodes: int, turns: int) -> dict[str, list[float]]:
     for record in ways.values():
-        record(2 * NODES)  # workers start, load and compile
+        record(2 * NODES)  # starts the workers, which load and compile
     times: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(turns):
         for name, record in ways.items():
@@ -87,7 +87,7 @@ def measured(ways: dict[str, Callable[[int], float]], episodes: int, turns: int)
 
 
 def wire(job: RolloutJob) -> float:
-    """Bytes of an episode on its way home."""
+    """Return the size of an episode as a worker sends it back [bytes]."""
     with tempfile.TemporaryDirectory() as folder:
         keep = Journal(Path(folder), env_spec(job.env), env_fingerprint(job.env))
         seeds = tuple(stream_seeds("certificate", 8))

@@ -1,12 +1,12 @@
-"""Recording from end to end (simulate, label, journal, dataset) against what its parts cost alone, in the same run.
+"""Recording end to end (simulate, label, journal, dataset) against the cost of its parts alone, in the same run.
 
 python benchmarks/recording_speed.py [--quick]
 
-One core: this process is held on one core, threads that encode video included. The limit is `mj_step` replaying the
-recorded controls from the same starts; with cameras, that and drawing the same pictures; episode by episode by turns.
-Beside it: as `record` runs, with a second core for video, recordings and their limits by turns.
+One core: this process is pinned to one core, including the threads that encode video. The limit is `mj_step` replaying
+the recorded controls from the same starts, plus, with cameras, rendering the same pictures; episodes alternate.
+Beside it: as in `record`, with a second core for video, recordings and their limits alternating.
 Two workers: the same recording with two processes against one, all warm, beside two processes of bare physics against
-one, which is what the machine can give. The median ratio over the repeats counts.
+one, which is the machine's limit. The result is the median ratio over the repeats.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from _machine import describe_machine
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env
 
-os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks, here and in the limit
+os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa renders on the calling core, here and in the limit
 
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect, provenance
@@ -41,9 +41,9 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import pictures
 
-HOLD = 10  # as `manip-il record`
+HOLD = 10  # as in `manip-il record`
 CAMERAS = CameraConfig(("front", "wrist"))
-BARE_STEPS = 50_000  # of physics, for what two processes can do
+BARE_STEPS = 50_000  # steps of bare physics, to measure the gain from a second process
 
 
 def main() -> int:
@@ -73,18 +73,18 @@ def report(name: str, ours: list[float], limits: list[float]) -> None:
 
 
 def one_core(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float], list[float]]:
-    """Control steps a second on one core: recording, and its limit."""
+    """Return control steps per second on one core: of recording, and of its limit."""
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(cores)})
     try:
-        measured = [steps_per_second(job, episodes) for _ in range(repeats + 1)][1:]  # the first loads and compiles
+        measured = [steps_per_second(job, episodes) for _ in range(repeats + 1)][1:]  # the first one loads and compiles
     finally:
         os.sched_setaffinity(0, cores)
     return [ours for ours, _ in measured], [limit for _, limit in measured]
 
 
 def beside(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float], list[float]]:
-    """Control steps a second where video may be encoded on another core while this one simulates and draws."""
+    """Return control steps per second if video may be encoded on another core than simulation and rendering."""
     ours: list[float] = []
     limits: list[float] = []
     for repeat in range(-1, repeats):
@@ -101,7 +101,7 @@ def beside(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float], l
 
 
 def steps_per_second(job: RolloutJob, episodes: int) -> tuple[float, float]:
-    """Control steps a second of recording, and of its limit, which takes its turn after every episode."""
+    """Return control steps per second of recording, and of its limit, measured after every episode."""
     limit = 0.0
     frames = 0
 
@@ -119,7 +119,7 @@ def steps_per_second(job: RolloutJob, episodes: int) -> tuple[float, float]:
 def record_seconds(
     engine: Engine, job: RolloutJob, seeds: range, root: Path, between: Callable[[Path], None] | None = None
 ) -> float:
-    """Seconds of `manip-il record`'s own path. between: called after every episode, while the clock stands still."""
+    """Return the seconds of `manip-il record`'s code path. between: called after every episode, not timed."""
     journals = root.with_name(f"{root.name}.journals")
     paused = 0.0
     started = time.perf_counter()
@@ -138,8 +138,8 @@ def record_seconds(
 
 
 def replay_seconds(job: RolloutJob, seed: int, actions: np.ndarray) -> float:
-    """Seconds of the bare physics of an episode, and of its pictures where the job makes some."""
-    import mujoco  # after ours, which chooses its OpenGL
+    """Return the seconds of an episode's bare physics, and of rendering its pictures if the job has cameras."""
+    import mujoco  # after our import, which chooses the OpenGL backend
 
     env = make_env(config=job.env)
     env.start(seed)
@@ -148,7 +148,7 @@ def replay_seconds(job: RolloutJob, seed: int, actions: np.ndarray) -> float:
     commands = [np.append(action[space.arm], gripper.command(action[space.gripper])) for action in actions]
     controls, order = np.array(commands), [*env.scene.arm_ctrl, *gripper.ctrl]
     if job.cameras is not None:
-        pictures(env.scene, data, job.cameras)  # the first makes the context
+        pictures(env.scene, data, job.cameras)  # the first call creates the context
     started = time.perf_counter()
     for control in controls:
         if job.cameras is not None:
@@ -167,7 +167,7 @@ def two_workers(name: str, job: RolloutJob, episodes: int, repeats: int) -> None
         ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool,
         tempfile.TemporaryDirectory() as folder,
     ):
-        for repeat in range(-1, repeats):  # the first starts the workers
+        for repeat in range(-1, repeats):  # the first one starts the workers
             seeds = stream_seeds("certificate", episodes if repeat >= 0 else 8)
             single, double = (
                 record_seconds(engine, job, seeds, Path(folder) / f"{repeat}_{count}")
@@ -182,7 +182,7 @@ def two_workers(name: str, job: RolloutJob, episodes: int, repeats: int) -> None
 
 
 def bare_seconds(job: RolloutJob) -> float:
-    """Seconds of some bare physics."""
+    """Return the seconds of some bare physics."""
     import mujoco
 
     env = make_env(config=job.env)

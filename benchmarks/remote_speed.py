@@ -1,14 +1,14 @@
-"""Push and pull over loopback against the plain client's copy: 1,000 small files, and one large one.
+"""Push and pull over loopback against copying with the plain client: 1,000 small files, and one large one.
 
 python benchmarks/remote_speed.py [--quick] [--repeats N] [--stores file,sftp,hub,s3]
 
-Ours hashes, verifies, and switches over in one step; the plain client only copies: shutil.copytree for file://;
+Ours hashes, verifies and commits atomically; the plain client only copies: shutil.copytree for file://;
 paramiko's put and get for sftp:// (Debian's sshd, which must be installed); huggingface_hub's upload_folder and
 snapshot_download for hf:// (the tests' server); s3fs' put and get for s3:// (moto, in a process of its own).
-By turns in the same run, into new places each time; the median ratio of the repeats counts (above 1: ours is faster).
+Both alternate in the same run, into new places each time; the result is the median ratio (above 1: ours is faster).
 
-ratio: of the commands as they are; a pull of ours ends when all is on the disk, the plain client's when in memory.
-on disk: of both until everything is on this machine's disk.
+ratio: of the plain commands; our pull ends when all data are on disk, the plain client's when they are in memory.
+on disk: of both until all data are on this machine's disk.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ BUCKET = "benchmark"
 
 @dataclass(frozen=True)
 class Store:
-    """A kind of store, and what its plain client does: put a folder at a place, get it back."""
+    """A kind of store, and its plain client: put a folder at a place, get it back."""
 
     name: str
     url: Callable[[str], str]
@@ -87,7 +87,7 @@ def main() -> int:
 
 
 def turn(store: Store, tree: Path, work: Path, *, ours_first: bool = False) -> dict[str, float]:
-    """Seconds of each direction, plain and ours. ours_first: whoever is finds more memory free, so both are in turn."""
+    """Return the seconds of each direction, plain and ours. ours_first: alternates, as the first has more memory."""
     times: dict[str, float] = {}
     place, plain = f"{_made(work)}/ours", f"{work}/plain"
     url = store.url(place)
@@ -122,7 +122,7 @@ def show(row: str, turns: list[dict[str, float]]) -> None:
 
 @contextlib.contextmanager
 def moto_beside() -> Iterator[str]:
-    """The endpoint: a server in this process would want Python's lock while a client has it."""
+    """Yield the endpoint of a server in another process, as in this one it would compete for Python's lock."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     server = context.Process(target=_serve_s3, args=(there,))
@@ -197,10 +197,10 @@ def connected(server: Sshd) -> Iterator[paramiko.SFTPClient]:
 
 
 def make_tree(folder: Path, files: int, size: int, suffix: str) -> Path:
-    """A folder that counts as a run."""
+    """Create and return a folder that counts as a run."""
     _made(folder)
     (folder / "config.yaml").write_text("# manip-il\n")
-    (folder / "README.md").write_text("---\nlicense: mit\n---\n")  # a card of its own: none is made
+    (folder / "README.md").write_text("---\nlicense: mit\n---\n")  # its own card, so that none is generated
     for number in range(files):
         (folder / f"{number}.{suffix}").write_bytes(os.urandom(size))
     return folder

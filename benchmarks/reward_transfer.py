@@ -1,12 +1,12 @@
-"""A learnt reward against cloning of the same demonstrations, and on arms that demonstrated nothing.
+"""A learnt reward against cloning on the same demonstrations, and on arms without any demonstrations.
 
 python benchmarks/reward_transfer.py [--taste NAME] [--demonstrations N] [--layouts N] [--steps N] [--quick]
 
-Records demonstrations of `carry` on the Panda on layouts with at most two things, learns the reward from them by every
-method, and clones them. Then drives on layouts never seen, with three or four things on the Panda, with any on the
-other arms, and sums what the object's path cost for the true weights. An episode that does not reach the goal is worse
-than any that does. Prints a line a driver: episodes that reached the goal, mean cost above a demonstrator's with the
-true weights on the same layouts, and on the Panda how often it is cheaper than the clone (sign test).
+Records demonstrations of `carry` on the Panda on layouts with at most two things, learns the reward from them with
+every method, and clones them. Then drives on unseen layouts, with three or four things on the Panda and any number on
+the other arms, and sums the cost of the object's path under the true weights. An episode that does not reach the goal
+is worse than any that does. Prints one line per driver: episodes that reached the goal, mean cost above that of a
+driver with the true weights on the same layouts, and on the Panda how often it is cheaper than the clone (sign test).
 
 Limits: at most 5 % above on every arm; cheaper than the clone with p < 0.01.
 """
@@ -43,15 +43,15 @@ from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.pick_place import OBJECT
 
-FEW = 2  # things of a layout that is demonstrated, at most
+FEW = 2  # most things in a demonstrated layout
 ARMS = ("panda", "fetch", "so101")
 ABOVE, P_VALUE = 0.05, 0.01
-_SPARE = 6  # times as many seeds as layouts that are wanted
+_SPARE = 6  # seeds to try per wanted layout
 
 
 @dataclass(frozen=True)
 class Driven:
-    """Cost of an episode for the true weights; infinite where the goal was not reached."""
+    """Cost of an episode under the true weights; infinite if the goal was not reached."""
 
     seed: int
     cost: float
@@ -109,20 +109,20 @@ def demonstrate(folder: Path, taste: str, count: int) -> Path:
 
 
 def learnt(root: Path) -> dict[str, Reward]:
-    """Return the reward that every method learns of a dataset."""
+    """Return the reward that each method learns from a dataset."""
     shown = [one.demonstration for one in read_carried(root)]
     rng = rng_for(stream_base("training", 0), "irl")
     return {method: Reward(tuple(learn(method, shown, rng).weights.tolist())) for method in METHODS}
 
 
 def things(episode: Episode, names: Sequence[str]) -> int:
-    """Return how many things an episode's layout has, the table's edge among them."""
+    """Return the number of things in an episode's layout, including the table's edge."""
     here = [names.index(f"{name}.here") for name in (*THINGS, EDGE)]
     return int((np.asarray(episode.columns[ENVIRONMENT_STATE], np.float64)[0, here] > 0.5).sum())
 
 
 def drive(job: RolloutJob, truth: Reward, layouts: int, *, many: bool) -> list[Driven]:
-    """Return what the first `layouts` unseen episodes of a job cost. many: with more things than were demonstrated."""
+    """Return the costs of a job's first `layouts` unseen episodes. many: with more things than were demonstrated."""
     names = env_spec(job.env).environment_state_names
     found: list[Driven] = []
     for seed in _seeds(job.env, layouts, many=many):
@@ -132,7 +132,7 @@ def drive(job: RolloutJob, truth: Reward, layouts: int, *, many: bool) -> list[D
 
 
 def _seeds(env: EnvConfig, layouts: int, *, many: bool) -> Iterator[int]:
-    """Seeds of layouts that no demonstration has, told apart by what the first observation shows."""
+    """Yield seeds of layouts that are in no demonstration, identified by their first observation."""
     simulated, left = env_of(env), layouts
     names = env_spec(env).environment_state_names
     here = [names.index(f"{name}.here") for name in (*THINGS, EDGE)]
@@ -161,7 +161,7 @@ def _env(robot: str, reward: Reward) -> EnvConfig:
 
 
 def _print(arm: str, name: str, found: list[Driven], own: list[Driven]) -> bool:
-    """Print a line; return whether the limit of the cost was missed."""
+    """Print a line; return whether the limit on cost was missed."""
     pairs = [(a.cost, b.cost) for a, b in zip(found, own, strict=True) if np.isfinite([a.cost, b.cost]).all()]
     above = sum(a for a, _ in pairs) / sum(b for _, b in pairs) - 1 if pairs else np.inf
     reached = sum(np.isfinite(one.cost) for one in found)
@@ -171,7 +171,7 @@ def _print(arm: str, name: str, found: list[Driven], own: list[Driven]) -> bool:
 
 
 def _compare(found: list[Driven], cloned: list[Driven]) -> bool:
-    """Print how often the first is cheaper on the same layouts; return whether that could be chance."""
+    """Print how often the first is cheaper on the same layouts; return whether that is not significant."""
     pairs = [(a.cost, b.cost) for a, b in zip(found, cloned, strict=True)]
     cheaper, dearer = sum(a < b for a, b in pairs), sum(a > b for a, b in pairs)
     p_value = float(binomtest(cheaper, max(1, cheaper + dearer), alternative="greater").pvalue)

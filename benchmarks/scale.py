@@ -1,13 +1,13 @@
-"""How recording, resuming, checking, training and pushing grow with the number of episodes.
+"""How the cost of recording, resuming, checking, training and pushing grows with the number of episodes.
 
 python benchmarks/scale.py [--quick] [--episodes=10000] [--folder=FOLDER] [--plot=FILE]
 
-Fetch's reach, the cheapest to simulate, on one worker. A recording grows tenfold again and again by
-`record --resume=true`; at every size each command runs whole, as a process of its own. Processor time, as it does not
-depend on what else the machine does. A new episode: what recording takes beyond a recording of one episode more, which
-reads all others back and writes the same dataset. Memory: the most that the process held. Resuming: wall time until a
-new episode is on disk. At the largest size: a new episode's wall time over that of the same one in an empty folder, by
-turns.
+Fetch's reach, the cheapest task to simulate, on one worker. A recording grows tenfold repeatedly with
+`record --resume=true`; at every size each command runs whole, in a new process. Measures CPU time, as it does not
+depend on the machine's other load. A new episode: the time of recording minus that of adding one episode, which reads
+all others back and writes the same dataset. Memory: the process's peak. Resuming: wall time until a new episode is on
+disk. At the largest size: the wall time of a new episode relative to that of the same one in an empty folder,
+alternating.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ROWS = "rows.json"
 
 @dataclass(frozen=True)
 class Run:
-    """One command: wall and processor time [s], and the most memory that it held [MiB]."""
+    """One command: wall and CPU time [s], and peak memory [MiB]."""
 
     wall: float
     processor: float
@@ -52,7 +52,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Row:
-    """All commands on a dataset of so many episodes. new: what one more takes [s of processor time]."""
+    """All commands on a dataset of a given size. new: time for one more episode [s of CPU time]."""
 
     episodes: int
     new: float
@@ -110,7 +110,7 @@ def read_rows(folder: Path) -> list[Row]:
 
 
 def measure(root: Path, count: int, before: int) -> Row:
-    """Let a dataset of `before` episodes grow to `count`, and measure all commands on it."""
+    """Grow a dataset from `before` to `count` episodes, and measure all commands on it."""
     recorded = manip_il(*record(root, count))
     more, resumed = resume(root, count + 1)
     fresh = (recorded.processor - more.processor) / (count - before)
@@ -135,12 +135,12 @@ def others(root: Path) -> dict[str, Run]:
 
 
 def against_empty(folder: Path, episodes: int) -> list[float]:
-    """Time of new episodes beside all journals that are there, over that of the same ones in an empty folder."""
+    """Return the time of new episodes beside all journals, relative to that of the same ones in an empty folder."""
     journals, empty = folder / "demos.journals", folder / "empty"
     job, after = RolloutJob(make_config("fetch", "reach"), hold=10), max(list_seeds(journals)) + 1
     ratios: list[float] = []
     empty.mkdir()
-    collect_seconds(job, range(after, after + 5), empty)  # the first loads and compiles
+    collect_seconds(job, range(after, after + 5), empty)  # the first call loads and compiles
     for turn in range(TURNS):
         seeds = range(after + turn * episodes, after + (turn + 1) * episodes)
         order = (journals, empty) if turn % 2 else (empty, journals)
@@ -151,7 +151,7 @@ def against_empty(folder: Path, episodes: int) -> list[float]:
 
 
 def collect_seconds(job: RolloutJob, seeds: range, journals: Path) -> float:
-    """Seconds of simulating episodes and storing their journals, which go again."""
+    """Return the seconds to simulate episodes and store their journals, which are then deleted."""
     started = time.perf_counter()
     for _ in collect(Engine(), job, seeds, journals):
         pass
@@ -162,7 +162,7 @@ def collect_seconds(job: RolloutJob, seeds: range, journals: Path) -> float:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Time and memory over the number of episodes; in the legend how each grows over the last decade."""
+    """Plot time and memory against the number of episodes, with their growth over the last decade in the legend."""
     plt = import_module("matplotlib.pyplot")
     figure, both = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
     sizes = [row.episodes for row in rows]
@@ -191,7 +191,7 @@ def record(root: Path, count: int) -> tuple[str, ...]:
 
 
 def resume(root: Path, count: int) -> tuple[Run, float]:
-    """Record one episode more; returns the run, and how long it took until that was on disk [s]."""
+    """Record one more episode; return the run, and how long it took until that was on disk [s]."""
     journals = root.with_name(f"{root.name}.journals")
     started, had = time.time(), {path.name for path in os.scandir(journals)}
     run = manip_il(*record(root, count))
@@ -200,7 +200,7 @@ def resume(root: Path, count: int) -> tuple[Run, float]:
 
 
 def manip_il(*words: str) -> Run:
-    """Run a command in a process of its own. Raises `SystemExit` where it fails."""
+    """Run a command in a new process. Raises `SystemExit` if it fails."""
     return measured([str(Path(sys.executable).with_name("manip-il")), *words, "--quiet"])
 
 

@@ -1,4 +1,4 @@
-"""A film strip of every task, solved by the expert, and the table beside them: what `docs/tasks.md` shows.
+"""Film strips of all tasks, solved by the expert, and the table beside them, for `docs/tasks.md`.
 
 Usage: MUJOCO_GL=egl python benchmarks/task_strips.py [TASK ...]; writes docs/tasks/TASK.jpg.
 """
@@ -18,15 +18,15 @@ from manip_il.sim.render import Picture
 from manip_il.tasks.envs import make_env
 from manip_il.tasks.table import TASKS
 
-FRAMES = 6  # of a strip
-CROP = (slice(90, 450), slice(130, 610))  # of the front camera's picture, where things happen [pixels]
-EPISODES = {"carry": 1}  # of a strip, of the first four; of others the fourth
-HEIGHT = 180  # of a strip [pixels]
+FRAMES = 6  # frames per strip
+CROP = (slice(90, 450), slice(130, 610))  # part of the front camera's picture with the task in it [pixels]
+EPISODES = {"carry": 1}  # index of the episode shown, of the first four; for other tasks the last
+HEIGHT = 180  # height of a strip [pixels]
 DOCS = Path(__file__).parent.parent / "docs" / "tasks"
 
 
 def film(task: str) -> list[Picture]:
-    """Return a picture of every other control step of one solved episode, and of its end."""
+    """Return pictures of every other control step of one solved episode, and of its end."""
     env = make_env("panda", task, look=FILM, render_mode="rgb_array")
     expert, pictures = Expert(env.scene), []
     env.start(stream_seeds("training", 4)[EPISODES.get(task, 3)])
@@ -41,7 +41,7 @@ def film(task: str) -> list[Picture]:
 
 
 def strip(pictures: list[Picture]) -> Image.Image:
-    """Return pictures from the beginning to the end, side by side."""
+    """Return evenly spaced pictures from beginning to end, side by side."""
     chosen = np.linspace(0, len(pictures) - 1, FRAMES).round().astype(int)
     whole = Image.fromarray(np.hstack([pictures[i][CROP] for i in chosen]))
     return whole.resize((whole.width * HEIGHT // whole.height, HEIGHT), Image.Resampling.LANCZOS)

@@ -1,11 +1,11 @@
-"""Wall-clock from nothing to a policy of 99 % and of 99.5 % on Fetch pick-and-place with 5 cm tolerance.
+"""Wall-clock from scratch to policies of 99 % and 99.5 % success on Fetch pick-and-place with 5 cm tolerance.
 
 python benchmarks/time_to_policy.py [--seed=N] [--peer=PYTHON] [--quick]
 
-`configs/fetch_5cm.yaml`: demonstrations, DAgger's rollouts and fitting count, and so does starting the worker
-processes; evaluation on the 200 validation seeds is left out. Beside it, in the same run, the `imitation` library
-clones 200 demonstrations of the stock environment, without evaluation too, and is tested on 200 seeds. PYTHON is the
-interpreter of an environment with that library, whose versions are not ours:
+`configs/fetch_5cm.yaml`: includes demonstrations, DAgger's rollouts, fitting and starting the worker processes, but not
+the evaluation on 200 validation seeds. In the same run, the `imitation` library clones 200 demonstrations of the stock
+environment, also without evaluation in its time, and is tested on 200 seeds. PYTHON is the interpreter of an
+environment with that library, which needs other versions than this project:
 
 python3.11 -m venv peer && peer/bin/pip install imitation==1.0.1 gymnasium-robotics==1.2.4
 """
@@ -32,7 +32,7 @@ from manip_il.collect.workers import Engine, default_workers
 
 HERE = Path(__file__).parent
 GOALS = (0.99, 0.995)
-EPOCHS = 150  # of the library's cloning
+EPOCHS = 150  # epochs of the library's cloning
 
 
 def main() -> int:
@@ -61,7 +61,7 @@ def main() -> int:
 
 
 def reach_goals(config: RunConfig, limit: float | None) -> list[float]:
-    """Print every round until the last goal is reached; return the goals that are not."""
+    """Print every round until the last goal is reached; return the goals that are not reached."""
     print("round  labels  success (200 validation seeds)  seconds without evaluation")
     left, started, evaluation = list(GOALS), time.monotonic(), 0.0
     with tempfile.TemporaryDirectory() as folder, Engine(default_workers()) as engine:
@@ -80,9 +80,9 @@ def reach_goals(config: RunConfig, limit: float | None) -> list[float]:
 
 
 def clone_by_peer(python: Path, seed: int, epochs: int) -> dict[str, float]:
-    """What the library's cloning took [s], learnt from and reached."""
+    """Return the library's cloning time [s], number of labels and success."""
     words = [str(python), str(HERE / "_imitation_cloning.py"), str(seed), str(epochs)]
-    own = {name: value for name, value in os.environ.items() if "GL" not in name}  # our choice of OpenGL crashes it
+    own = {name: value for name, value in os.environ.items() if "GL" not in name}  # our choice of OpenGL makes it crash
     done = subprocess.run(words, check=True, capture_output=True, text=True, env=own)
     return json.loads(done.stdout.splitlines()[-1])
 

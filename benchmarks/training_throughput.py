@@ -1,9 +1,9 @@
-"""Samples a second of training: our in-memory path against LeRobot's DataLoader, same data, same run.
+"""Samples per second of training: our in-memory path against LeRobot's DataLoader, on the same data in the same run.
 
 python benchmarks/training_throughput.py [DATASET]
 
-DATASET is the root of a local LeRobot dataset with our columns; without it a small one is made by
-LeRobot's own API. Prints samples/s of feeding, of a whole optimisation step, and the ratios.
+DATASET is the root of a local LeRobot dataset with our columns; without it a small one is made with
+LeRobot's own API. Prints samples/s of loading and of a whole optimisation step, and the ratios.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from manip_il.learn.network import threads
 from manip_il.learn.train import Trainer
 
 BATCH = 512
-SECONDS = 3.0  # of measuring, each
+SECONDS = 3.0  # duration of each measurement [s]
 LEARNING = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
 
 
@@ -47,11 +47,11 @@ def main() -> None:
 
 
 def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callable[[], object]]:
-    """A batch from LeRobot's loader; and an update of lerobot-train's kind with it."""
+    """Return functions that load a batch with LeRobot's loader, and that also update as lerobot-train does."""
     config = MLPConfig()
     policy = make_policy(config, ds_meta=dataset.meta)
     before, _ = make_pre_post_processors(config)
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=config.optimizer_lr)  # as LeRobot builds it
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=config.optimizer_lr)  # as in LeRobot
     batches = endless(torch.utils.data.DataLoader(dataset, BATCH, shuffle=True, drop_last=True))
 
     def step() -> None:
@@ -66,7 +66,7 @@ def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callabl
 
 
 def our_path(root: Path, folder: Path) -> tuple[Callable[[], object], Callable[[], object]]:
-    """A batch from the tables in memory, as LeRobot's processors give it; and the same update with it."""
+    """Return functions that gather a batch in memory, in the form of LeRobot's processors, and that also update."""
     config = FitConfig(steps=10**9, batch_size=BATCH, log_freq=10**9)
     trainer = Trainer((Dataset.open(root),), config, folder)
     updates, counter = trainer.run(), iter(range(10**9))

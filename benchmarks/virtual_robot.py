@@ -1,4 +1,4 @@
-"""The virtual robot in use, as `README.md` shows it: what a session prints, and what LeRobot's program recorded of it.
+"""The virtual robot in use, for `README.md`: what a session prints, and what LeRobot's program recorded in it.
 
 Usage: MUJOCO_GL=egl python benchmarks/virtual_robot.py; writes docs/virtual_robot.png, in about a minute.
 """
@@ -18,8 +18,8 @@ from lerobot.datasets import LeRobotDataset
 from matplotlib.gridspec import GridSpec
 
 OUTPUT = Path(__file__).parent.parent / "docs" / "virtual_robot.png"
-HEIGHT, WIDTH = 144, 192  # of a camera's picture [pixels]
-MOMENTS = 3  # of an episode
+HEIGHT, WIDTH = 144, 192  # size of a camera's picture [pixels]
+MOMENTS = 3  # number of moments shown per episode
 SHOWN = r"(?:follower|leader): |Recording episode|Reset the env|Stop recording|Right arrow|.*ended; "
 SAID = rf"^(?:INFO .*\d (?=[RS]))?((?:{SHOWN}).*)$"
 COMMANDS = [
@@ -31,7 +31,7 @@ COMMANDS = [
 
 
 def record(folder: Path) -> tuple[list[str], LeRobotDataset]:
-    """Return what a session printed in which LeRobot recorded two episodes, shortened, and its dataset."""
+    """Return a session's shortened output while LeRobot recorded two episodes, and the dataset of these."""
     tools, arm = Path(sys.executable).parent, folder / "arm"
     shared = f"type: zmq, server_address: 127.0.0.1, port: 5598, width: {WIDTH}, height: {HEIGHT}, fps: 30"
     cameras = ", ".join(f"{name}: {{{shared}, camera_name: {name}}}" for name in ("front", "wrist"))
@@ -55,7 +55,7 @@ def record(folder: Path) -> tuple[list[str], LeRobotDataset]:
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         lines, dataset = record(Path(folder))
-        last = int(np.argmax(np.array(dataset.hf_dataset["episode_index"]) == 1)) - 1  # of the first episode
+        last = int(np.argmax(np.array(dataset.hf_dataset["episode_index"]) == 1)) - 1  # last frame of the first episode
         moments = np.linspace(0, last, MOMENTS).round().astype(int)
         frames: list[Any] = [dataset[int(moment)] for moment in moments]
     plt.rcParams["font.family"] = "DejaVu Sans Mono"

@@ -1,12 +1,12 @@
-"""Frames a second into a LeRobot dataset: our writer against LeRobot's own loop, fed the same frames in the same run.
+"""Frames per second written to a LeRobot dataset: our writer against LeRobot's own loop, on the same frames.
 
 python benchmarks/writer_speed.py [--quick]
 
-Ours is `write_dataset`; the peer is `add_frame` a frame, `save_episode` an episode and
-`finalize`, with its pictures encoded after every episode (its default) or while it records (streaming). Both have
-the whole dataset on file in the end, both with LeRobot's default video settings. By turns in the same run; the median
-ratio over the repeats counts. The peer's time an episode grows with its video file, ours does not: longer datasets
-than these are further apart.
+Ours is `write_dataset`; the peer is `add_frame` per frame, `save_episode` per episode and
+`finalize`, with its pictures encoded after every episode (its default) or while it records (streaming). Both end with
+the whole dataset on disk and use LeRobot's default video settings. They alternate in the same run; the result is the
+median ratio over the repeats. The peer's time per episode grows with its video file, ours does not, so the ratio is
+larger for longer datasets.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.video import VideoConfig
 from manip_il.mdp import Episode
 
-LENGTH = 100  # frames of an episode
+LENGTH = 100  # frames per episode
 REPO = "someone/benchmark"
 STATE_ONLY = s.RobotTaskSpec(
     robot="benchmark",
@@ -54,7 +54,7 @@ def main() -> int:
     repeats = 1 if options.quick else 3
     datasets.disable_progress_bars()
     logging.disable(logging.WARNING)
-    os.environ["SVT_LOG"] = "1"  # the peer's encoders greet otherwise
+    os.environ["SVT_LOG"] = "1"  # otherwise the peer's encoders print a greeting
     print(describe_machine())
     print("dataset                            LeRobot, frames/s  ours, frames/s  ratio (median, all repeats)")
     for name, spec, episodes, peer in (
@@ -72,7 +72,7 @@ def main() -> int:
 
 
 def rate(write: Write, spec: s.RobotTaskSpec, episodes: list[Episode]) -> float:
-    """Frames a second, from nothing to a whole dataset."""
+    """Return frames per second, from nothing to a whole dataset."""
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
         write(Path(folder) / "dataset", spec, episodes)
@@ -92,7 +92,7 @@ def peer_default(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode], str
         robot_type=spec.robot,
         use_videos=bool(spec.cameras),
         streaming_encoding=streaming,
-        encoder_queue_maxsize=LENGTH,  # it drops frames where its queue is full
+        encoder_queue_maxsize=LENGTH,  # it drops frames if its queue is full
     )
     for episode in episodes:
         for frame in range(len(episode)):
@@ -115,7 +115,7 @@ def make_episode(spec: s.RobotTaskSpec, seed: int) -> Episode:
 
 
 def column(rng: np.random.Generator, feature: dict) -> np.ndarray:
-    """Slow random walks: arms move little from one frame to the next; in pictures a square moves on a gradient."""
+    """Return slow random walks, as arms move little between frames; in pictures a square moves on a gradient."""
     shape = (LENGTH, *feature["shape"])
     if feature["dtype"] == "video":
         return film(rng, *feature["shape"][:2])

@@ -1,4 +1,4 @@
-"""An arm of a comparison: one policy, or one for each training seed, as evaluations, checkpoints or whole runs."""
+"""An arm of a comparison: one policy, or one per training seed, as evaluations, checkpoints or whole runs."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _SEED_FOLDER = re.compile(r"seed_(\d+)")
 
 @dataclass(frozen=True)
 class Member:
-    """One policy of an arm: an evaluation, a checkpoint, or a run of which a rule chooses a round.
+    """One policy of an arm: an evaluation, a checkpoint, or a run from which a rule chooses a round.
 
-    policy: its folder; None for an evaluation, and for a run before its round is chosen. result: once there is one.
+    policy: its folder; None for an evaluation, and for a run before its round is chosen. result: None until measured.
     """
 
     path: Path
@@ -38,17 +38,17 @@ class Member:
 
     @property
     def name(self) -> str:
-        """Path, for tables and errors."""
+        """The path, for tables and errors."""
         return str(self.path)
 
     @property
     def test(self) -> EvalResult:
-        """The evaluation, of a member that has been measured."""
+        """The evaluation of a member that has been measured."""
         assert self.result is not None
         return self.result
 
     def select(self, rule: Rule) -> Member:
-        """Return the member with the policy of the round that `rule` chooses; `UsageError` if there is none."""
+        """Return the member with the policy of the round that `rule` chooses. Raises `UsageError` if there is none."""
         if not self.history:
             return self
         chosen = rule.select(self.history, self.name)
@@ -57,7 +57,7 @@ class Member:
         return replace(self, chosen=chosen, policy=policy)
 
     def measure(self, trial: Trial, folder: Path, engine: Engine, progress: Progress) -> Member:
-        """Return the member with the evaluation of its policy, which is kept in `folder`; itself without a policy."""
+        """Return the member with its policy's evaluation, saved in `folder`; the member itself if it has no policy."""
         if self.policy is None:
             return self
         words = f"{re.sub(r'[^A-Za-z0-9]+', '_', self.name)[-80:]}_{policy_sha256(self.policy)[:8]}"
@@ -65,7 +65,7 @@ class Member:
         return replace(self, result=result)
 
     def env(self, task: str | None = None) -> EnvConfig:
-        """Return the environment in which a run was validated. task: its file, if it does not ship."""
+        """Return the environment in which a run was validated. task: the task's file, for a custom task."""
         found = EvalResult.read(_round_folder(self.path, self.history[0]))
         return found.settings.env(found.robot, task or found.task)
 
@@ -78,7 +78,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Arm:
-    """One side of a comparison: one policy, or one a training seed."""
+    """One side of a comparison: one policy, or one per training seed."""
 
     name: str
     members: tuple[Member, ...]
@@ -94,18 +94,18 @@ class Arm:
         return all(member.history for member in self.members)
 
     def measure(self, trial: Trial, folder: Path, engine: Engine, progress: Progress) -> Arm:
-        """Return the arm with the evaluations of its policies, see `Member.measure`."""
+        """Return the arm with its policies' evaluations, see `Member.measure`."""
         return replace(self, members=tuple(one.measure(trial, folder, engine, progress) for one in self.members))
 
 
 def select_rounds(rule: Rule, arms: Sequence[Arm]) -> tuple[Rule, tuple[Arm, ...]]:
-    """Return the rule with the limit of all runs, and the arms with the rounds that it chooses."""
+    """Return the rule with the cost limit of all runs, and the arms with the rounds that it chooses."""
     rule = rule.limited({member.name: member.history for arm in arms for member in arm.members})
     return rule, tuple(replace(arm, members=tuple(one.select(rule) for one in arm.members)) for arm in arms)
 
 
 def read_arm(path: Path) -> Arm:
-    """Return what lies at `path`; `UsageError` in one line for what cannot be compared."""
+    """Return the arm at `path`. Raises a one-line `UsageError` if it cannot be compared."""
     require_source(path)
     folders = [folder for folder in path.iterdir() if folder.is_dir()] if path.is_dir() else []
     seeds = {int(match[1]): folder for folder in folders if (match := _SEED_FOLDER.fullmatch(folder.name))}
@@ -116,9 +116,9 @@ def read_arm(path: Path) -> Arm:
 
 
 def require_pair(left: Arm, right: Arm) -> None:
-    """Raise `UsageError` unless two arms can be compared: both or neither evaluated already, the same training seeds.
+    """Raise `UsageError` unless two arms can be compared: both or neither already evaluated, the same training seeds.
 
-    Two single policies are a pair, whatever their seeds.
+    Two single policies can be compared whatever their seeds.
     """
     if len({member.result is None for arm in (left, right) for member in arm.members}) > 1:
         raise UsageError(f"{left.name} and {right.name}: one is evaluated already; give two eval.json, or two policies")
@@ -128,7 +128,7 @@ def require_pair(left: Arm, right: Arm) -> None:
 
 
 def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
-    """Return the environment that all have, by name; `MismatchError` naming the first field that differs."""
+    """Return the environment that all share, given by name. Raises `MismatchError` naming the first difference."""
     (first, env), *others = envs.items()
     for name, other in others:
         for field in fields(env):
@@ -139,11 +139,11 @@ def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
 
 
 def read_member(path: Path) -> Member:
-    """Return the policy, run or evaluation at `path`; `UsageError` if there is none."""
+    """Return the policy, run or evaluation at `path`. Raises `UsageError` if there is none."""
     if path.is_file():
         return Member(path, result=EvalResult.read(path))
     records = read_lines(path / METRICS_FILE)
-    if any({"round", "iteration"} & record.keys() for record in records):  # `manip-il train` counts steps there
+    if any({"round", "iteration"} & record.keys() for record in records):  # `manip-il train` logs only steps
         return Member(path, history=history(records, str(path)))
     if (path / FILE_NAME).is_file():
         return Member(path, result=EvalResult.read(path))
@@ -154,5 +154,5 @@ def read_member(path: Path) -> Member:
 
 
 def _round_folder(run: Path, one: Round) -> Path:
-    """Where a run keeps a round, or an iteration that was validated, with its `eval.json`."""
+    """Return the folder, with its `eval.json`, of a run's round or of an iteration that was validated."""
     return run / "validation" / f"{one.round:06d}" if one.unit == "iteration" else run / f"round_{one.round:03d}"

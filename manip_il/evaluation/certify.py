@@ -1,14 +1,14 @@
-"""Measure the expert's recoverability: rollouts perturbed once, beside the same ones undisturbed.
+"""Measure the expert's recoverability: rollouts with one perturbation, compared with the same rollouts undisturbed.
 
-The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the expert's cost of going
-on after action a in state s, and V*(s) its cost of acting itself, the gap Q*(s, a) - V*(s) is what the action a costs.
+The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the expert's cost after
+action a in state s, and V*(s) its cost if it acts itself from s on, the gap Q*(s, a) - V*(s) is what action a costs.
 Expert and simulator are deterministic, so the undisturbed run of a seed gives V* of every state on it, and the same run
 with one wrong action gives Q*.
 
 Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest gap, u: a learner that errs in a share e of
-the states it visits within T steps costs at most u T e more than the expert, so linearly in T if a mistake can be
-undone, and not quadratically. Rajaraman et al. (2021) call it mu-recoverability. The largest gap among drawn actions,
-as here, is a lower bound of u.
+the states it visits within T steps costs at most u T e more than the expert, so the cost is linear in T if mistakes can
+be undone, not quadratic. Rajaraman et al. (2021) call this mu-recoverability. The largest gap among sampled actions, as
+here, is a lower bound of u.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ _COLOURS: dict[Group, str] = {"start": EXPERT, "state": DAGGER, "action": CLONIN
 class Case:
     """One episode. moment: the control step from which the expert is judged.
 
-    steps: until solved from there [control steps]; None if not within a horizon. undisturbed: the same without the
-    perturbation, if known.
+    steps: control steps from there until solved; None if not solved within the horizon. undisturbed: the same without
+    the perturbation, if known.
     """
 
     seed: int
@@ -57,9 +57,9 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """The cases of one kind. kind, words: short and in full; horizon: [control steps].
+    """The cases of one kind. kind, words: short and full name; horizon: [control steps].
 
-    left_out: episodes that give no case, as the perturbation found no place or changed nothing.
+    left_out: number of episodes without a case, as the perturbation could not be placed or changed nothing.
     """
 
     group: Group
@@ -71,12 +71,12 @@ class Row:
 
     @property
     def success(self) -> Proportion | None:
-        """Solved within a horizon from the moment on; None without cases."""
+        """The share solved within a horizon from the moment on; None without cases."""
         return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
 
     @property
     def mean_steps(self) -> float | None:
-        """Mean over the solved cases, until they were [control steps]."""
+        """The mean over solved cases of the control steps until solved."""
         steps = [case.steps for case in self.cases if case.steps is not None]
         return float(np.mean(steps)) if steps else None
 
@@ -96,9 +96,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Recoverability of the expert on one robot and task, one row a kind.
+    """Recoverability of the expert on one robot and task, one row per kind of perturbation.
 
-    settings: cases of each kind, and seed, horizon [control steps], rate, tolerance [m] and success_steps of the runs.
+    settings: cases per kind, and seed, horizon [control steps], rate, tolerance [m] and success_steps of the runs.
     """
 
     robot: str
@@ -134,7 +134,7 @@ class Certificate:
         return (*self.of("start"), *self.of("state"), states, *self.of("action"), actions)
 
     def table(self) -> Table:
-        """Return a row a kind: how often and how fast the expert recovers, and what a wrong action costs."""
+        """Return one row per kind: how often and how fast the expert recovers, and what a wrong action costs."""
         rows: list[tuple[str, ...]] = []
         for row in self._with_pooled:
             steps = "" if row.mean_steps is None else f"{row.mean_steps:.1f}"
@@ -152,7 +152,7 @@ class Certificate:
         return [f"mu (the u of Ross et al. 2011) is at least {self._in_seconds(self.mu)}."]
 
     def report(self, command: str, config: Mapping[str, Any]) -> Report:
-        """Return the page."""
+        """Return the HTML report."""
         states = self.pooled("state")
         changed = f"{states.success} of {len(states.cases):,} changed states" if states.success else "no changed state"
         bars = [Bar(row.words, (row.success,), _COLOURS[row.group]) for row in self.rows if row.success]
@@ -177,7 +177,7 @@ class Certificate:
 
 
 def count_episodes(env: EnvConfig, cases: int) -> int:
-    """Return how many episodes `certify` runs at most."""
+    """Return the largest number of episodes that `certify` runs."""
     return cases * (2 + len(kinds_for(get_task(env.task))))
 
 
@@ -190,8 +190,8 @@ def certify(
 ) -> Certificate:
     """Measure the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
 
-    A perturbation happens at a step drawn evenly from those that the undisturbed run takes until the task is solved;
-    the expert then has a whole horizon. on_episode: sees every episode as it ends.
+    The step of a perturbation is drawn uniformly from those that the undisturbed run takes until the task is solved;
+    the expert then has a whole horizon. on_episode: called with every episode as it ends.
     """
     seeds = stream_seeds("certificate", cases, seed)
 
@@ -232,7 +232,7 @@ def certify(
 
 
 def draw_moment(seed: int, kind: str, steps: int) -> int:
-    """Return one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
+    """Draw one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
 
 
@@ -242,6 +242,6 @@ def _case(episode: Episode, moment: int, horizon: int, undisturbed: int | None =
 
 
 def _differ(one: Episode, other: Episode, step: int) -> bool:
-    """Whether state or executed action of a step are not those of the other episode."""
+    """Return whether the state or the executed action of a step differs between two episodes."""
     names = (schema.SIM_STATE, schema.EXECUTED_ACTION)
     return not all(np.array_equal(one.columns[name][step], other.columns[name][step]) for name in names)

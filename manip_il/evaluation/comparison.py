@@ -1,4 +1,4 @@
-"""Arms on the same test episodes: which one is better, and what it had cost."""
+"""Comparison of arms on the same test episodes: which one is better, and what each cost."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ TARGET = 0.95
 class Comparison:
     """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
 
-    results: of both, for each training seed; episodes that only one of them ran do not count. Raises `MismatchError`
-    if robot, task or settings differ, `ManipError` if two share no episode.
+    results: (left, right) for each training seed; episodes that only one of them ran do not count. Raises
+    `MismatchError` if robot, task or settings differ, `ManipError` if two share no episode.
     """
 
     left: str
@@ -49,7 +49,7 @@ class Comparison:
 
     @classmethod
     def of(cls, left: Arm, right: Arm) -> Comparison:
-        """Compare two arms. Raises `ManipError`, too, unless all their policies have run the same episodes."""
+        """Compare two arms. Also raises `ManipError` unless all their policies have run the same episodes."""
         members = [*left.members, *right.members]
         ours, *others = ({episode.seed for episode in one.test.episodes} for one in members)
         for other, theirs in zip(members[1:], others, strict=True):
@@ -63,7 +63,7 @@ class Comparison:
 
     @cached_property
     def _outcomes(self) -> list[dict[int, tuple[bool, bool]]]:
-        """Outcomes (left, right) by test episode, of each training seed."""
+        """Outcomes (left, right) by test episode, for each training seed."""
         found: list[dict[int, tuple[bool, bool]]] = []
         for left, right in self.results:
             theirs = {episode.seed: episode.success for episode in right.episodes}
@@ -90,9 +90,9 @@ class Comparison:
 
     @cached_property
     def p_value(self) -> float:
-        """Two-sided and exact over test episodes, all training seeds together; with one it is McNemar's.
+        """Two-sided exact p over test episodes, all training seeds together; McNemar's for one training seed.
 
-        It holds for these trained policies; `interval` is about other training seeds, too.
+        It holds for these trained policies; `interval` also covers other training seeds.
         """
         margins: Counter[int] = Counter()
         for seed, (left, right) in (one for outcomes in self._outcomes for one in outcomes.items()):
@@ -101,13 +101,13 @@ class Comparison:
 
     @property
     def significant(self) -> bool:
-        """Whether one is better by the exact test, and with several training seeds by the t interval, too."""
+        """Whether one is better by the exact test and, if there are several training seeds, by the t interval."""
         low, high = self.interval
         return self.p_value < 1 - CONFIDENCE and (len(self.pairs) == 1 or low > 0 or high < 0)
 
     @property
     def verdict(self) -> str:
-        """A sentence: which one is better, or that nothing shows it, with the difference, its interval and p."""
+        """A sentence that says which is better, or that neither is shown to be, with difference, interval and p."""
         n, sign = len(self.pairs), -1 if self.difference < 0 else 1
         leads = sum(sign * pair.difference > 0 for pair in self.pairs)
         tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
@@ -139,10 +139,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Study:
-    """Arms with the same training seeds, each tested, and what they had cost.
+    """Tested arms with the same training seeds, and what they cost.
 
-    baseline: the arm that the others are compared with; arms of different tasks have none (None). rule: chose each
-    run's round. target: validation success whose cost is told.
+    baseline: the arm that the others are compared with; None for arms of different tasks. rule: chose each run's round.
+    target: validation success for which the cost is reported.
     """
 
     arms: tuple[Arm, ...]
@@ -152,7 +152,7 @@ class Study:
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
-        """Arm -> its comparison with the baseline, for every other arm; empty if there is no baseline."""
+        """Arm -> its comparison with the baseline, for every other arm; empty without a baseline."""
         if self.baseline is None:
             return {}
         [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
@@ -160,7 +160,7 @@ class Study:
 
     @property
     def verdict(self) -> str:
-        """The first sentence: of two arms which is better; of several the best; of tasks how many reach the target."""
+        """The first sentence: the better of two arms, the best of several, or how many tasks reach the target."""
         if len(self.comparisons) == 1:
             return next(iter(self.comparisons.values())).verdict
         ranked = sorted(self.arms, key=lambda arm: -arm.test_rate)
@@ -176,7 +176,7 @@ class Study:
 
     @property
     def facts(self) -> list[str]:
-        """Sentences after the verdict: comparisons with the baseline, and how rounds were chosen."""
+        """Return the sentences after the verdict: comparisons with the baseline, and how rounds were chosen."""
         verdicts = [comparison.verdict for comparison in self.comparisons.values()]
         facts = verdicts if len(verdicts) > 1 else []
         if self.comparisons and (seeds := len(self.arms[0].members)) > 1:
@@ -194,13 +194,13 @@ class Study:
         return (self.results_table(), *([self.condition_table()] if several else []))
 
     def cost_tables(self) -> tuple[Table, ...]:
-        """Return costs to the target; nothing unless all arms are runs."""
+        """Return costs to reach the target; nothing unless all arms are runs."""
         return (self.target_table(),) if all(arm.has_histories for arm in self.arms) else ()
 
     def results_table(self) -> Table:
-        """Return an arm a row: mean costs, validation, test success, difference.
+        """Return one row per arm: mean costs, validation, test success, difference.
 
-        In brackets each training seed, of one alone the interval.
+        In brackets are the values of each training seed, or, for a single seed, the interval.
         """
         rows: list[tuple[str, ...]] = []
         for arm in self.arms:
@@ -214,7 +214,7 @@ class Study:
         return Table(head, tuple(rows))
 
     def condition_table(self) -> Table:
-        """Return a condition a row: success of every arm, the mean over training seeds."""
+        """Return one row per condition: success of every arm, averaged over training seeds."""
         rows = [
             (
                 name or NO_CONDITION,
@@ -228,7 +228,7 @@ class Study:
         return Table(("condition", *(arm.name for arm in self.arms)), tuple(rows))
 
     def target_table(self) -> Table:
-        """Return an arm a row: its mean costs when validation first reached the target in each training seed."""
+        """Return one row per arm: its mean costs when validation first reached the target in each training seed."""
         rows: list[tuple[str, ...]] = []
         for arm in self.arms:
             first = self._reached(arm)
@@ -239,12 +239,12 @@ class Study:
 
     @property
     def _costs(self) -> list[Cost]:
-        """Costs in the tables; steps if they are not all labelled."""
+        """The costs shown in tables; steps only if some have no label."""
         steps = any(has_unlabelled_steps(member.history) for arm in self.arms for member in arm.members)
         return [cost for cost in COSTS if cost != "steps" or steps]
 
     def _reached(self, arm: Arm) -> list[Round | None]:
-        """The round of each training seed in which validation first reached the target."""
+        """Return, for each training seed, the round in which validation first reached the target."""
         return [
             next((one for one in member.history if one.validation.rate >= self.target), None) for member in arm.members
         ]
@@ -283,7 +283,7 @@ def _head(cost: Cost) -> str:
 
 
 def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:
-    """The mean amount without the unit that the column's head has."""
+    """Return the mean amount without its unit, which is in the column's head."""
     return format_amount(cost, fmean(one.amount(cost) for one in rounds if one)).removesuffix(f" {cost}")
 
 

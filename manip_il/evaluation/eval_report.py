@@ -1,4 +1,4 @@
-"""`report.html` of an evaluation, a run's policies and a comparison: how good, where it fails, what it cost, films."""
+"""`report.html` of an evaluation, a run's policies or a comparison: success, failures, costs and films."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def eval_report(
     films: Sequence[Film] = (),
     no_films: str = "",
 ) -> Report:
-    """Return the report of an evaluation. no_films: why there are none."""
+    """Return the report of an evaluation. no_films: the reason if there are none."""
     fails = failures_sections(
         [("failed episodes", result.episodes)], result.task, "Where it fails", failure_map(result.episodes)
     )
@@ -59,7 +59,7 @@ def run_report(
     curves: Sequence[Curve] = (),
     **parts: Any,
 ) -> Report:
-    """Return the report of policies of a run, one a row. parts: title, verdict and the like, see `Report`."""
+    """Return the report of a run's policies, one per row. parts: title, verdict and the like, see `Report`."""
     sizes = sorted({row.success.n for row in rows})
     episodes = " to ".join(f"{size:,}" for size in dict.fromkeys((sizes[0], sizes[-1])))
     note = f"Each policy ran {episodes} episodes. Intervals are Wilson's score intervals."
@@ -70,7 +70,7 @@ def run_report(
 
 
 def compare_report(study: Study, title: str, command: str, config: Mapping[str, Any] | None = None) -> Report:
-    """Return the report of arms beside each other."""
+    """Return the report of a comparison of arms."""
     colours = arm_colours(study)
     first = study.arms[0].members[0].test
     of_arms = tuple(colours.values())
@@ -104,7 +104,7 @@ def compare_report(study: Study, title: str, command: str, config: Mapping[str, 
 
 
 def arm_colours(study: Study) -> dict[str, str]:
-    """Return arm -> its colour: the baseline grey, the others in order."""
+    """Return arm -> colour: grey for the baseline, the palette in order for the others."""
     others = [arm.name for arm in study.arms if arm.name != study.baseline]
     found = {name: ARMS[place % len(ARMS)] for place, name in enumerate(others)}
     return {arm.name: found.get(arm.name, BASELINE) for arm in study.arms}
@@ -113,7 +113,7 @@ def arm_colours(study: Study) -> dict[str, str]:
 def failures_sections(
     policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: str, heading: str, figures: tuple[Figure, ...] = ()
 ) -> list[Section]:
-    """Return the phases that failed episodes of policies (name, episodes) ended in, after the figures; else nothing."""
+    """Return the figures and the phases that failed episodes ended in, if any. policies: name and episodes of each."""
     table = phase_table(policies, task)
     if not figures and table is None:
         return []
@@ -123,7 +123,7 @@ def failures_sections(
 def curve_sections(
     curves: Sequence[Curve], target: float | None = None, tables: tuple[Table, ...] = ()
 ) -> list[Section]:
-    """Return success over every cost; nothing without curves."""
+    """Return a section on success against every cost; nothing without curves."""
     if not curves:
         return []
     note = curve_note(curves)
@@ -131,15 +131,15 @@ def curve_sections(
 
 
 def disturbed_note(result: EvalResult) -> str:
-    """Return a sentence on the conditions, behind a blank; empty without any."""
+    """Return a sentence on the conditions, with a leading space; empty if there are none."""
     disturbance = result.settings.disturbance
     return "" if disturbance == "none" else f" Conditions: {disturbance}."
 
 
 def phase_table(policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: str) -> Table | None:
-    """Return failed episodes by the phase that they ended in, in the order of the task, a column a policy.
+    """Return failed episodes by the phase that they ended in, in the task's order, one column per policy.
 
-    policies: names and episodes. None if none failed or no phase is known.
+    policies: names and episodes. Returns None if none failed or no phase is known.
     """
     counted = [Counter(e.phase_at_end for e in own if e.phase_at_end and not e.success) for _, own in policies]
     found = {name for counts in counted for name in counts}
@@ -156,7 +156,7 @@ def _phase_words(name: str) -> str:
 
 
 def evaluation_verdict(result: EvalResult) -> str:
-    """Return the first sentence: success with its interval, and the phase that failures end in."""
+    """Return the first sentence: success with its interval, and the phase in which most failures end."""
     success, episodes = result.success, f"unseen episodes of {result.robot} {result.task}"
     failed = success.n - success.successes
     if not failed:
@@ -165,7 +165,7 @@ def evaluation_verdict(result: EvalResult) -> str:
         verdict = f"{result.policy} fails in all {success.n:,} {episodes}: {success}"
     else:
         verdict = f"{result.policy} succeeds in {success} of {success.n:,} {episodes}"
-    phase = next(filter(None, result.failures), "")  # unknown in old files
+    phase = next(filter(None, result.failures), "")  # missing in old files
     if not phase:
         return f"{verdict}."
     share = f"{result.failures[phase]:,} of its {failed:,} failures end" if failed > 1 else "its one failure ends"
@@ -173,12 +173,12 @@ def evaluation_verdict(result: EvalResult) -> str:
 
 
 def _conditions(result: EvalResult) -> Section:
-    """Success in all episodes and in every condition, and what success and the conditions mean."""
+    """Return a section: success in all episodes and per condition, and what success and the conditions mean."""
     settings, table = result.settings, evaluation_table(result)
     successes = [result.success, *(part.success for part in result.by_condition.values())]
     bars = [
         Bar(row[0], (success,), colour)
-        for row, success, colour in zip(table.rows, successes, table.colours, strict=False)  # one row of one condition
+        for row, success, colour in zip(table.rows, successes, table.colours, strict=False)  # one condition: one row
     ]
     ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
     intervals = "Intervals are Wilson's score intervals."
@@ -193,7 +193,7 @@ def _conditions(result: EvalResult) -> Section:
 
 
 def _looks(films: Sequence[Film], no_films: str) -> list[Section]:
-    """Films, or why there are none."""
+    """Return a section with the films, or with the reason if there are none."""
     if not films and not no_films:
         return []
     return [Section("How it looks", (f"No films: {no_films}",) if no_films else (), films=tuple(films))]

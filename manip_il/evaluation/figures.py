@@ -1,6 +1,6 @@
 """Figures of reports, drawn by matplotlib as SVG: success rates, learning curves, and where episodes fail.
 
-A panel is as wide as a phone, so that its words stay readable there; wide windows show panels side by side.
+A panel is as wide as a phone's screen, so that its text stays readable there; wide windows show panels side by side.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from manip_il.evaluation.tables import BASELINE, CLONING, DAGGER, EXPERT
 
 INK, SOFT, RULE = "#1d2126", "#5b636d", "#e3e5e8"
 ARMS = (DAGGER, CLONING, EXPERT, "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
-_MARKERS = "osD^"  # told apart without colour
-_PANEL = (4.4, 3.0)  # of a figure that stands beside others [inches]
-_NAME = 20  # characters of a bar's name in a line
-_LOG_SPAN = 20  # amounts that differ by this factor or more are shown on a logarithmic axis
+_MARKERS = "osD^"  # distinguishable without colour
+_PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]
+_NAME = 20  # characters per line of a bar's name
+_LOG_SPAN = 20  # a cost axis is logarithmic if its amounts differ by at least this factor
 _COST_WORDS = {"labels": "expert labels", "steps": "simulated steps", "seconds": "wall-clock [s]"}
 _DPI = 96
-MAX_MARKS = 200  # of one outcome on a map; more would hide each other
+MAX_MARKS = 200  # number shown on a map per outcome; more would hide each other
 MAP_NOTE = (
     "Circles: starts, squares: goals, crosses: where failed episodes ended. "
     f"Of each outcome the first {MAX_MARKS} episodes are drawn at most."
 )
 _STYLE: dict[Any, Any] = {
-    "svg.fonttype": "path",  # looks the same with whatever fonts a machine has
-    "svg.hashsalt": "manip_il",  # the same figure is the same bytes
+    "svg.fonttype": "path",  # looks the same whatever fonts a machine has
+    "svg.hashsalt": "manip_il",  # makes equal figures equal bytes
     "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # which comes with matplotlib
+    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib
     "font.size": 8.5,
     "axes.titlesize": 9.5,
     "axes.edgecolor": SOFT,
@@ -57,7 +57,7 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture of a report. svg: its file; words: what it shows, for who cannot see it; width: its own [px]."""
+    """A picture in a report. svg: its file; words: alternative text; width: its natural width [px]."""
 
     svg: bytes
     words: str
@@ -70,7 +70,7 @@ def drawing(
 ) -> Iterator[tuple[Any, Any]]:
     """Yield a figure and its axes (rows, columns) in the reports' style.
 
-    size: of one panel [inches]. share: the panels of a row have the same axes.
+    size: of one panel [inches]. share: whether the panels of a row share their axes.
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -86,20 +86,20 @@ def drawing(
 
 
 def to_figure(drawn: Any, words: str) -> Figure:
-    """Return a drawn figure as a part of a report; call it while `drawing` is open."""
+    """Return a drawn figure as part of a report; call it while `drawing` is open."""
     content = io.BytesIO()
     drawn.savefig(content, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     return Figure(content.getvalue(), words, round(_DPI * drawn.get_figwidth()))
 
 
 def plain(text: str) -> str:
-    """Return text in which matplotlib sees no mathematics, and finds a glyph for every character."""
+    """Return text without matplotlib's maths markup or characters that its font lacks."""
     return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
 
 
 @dataclass(frozen=True)
 class Bar:
-    """Success rates of one thing: one with its interval, or those of training seeds, of which the bar is the mean."""
+    """Success rates of one arm: one rate with its interval, or one per training seed, with their mean as the bar."""
 
     name: str
     successes: tuple[Proportion, ...]
@@ -107,8 +107,8 @@ class Bar:
 
 
 def rates_figure(bars: Sequence[Bar]) -> Figure:
-    """Draw success rates as bars from 0 to 100 %, with intervals, or with a dot for each training seed."""
-    # at most three short lines, broken at blanks and slashes
+    """Draw success rates as bars from 0 to 100 %, with intervals, or with one dot per training seed."""
+    # at most three short lines, broken at spaces and slashes
     lines = [textwrap.wrap(bar.name.replace("/", "/ "), _NAME)[-3:] for bar in bars]
     names = ["\n".join(plain(part.replace("/ ", "/")) for part in parts) for parts in lines]
     height = 0.55 + sum(0.24 + 0.14 * (1 + name.count("\n")) for name in names)
@@ -121,7 +121,7 @@ def rates_figure(bars: Sequence[Bar]) -> Figure:
             if len(rates) == 1:
                 low, high = (100 * end for end in bar.successes[0].interval)
                 error = [[max(0.0, mean - low)], [max(0.0, high - mean)]]
-                for width, colour in ((4.0, "white"), (1.4, INK)):  # the pale one parts the dark one from the bar
+                for width, colour in ((4.0, "white"), (1.4, INK)):  # white outline, to stand out on the bar
                     axis.errorbar(mean, place, xerr=error, color=colour, lw=width, capsize=3, capthick=width)
             else:
                 axis.plot(rates, [place] * len(rates), "o", mfc="white", mec=INK, ms=5)
@@ -137,7 +137,7 @@ def rates_figure(bars: Sequence[Bar]) -> Figure:
 
 @dataclass(frozen=True)
 class Curve:
-    """Validation success by round of one arm, a run for each training seed. costs: those that its rounds know."""
+    """Validation success by round of one arm, one run per training seed. costs: those known for its rounds."""
 
     name: str
     runs: tuple[History, ...]
@@ -146,13 +146,13 @@ class Curve:
 
 
 def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple[Figure, ...]:
-    """Draw success over every cost that is known, a figure each. target: drawn as a level, in [0, 1].
+    """Draw success against every known cost, one figure each. target: drawn as a horizontal line, in [0, 1].
 
-    Steps are left out if the expert was queried in each of them, as they are labels then.
+    Steps are omitted if every step was labelled, as they then equal the labels.
     """
     rounds = [one for curve in curves for run in curve.runs for one in run]
     lowest = min([one.validation.interval[0] for one in rounds] + ([] if target is None else [target]))
-    floor = math.floor(10 * lowest) * 10 if lowest > 0.5 else 0  # unlike bars, points may start above 0
+    floor = math.floor(10 * lowest) * 10 if lowest > 0.5 else 0  # unlike bars, the axis of points may start above 0
     queried = not any(has_unlabelled_steps(run) for curve in curves for run in curve.runs)
     figures: list[Figure] = []
     for cost in COSTS:
@@ -181,7 +181,7 @@ def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, t
             continue
         for x, y in lines:
             axis.plot(x, y, color=curve.colour, lw=0.9, alpha=0.4)
-        # Only rounds that every seed has: else the mean would jump where a seed ends.
+        # Only rounds that every seed has: otherwise the mean would jump where a seed ends.
         xs, ys = ([*map(fmean, zip(*part, strict=False))] for part in zip(*lines, strict=True))
         axis.plot(xs, ys, lw=1.8, ms=5, **style)
     if target is not None:
@@ -193,7 +193,7 @@ def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, t
 
 
 def curve_note(curves: Sequence[Curve]) -> str:
-    """Return what the marks of `curve_figures` mean."""
+    """Return a note on the meaning of the marks in `curve_figures`."""
     marks = f"bars are {CONFIDENCE:.0%} intervals"
     if any(len(curve.runs) > 1 for curve in curves):
         marks = "the mean over training seeds; thin lines are the seeds"
@@ -201,9 +201,9 @@ def curve_note(curves: Sequence[Curve]) -> str:
 
 
 def failure_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
-    """Draw from above where episodes started, were to go and failed; no figure if none has its places.
+    """Draw a top view of starts, goals and where episodes failed; no figure if no episode has its positions.
 
-    Of failed and of solved episodes the first `MAX_MARKS` are drawn.
+    Shows at most the first `MAX_MARKS` failed and solved episodes each.
     """
     known = [(one, one.place("start"), one.place("goal")) for one in episodes]
     found = [(one, start[:2], goal[:2]) for one, start, goal in known if start is not None and goal is not None]
@@ -228,7 +228,7 @@ def failure_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
                 axis.plot(*np.stack([starts, goals]).T, color=colour, lw=0.7, alpha=0.3)
                 ends = np.array([end[:2] for one, *_ in own[:MAX_MARKS] if (end := one.place("end")) is not None])
                 axis.plot(*ends.reshape(-1, 2).T, "x", color=INK, ms=4, mew=0.9, alpha=0.6)
-        # Where it is, however far an object rolled away.
+        # The view covers starts and goals, however far an object rolled away.
         axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
         axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]")
         drawn.legend(loc="outside lower left")

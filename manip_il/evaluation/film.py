@@ -1,4 +1,4 @@
-"""Films of episodes, from their recorded states."""
+"""Films of episodes, rendered from their recorded states."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-# First: it chooses the OpenGL that mujoco takes on import.
+# Import this first: it chooses the OpenGL backend before mujoco is imported.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.collect.edits import render_states
 from manip_il.collect.job import RolloutJob
@@ -30,19 +30,19 @@ from manip_il.mdp import Episode
 from manip_il.sim.config import FILM, CameraConfig
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
-FILM_EVERY = 2  # control steps a frame of film
+FILM_EVERY = 2  # control steps per frame of film
 _SIZE = (240, 320)  # height and width [pixels]
 _LOG = logging.getLogger(__name__)
 
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
-    """Return the episode of one seed, the same as in an evaluation of `job`, with its states."""
+    """Return the episode of one seed with its states, identical to that in an evaluation of `job`."""
     return next(replace(job, label="last").run([seed]))
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One episode to film. title, caption: beside the film. stills: number of its frames shown as pictures, too."""
+    """One episode to film. title, caption: shown beside the film. stills: number of frames also shown as pictures."""
 
     job: RolloutJob
     episode: Episode
@@ -51,7 +51,7 @@ class Shot:
     stills: int = 0
 
     def film(self) -> Film:
-        """Return the film, whose poster is its last frame; `RenderError` without off-screen OpenGL."""
+        """Return the film, with its last frame as poster. Raises `RenderError` without off-screen OpenGL."""
         env, fps = self.job.env, self.job.env.control_hz // FILM_EVERY or 1
         states = self.episode.columns[schema.SIM_STATE][::FILM_EVERY]
         camera = next(iter(STOCK[env.robot].cameras if env.robot in STOCK else ()), "front")
@@ -63,7 +63,7 @@ class Shot:
 
 
 def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], str]:
-    """Return every episode as a film; none without OpenGL, and why, which is logged, too."""
+    """Return a film of every episode; without OpenGL, none and the reason, which is also logged."""
     films: list[Film] = []
     try:
         for shot in shots:
@@ -80,7 +80,7 @@ def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], s
 def film_outcomes(
     engine: Engine, job: RolloutJob, result: EvalResult, most: int, folder: Path, progress: Progress
 ) -> tuple[list[Film], str]:
-    """Run up to `most` failures and as many successes of an evaluation again and film them, into `folder`, too.
+    """Rerun up to `most` failures and as many successes of an evaluation and film them; also save them in `folder`.
 
     Returns what `film_shots` does.
     """
@@ -95,16 +95,16 @@ def film_outcomes(
         shot = Shot(job, episodes[one.seed], outcome.capitalize(), caption)
         shots[f"seed_{one.seed}_{outcome}.mp4"] = shot
     films, why = film_shots(shots.values(), progress)
-    for film, name in zip(films, shots, strict=False):  # no films without OpenGL
+    for film, name in zip(films, shots, strict=False):  # without OpenGL there are no films
         folder.mkdir(parents=True, exist_ok=True)
         write_file(folder / name, film.mp4)
     return films, why
 
 
 def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
-    """Return an MP4 that browsers play from its first bytes on: H.264, 4:2:0, index in front.
+    """Return an MP4 that browsers can stream: H.264, 4:2:0, index at the front.
 
-    frames: at least one, uint8 (height, width, 3), both even, as 4:2:0 needs them.
+    frames: at least one, uint8 (height, width, 3), both even, as 4:2:0 requires.
     """
     height, width = frames[0].shape[:2]
     with tempfile.TemporaryDirectory() as folder:  # moving the index to the front needs a file that can be read again
@@ -119,7 +119,7 @@ def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
 
 
 def encode_jpeg(picture: NDArray[np.uint8]) -> bytes:
-    """Return one picture (height, width, 3) as a file."""
+    """Return one picture (height, width, 3) as the bytes of a JPEG file."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="jpeg", optimize=True, quality=85)
     return buffer.getvalue()

@@ -13,15 +13,15 @@ from scipy import optimize, special, stats
 
 from manip_il.errors import UsageError
 
-CONFIDENCE = 0.95  # of every interval, and one minus the level of every test
-_EDGE = 1e-12  # as near to 0 and 1 as a rate's likelihood is computed
+CONFIDENCE = 0.95  # level of every interval, and one minus the significance level of every test
+_EDGE = 1e-12  # smallest distance from 0 and 1 at which a rate's likelihood is computed
 
 
 @dataclass(frozen=True, slots=True)
 class Proportion:
     """`successes` of `n` trials with Wilson's interval; prints as `98.7 % [97.8, 99.3]`.
 
-    sequential: `n` depended on the outcomes so far, so the interval is that of a confidence sequence.
+    sequential: whether `n` depended on the outcomes so far, so that the interval is that of a confidence sequence.
     """
 
     successes: int
@@ -34,7 +34,7 @@ class Proportion:
 
     @classmethod
     def of(cls, outcomes: Sequence[bool], sequential: bool = False) -> Proportion:
-        """Return the proportion of true values."""
+        """Return the proportion of true values in `outcomes`."""
         return cls(sum(map(bool, outcomes)), len(outcomes), sequential)
 
     @property
@@ -48,7 +48,7 @@ class Proportion:
         return (confidence_sequence if self.sequential else wilson_interval)(self.successes, self.n)
 
     def to_json(self) -> dict[str, Any]:
-        """Return rate, interval and number as the files of results hold them."""
+        """Return rate, interval and number of episodes, as in result files."""
         return {"success_rate": self.rate, "interval": list(self.interval), "n_episodes": self.n}
 
     def __str__(self) -> str:
@@ -64,17 +64,17 @@ def format_percent(rate: float) -> str:
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """Return the score interval (low, high) of a binomial proportion (Wilson 1927, J. Am. Stat. Assoc. 22, 209-212)."""
     found = stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
-    # At the ends the formula gives the rate itself, but for rounding.
+    # At the ends the formula gives the rate itself, up to rounding.
     return (0.0 if successes == 0 else float(found.low)), (1.0 if successes == n else float(found.high))
 
 
 def confidence_sequence(successes: int, n: int) -> tuple[float, float]:
-    """Return (low, high) of a binomial proportion that holds at every `n` at once, whatever the rule for stopping.
+    """Return (low, high) of a binomial proportion, valid at every `n` at once, whatever the stopping rule.
 
-    A rate p is left out once the likelihood of the outcomes, averaged over rates drawn from Beta(1/2, 1/2), is
+    A rate p is excluded once the likelihood of the outcomes, averaged over rates drawn from Beta(1/2, 1/2), is
     1 / (1 - confidence) times that of p: under the true rate this ratio is a martingale of mean 1, so with probability
-    `CONFIDENCE` it stays below that (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). Wider than Wilson's,
-    which holds for an `n` fixed in advance.
+    `CONFIDENCE` it never exceeds that (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). Wider than Wilson's
+    interval, which is valid for an `n` fixed in advance.
     """
     failures = n - successes
     mixture = special.betaln(successes + 0.5, failures + 0.5) - special.betaln(0.5, 0.5) + math.log1p(-CONFIDENCE)
@@ -91,10 +91,10 @@ def confidence_sequence(successes: int, n: int) -> tuple[float, float]:
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Return Student's (low, high) of the mean of two or more independent `values`.
+    """Return Student's (low, high) for the mean of two or more independent `values`.
 
-    Student (1908), Biometrika 6, 1-25. With two or three values it is wide: the factor on the standard error is 12.7
-    or 4.3, against 2.0 for many values.
+    Student (1908), Biometrika 6, 1-25. It is wide for two or three values: the factor on the standard error is 12.7
+    or 4.3, compared with 2.0 for many values.
     """
     half = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * stats.sem(values))
     mean = float(np.mean(values))
@@ -103,7 +103,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Two policies, left and right, on the same `n` episodes, counted by who succeeded."""
+    """Two policies, left and right, on the same `n` episodes, counted by which succeeded."""
 
     both: int
     only_left: int
@@ -112,7 +112,7 @@ class Pairs:
 
     @classmethod
     def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> Pairs:
-        """Count the outcomes (left, right) of every episode, at least one."""
+        """Count the outcomes (left, right) of episodes, at least one."""
         pairs = Counter(outcomes)
         return cls(pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])
 
@@ -131,13 +131,13 @@ class Pairs:
         """(low, high) of `difference`, inside [-1, 1].
 
         Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: Wilson's limits of both rates, squared and
-        added, less their correlation with a continuity correction.
+        added, minus their correlation with a continuity correction.
         """
         n, right, left = self.n, self.both + self.only_right, self.both + self.only_left
         (l1, u1), (l2, u2) = wilson_interval(right, n), wilson_interval(left, n)
         p1, p2 = right / n, left / n
         cross = self.both * self.neither - self.only_right * self.only_left
-        if cross > 0:  # the correction draws a positive correlation towards none, never past it
+        if cross > 0:  # the correction shrinks a positive correlation, but not below zero
             cross = max(cross - n / 2, 0.0)
         margins = math.sqrt(right * (n - right) * left * (n - left))
         phi = cross / margins if margins else 0.0
@@ -150,24 +150,24 @@ class Pairs:
 
 
 def sign_flip_exact(differences: Sequence[int]) -> float:
-    """Return two-sided p that every difference, one a test episode, was as likely to have the other sign.
+    """Return the two-sided p of the hypothesis that each difference, one per test episode, could have had either sign.
 
-    differences: right's successes less left's in that episode, summed over training seeds. The seeds' signs are flipped
-    together, so that training seeds which share an episode need not be independent in it. With one training seed this
-    is McNemar's exact test; in general Fisher's randomisation test (The Design of Experiments, 1935, section 21).
+    differences: right's successes minus left's in an episode, summed over training seeds. The seeds' signs are flipped
+    together, so training seeds that share an episode need not be independent in it. With one training seed this is
+    McNemar's exact test; in general it is Fisher's randomisation test (The Design of Experiments, 1935, section 21).
     """
-    ways = np.array([1], dtype=object)  # of the sums -total, -total + 2, ..., total of the signed differences
+    ways = np.array([1], dtype=object)  # counts of the sums -total, -total + 2, ..., total of signed differences
     for size, count in Counter(abs(d) for d in differences if d).items():
         flips = np.zeros(size * count + 1, dtype=object)
         flips[::size] = [math.comb(count, k) for k in range(count + 1)]
         ways = np.convolve(ways, flips)
     total, observed = len(ways) - 1, abs(sum(differences))
-    # Whole numbers divided once: exact at any count.
+    # Integers are divided only once, so the result is exact for any count.
     return sum(count for place, count in enumerate(ways) if abs(2 * place - total) >= observed) / sum(ways)
 
 
 def format_p(p: float) -> str:
-    """Return `p = 0.031`, or `p < 0.001` for what is smaller."""
+    """Return `p = 0.031`, or `p < 0.001` for smaller values."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
 
 

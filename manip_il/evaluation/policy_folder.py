@@ -1,4 +1,4 @@
-"""Where a policy lies: in the folder itself, in a checkpoint, or in a run."""
+"""Find a policy: in the folder itself, in a checkpoint, or in a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
 
 
 def find_policy(path: Path) -> Path:
-    """Return the `pretrained_model` folder in that folder, a checkpoint or a run: the best one, else the newest.
+    """Return the `pretrained_model` folder of a folder, checkpoint or run: the best one, else the newest.
 
     Raises `UsageError` if there is none.
     """
@@ -29,13 +29,13 @@ def find_policy(path: Path) -> Path:
 
 
 def require_source(path: Path) -> None:
-    """Raise `UsageError` if nothing is at `path` that could be compared."""
+    """Raise `UsageError` if nothing that can be compared is at `path`."""
     if not path.exists():
         raise UsageError(f"{path} does not exist; {EXPECTED}{hub_hint(path)}")
 
 
 def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull a path that looks like a repo on the Hub; nothing for others. kind: `datasets/`."""
+    """Return how to pull a path that looks like a repo on the Hub; empty for other paths. kind: `datasets/`."""
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""
     return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"

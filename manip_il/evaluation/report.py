@@ -1,4 +1,4 @@
-"""`report.html`: one file that needs no network and no scripts, rendered from the template beside this module."""
+"""`report.html`: one file without network access or scripts, rendered from the template beside this module."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _INTERVAL = re.compile(r"(.*?) ([\[(].*)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Still:
-    """A picture with its caption. media_type: such as `image/jpeg`."""
+    """A picture with its caption. media_type: for example `image/jpeg`."""
 
     caption: str
     content: bytes
@@ -34,7 +34,7 @@ class Still:
 class Film:
     """One episode as an MP4 (H.264). title: in bold before the caption. poster: a JPEG shown until it plays.
 
-    stills: some of its frames, for where no film plays, each with its time as a caption.
+    stills: some of its frames, for viewers that play no film, each with its time as caption.
     """
 
     title: str
@@ -46,7 +46,7 @@ class Film:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report. Empty parts are left out. formulas: one a line; notes: paragraphs under the tables."""
+    """A part of a report. Empty parts are omitted. formulas: one per line; notes: paragraphs below the tables."""
 
     heading: str
     lead: tuple[str, ...] = ()
@@ -60,9 +60,9 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """A page: the verdict, which is the first sentence with its numbers, further facts, sections, how it was made.
+    """A page: the verdict (a first sentence with its numbers), further facts, sections, and how it was made.
 
-    command: that made it. timings: by name [s]. config, fingerprint: nested mappings.
+    command: the command that made it. timings: by name [s]. config, fingerprint: nested mappings.
     """
 
     title: str
@@ -79,13 +79,13 @@ class Report:
         return _environment().get_template("report.html.j2").render(report=self)
 
     def write(self, path: Path) -> None:
-        """Write the page to `path`, whole or not at all, creating its folder."""
+        """Write the page to `path` atomically, creating its folder."""
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, self.render().encode())
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Return a nested mapping as `policy.hidden -> 256`: the names that the command line takes."""
+    """Return a nested mapping flattened to `policy.hidden -> 256`, with the command line's names."""
     flat: dict[str, str] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:
@@ -104,13 +104,13 @@ def _plain(value: object) -> str:
 
 
 def _prose(words: str) -> Markup:
-    """Words in which a number keeps its unit, and a comparison its sign, on one line; paths break after a slash."""
+    """Keep numbers with their units, and comparisons with their signs, on one line; let paths break after a slash."""
     kept = re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", words)
     return Markup(re.sub(r"(?<=\w)/(?=\w)", "/<wbr>", escape(kept)))
 
 
 def _split_interval(cell: str) -> tuple[str, str]:
-    """A table cell as its number, and what follows in brackets; empty if nothing does."""
+    """Return a table cell as its number and the bracketed text after it, empty if there is none."""
     match = _INTERVAL.fullmatch(cell)
     return (match.group(1), match.group(2)) if match else (cell, "")
 

@@ -1,4 +1,4 @@
-"""`eval.json`: one evaluation of one policy, reading it back, merging parts of it and comparing two."""
+"""`eval.json`: one evaluation of one policy; reading, merging and comparing evaluations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from manip_il.tasks.config import EnvConfig
 
 FILE_NAME = "eval.json"
-# Of every episode, in the order of `EpisodeResult`.
+# keys of every episode, in the order of `EpisodeResult`
 _KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
 
 
@@ -31,7 +31,7 @@ _KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "re
 class EpisodeResult:
     """One episode: `success` at some time, `success_at_end` at the last frame, `ret` the sum of rewards.
 
-    steps: control steps until the episode ended. phase_at_end: the expert's name for the last state.
+    steps: control steps until the episode ended. phase_at_end: the expert's name for the phase of the last state.
     detail: further keys of the JSON object.
     """
 
@@ -45,12 +45,12 @@ class EpisodeResult:
 
     @property
     def condition(self) -> str:
-        """The condition's name; empty if none is given."""
+        """The condition's name; empty if there is none."""
         name = self.detail.get("condition")
         return name if isinstance(name, str) else ""
 
     def place(self, when: Literal["start", "end", "goal"]) -> list[float] | None:
-        """Return where the object, or the hand if the task has none, was or was to go, or None if nothing says it.
+        """Return the start, end or goal position of the object, or of the hand if the task has none; None if unknown.
 
         x away from the robot, y to its left, z above the table's top [m].
         """
@@ -58,14 +58,14 @@ class EpisodeResult:
         return found.get("object", found.get("hand")) if isinstance(found, Mapping) else found
 
     def to_json(self) -> dict[str, Any]:
-        """Return the episode as `eval.json` holds it."""
+        """Return the episode as stored in `eval.json`."""
         values = (self.seed, self.success, self.success_at_end, self.steps, self.ret, self.phase_at_end)
         detail = {key: value for key, value in self.detail.items() if key not in _KEYS}
         return dict(zip(_KEYS, values, strict=True)) | detail
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
-        """Return the inverse of `to_json`; `KeyError` or `TypeError` if a value is missing or of another kind."""
+        """Return the inverse of `to_json`. Raises `KeyError` or `TypeError` for a value that is missing or invalid."""
         known = {"success_at_end": data["success"], "phase_at_end": ""} | {
             key: data[key] for key in data if key in _KEYS
         }
@@ -75,16 +75,16 @@ class EpisodeResult:
 
 @dataclass(frozen=True, slots=True)
 class EvalSettings:
-    """The settings that two evaluations must share to be compared, and that repeating an episode needs.
+    """The settings that two evaluations must share to be comparable, and that reproduce an episode.
 
     horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
-    of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
-    if it goes on to the horizon. object: shape and size of what is grasped, empty for the task's own.
+    of the conditions, which episodes cycle through. hold: control steps after success at which an episode ends, None
+    if it continues to the horizon. object: shape and size of the object to grasp, empty for the task's default.
     """
 
     horizon: int
     tolerance: float
-    control_hz: int = 20  # and five steps, in files without them
+    control_hz: int = 20  # this and the next: values for files without them
     success_steps: int = 5
     suite: str = NOMINAL.name
     conditions: tuple[Condition, ...] = (NOMINAL,)
@@ -93,13 +93,13 @@ class EvalSettings:
 
     @classmethod
     def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
-        """Return those of a job whose conditions are called `suite`."""
+        """Return the settings of a job whose conditions are called `suite`."""
         env, conditions = job.env, job.conditions or (NOMINAL,)
         steps, hz = env.success_steps, env.control_hz
         return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, stored(env.object))
 
     def env(self, robot: str, task: str) -> EnvConfig:
-        """Return the environment that was evaluated in."""
+        """Return the environment of the evaluation."""
         limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.horizon}
         return make_config(robot, task, self.control_hz, **limits, object=self.object)
 
@@ -115,7 +115,7 @@ class EvalSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
-        """Return the inverse of `to_json`; raises as `EpisodeResult.from_json`. Other keys are ignored."""
+        """Return the inverse of `to_json`; raises what `EpisodeResult.from_json` does. Other keys are ignored."""
         known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
         named = [dict(one) for one in known.pop("conditions", [NOMINAL.to_json()])]
         return cls(**known, conditions=tuple(Condition(**one) for one in named))
@@ -123,12 +123,12 @@ class EvalSettings:
 
 @dataclass(frozen=True)
 class EvalResult:
-    """One policy on one robot and task: every episode, and what follows from them.
+    """One policy on one robot and task: every episode, and the statistics derived from them.
 
-    policy_sha256: of its files, empty where it has none. until_width: the width of the interval at which the evaluation
-    was to stop, None where the number of episodes was fixed in advance; intervals then hold at any stop.
+    policy_sha256: hash of its files, empty if it has none. until_width: the interval width at which the evaluation was
+    to stop, None if the number of episodes was fixed in advance; intervals then hold whenever it stops.
 
-    Raises `ManipError` on construction where there is no episode or a seed comes twice.
+    Raises `ManipError` on construction if there is no episode or a seed occurs twice.
     """
 
     policy: str
@@ -157,12 +157,12 @@ class EvalResult:
 
     @property
     def success_at_end(self) -> Proportion:
-        """Episodes that stood at the goal when they ended."""
+        """Episodes that were at the goal when they ended."""
         return Proportion.of([episode.success_at_end for episode in self.episodes], self.until_width is not None)
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
-        """Each condition's episodes, in the settings' order; under an empty name those without a condition."""
+        """The episodes of each condition, in the settings' order; those without a condition under an empty name."""
         parts: dict[str, list[EpisodeResult]] = {condition.name: [] for condition in self.settings.conditions}
         for episode in self.episodes:
             parts.setdefault(episode.condition, []).append(episode)
@@ -170,16 +170,16 @@ class EvalResult:
 
     @property
     def steps_to_success(self) -> float | None:
-        """Mean over the episodes that succeeded, until they first did [control steps]; None where none records it."""
+        """Mean control steps until the first success, over successful episodes; None if none records it."""
         steps = [episode.detail.get("steps_to_success") for episode in self.episodes if episode.success]
         known = [float(count) for count in steps if count is not None]
         return sum(known) / len(known) if known else None
 
     @property
     def failures(self) -> dict[str, int]:
-        """Failed episodes by the phase they ended in, most frequent first."""
+        """Failed episodes by the phase that they ended in, most frequent first."""
         phases = Counter(sorted(episode.phase_at_end for episode in self.episodes if not episode.success))
-        return dict(phases.most_common())  # of equals the first by name
+        return dict(phases.most_common())  # ties keep the order of names
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `eval.json`."""
@@ -204,14 +204,14 @@ class EvalResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalResult:
-        """Return the inverse of `to_json`: rates and intervals are computed anew from the episodes.
+        """Return the inverse of `to_json`: rates and intervals are recomputed from the episodes.
 
-        Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or of another kind.
+        Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
         return cls(
             policy=data["policy"],
             robot=str(data["robot"]),
-            # No path, which would be code to run. A reward was a setting of its own once.
+            # Paths are refused, as they would run code. The reward was once a separate setting.
             task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
@@ -221,14 +221,14 @@ class EvalResult:
         )
 
     def write(self, path: Path) -> None:
-        """Write `path` whole or not at all, creating its folder."""
+        """Write `path` atomically, creating its folder."""
         write_json(path, self.to_json())
 
     @classmethod
     def read(cls, path: Path) -> EvalResult:
-        """Read what `write` wrote; `ManipError` for a file that is missing, cut short or not of this kind.
+        """Read what `write` wrote. Raises `ManipError` for a file that is missing, truncated or of another kind.
 
-        `path` may be the folder that holds `eval.json`.
+        `path` may be the folder that contains `eval.json`.
         """
         path = path / FILE_NAME if path.is_dir() else path
         data = checks.read_json(path, f"an {FILE_NAME} of manip-il eval")
@@ -242,12 +242,12 @@ class EvalResult:
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     """Return all episodes of the parts (name -> part), in the order of their seeds.
 
-    Raises `MismatchError` if they are not of one policy in one world, and `ManipError` for a seed that two of them ran,
-    or for a part whose number of episodes depended on its outcomes.
+    Raises `MismatchError` if policy or environment differ, and `ManipError` for a seed that two of them ran, or for a
+    part whose number of episodes depended on its outcomes.
     """
     (first, one), *others = parts.items()
     for name, other in others:
-        known = one.policy_sha256 or other.policy_sha256  # else the names alone say whether the policy is the same
+        known = one.policy_sha256 or other.policy_sha256  # otherwise only the names show whether the policy is the same
         require_equal(first, one, name, other, "policy_sha256" if known else "policy")
     if stopped := next((name for name, part in parts.items() if part.until_width is not None), None):
         raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes merge")
@@ -256,13 +256,13 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
 
 
 def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -> None:
-    """Write `content` whole or not at all, creating the folder."""
+    """Write `content` atomically, creating the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
 def require_equal(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
-    """Raise `MismatchError` naming the first field in which two differ: robot, task, a setting, or one of `more`."""
+    """Raise `MismatchError` naming the first field that differs: one of `more`, robot, task, or a setting."""
     sides = [(name, getattr(one, name), getattr(other, name)) for name in (*more, "robot", "task")]
     own = [field.name for field in fields(EvalSettings)]
     sides += [(name, getattr(one.settings, name), getattr(other.settings, name)) for name in own]

@@ -1,4 +1,4 @@
-"""What an arm of one's own can do before anything is recorded: gripper, reach, starts, the expert at every task."""
+"""Checks of a custom arm before anything is recorded: gripper, reach, start states, and the expert on every task."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
 
 FILE_NAME = "check.json"
-SOLVES = 0.9  # share of clean episodes that the expert solves, of a task that can be done
-STARTS = 50  # of each task that are drawn
-ENOUGH = 0.95  # share of a workspace that a robot reaches, of one that suits it
-LOW = 0.03  # height of what lies on the table [m]
-_ROOM = 0.13  # of the map around the workspace [m]
+SOLVES = 0.9  # share of clean episodes that the expert must solve if a task is to count as possible
+STARTS = 50  # number of starts drawn per task
+ENOUGH = 0.95  # share of the workspace that a suitable robot reaches
+LOW = 0.03  # height of objects on the table [m]
+_ROOM = 0.13  # margin of the map around the workspace [m]
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 
 
 @dataclass(frozen=True)
 class TaskCheck:
-    """One task with a robot.
+    """Result of one task with a robot.
 
-    starts: how many found a place; refused: why there is no scene, or why the next start found none. clean, noisy:
-    evaluations of the expert, as it is and with a tenth of its actions random; None if none ran.
+    starts: number drawn before one failed; refused: why there is no scene, or why the next start failed. clean, noisy:
+    evaluations of the expert, as it is and with a tenth of its actions random; None if not run.
     """
 
     name: str
@@ -59,7 +59,7 @@ class TaskCheck:
 
     @property
     def done(self) -> bool:
-        """Whether the robot can do it."""
+        """Whether the robot can do the task."""
         return not self.refused and (self.clean is None or self.clean.success.rate >= SOLVES)
 
     def to_json(self) -> dict[str, Any]:
@@ -71,10 +71,10 @@ class TaskCheck:
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """A robot as it was measured. name: as it was given.
+    """Measurements of a robot. name: as given by the user.
 
-    opening: the widest of the gripper [m]. overlaps: pairs of links at home, and in any posture. table: share of points
-    on the table of the workspace that the hand, pointing down, gets to.
+    opening: largest opening of the gripper [m]. overlaps: pairs of links that overlap at home and in every posture.
+    table: share of points on the table of the workspace that the hand reaches while pointing down.
     """
 
     name: str
@@ -86,7 +86,7 @@ class RobotCheck:
 
     @property
     def failed(self) -> tuple[TaskCheck, ...]:
-        """Tasks that cannot be done."""
+        """Tasks that the robot cannot do."""
         return tuple(task for task in self.tasks if not task.done)
 
     def to_json(self) -> dict[str, Any]:
@@ -104,7 +104,7 @@ class RobotCheck:
 def check_robot(
     name: str, tasks: Sequence[str], episodes: int, engine: Engine, on_result: Callable[[EpisodeResult], object]
 ) -> RobotCheck:
-    """Measure a robot, by its name or YAML, with tasks. episodes: of each task, clean and as many with random actions.
+    """Measure a robot, given by name or YAML, on tasks. episodes: per task, without and again with random actions.
 
     on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
     """
@@ -130,7 +130,7 @@ def check_robot(
 
 
 def check_starts(name: str, task: str) -> TaskCheck:
-    """Draw a task's starts with a robot as episodes do, until one finds no place."""
+    """Draw a task's starts with a robot, as for episodes, until one has no valid placement."""
     the_task, starts = get_task(task), 0
     try:
         world = World(scene_of(name, task))
@@ -144,7 +144,7 @@ def check_starts(name: str, task: str) -> TaskCheck:
 
 
 def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
-    """Whether the hand, pointing down, gets to the points of a square on the table, n x n, in rows along x."""
+    """Return whether the hand, pointing down, reaches each point of an n x n grid on the table, in rows along x."""
     reach, (x, y), steps = reach_of(robot), robot.workspace.centre, np.linspace(-half, half, n).tolist()
     return [[reach.has((x + dx, y + dy, LOW)) for dx in steps] for dy in steps]
 
@@ -152,7 +152,7 @@ def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
 def check_report(
     check: RobotCheck, pictures: Sequence[Still], no_pictures: str, command: str, config: Mapping[str, Any]
 ) -> Report:
-    """Return the page of a check. no_pictures: why there are none."""
+    """Return the HTML report of a check. no_pictures: the reason if there are none."""
     lead = () if pictures else (f"No pictures: {no_pictures}",)
     tasks = (
         f"Starts: of {STARTS} that are drawn, how many find a place within reach before one does not. Random actions: "
@@ -178,7 +178,7 @@ def check_report(
 
 
 def verdict(check: RobotCheck) -> str:
-    """Return in a sentence which tasks a robot can do."""
+    """Return a sentence on which tasks a robot can do."""
     count, cannot = len(check.tasks), ", ".join(task.name for task in check.failed)
     asked = any(task.clean is not None for task in check.tasks)
     can, end = ("can do", "") if asked else ("has starts for", "; the expert was not asked")
@@ -191,7 +191,7 @@ def verdict(check: RobotCheck) -> str:
 
 
 def task_table(check: RobotCheck) -> Table:
-    """Return the tasks: starts, and the expert's success, clean and with random actions."""
+    """Return the table of tasks: starts, and the expert's success without and with random actions."""
     columns = ("task", "starts", "expert [95 % interval]", "with random actions")
     rows: list[tuple[str, ...]] = []
     for task in check.tasks:
@@ -201,7 +201,7 @@ def task_table(check: RobotCheck) -> Table:
 
 
 def home_line(check: RobotCheck) -> str:
-    """Return in sentences how wide the gripper opens, and whether the robot is free at home."""
+    """Return sentences on how wide the gripper opens, and whether the robot is free of overlaps at home."""
     opens = f"The gripper opens to {1000 * check.opening:.1f} mm."
     if not check.overlaps:
         return f"{opens} At home no part of the robot touches another or the table."
@@ -210,7 +210,7 @@ def home_line(check: RobotCheck) -> str:
 
 
 def _reach_figure(robot: Robot) -> Figure:
-    """Draw where the hand, pointing down, gets to on the table, and the workspace."""
+    """Draw the region of the table that the hand, pointing down, reaches, and the workspace."""
     (x, y), half = robot.workspace.centre, robot.workspace.half_width
     wide = half + _ROOM
     extent = (x - wide, x + wide, y - wide, y + wide)
@@ -224,7 +224,7 @@ def _reach_figure(robot: Robot) -> Figure:
 
 
 def advice(check: RobotCheck) -> tuple[str, ...]:
-    """Return what to change in the robot's YAML, the arm's first, then for each task that cannot be done."""
+    """Return what to change in the robot's YAML: first for the arm, then for each task that it cannot do."""
     lines, space = list[str](), check.robot.workspace
     if check.table < ENOUGH:
         x, y = space.centre
@@ -234,7 +234,7 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
             "nowhere, turn the gripper on the hand by gripper.quaternion."
         )
     for task in check.failed:
-        if task.refused and check.table:  # else it is said of the whole workspace
+        if task.refused and check.table:  # otherwise the advice on the whole workspace covers it
             lines.append(f"{task.name}: {task.refused}.")
         elif task.clean is not None:
             success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
@@ -257,7 +257,7 @@ def looks(name: str) -> tuple[Still, ...]:
     (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
     corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]
     points = np.vstack([data.xpos[1:], corners])
-    points = points[np.abs(points).max(axis=1) < 3]  # without what was put out of sight
+    points = points[np.abs(points).max(axis=1) < 3]  # without objects that are parked out of sight
     low, high = points.min(axis=0), points.max(axis=0)
     distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
     views: tuple[tuple[str | Overview, str], ...] = (
@@ -265,7 +265,7 @@ def looks(name: str) -> tuple[Still, ...]:
         ("front", "what camera front sees"),
         ("wrist", "what camera wrist sees"),
     )
-    data.mocap_pos[:, 2] = -9.0  # goals: out of sight
+    data.mocap_pos[:, 2] = -9.0  # move goals out of sight
     return tuple(
         Still(words, encode_jpeg(framed_picture(scene, data, view, (480, 640), FILM))) for view, words in views
     )

@@ -1,4 +1,4 @@
-"""The rounds of a run and their costs, read from `metrics.jsonl`, and the choice of one for a comparison."""
+"""The rounds of a run and their costs, read from `metrics.jsonl`, and the choice of a round for a comparison."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ METRICS_FILE = "metrics.jsonl"
 class Round:
     """One round of DAgger, or one validated iteration of reinforcement learning, and the run's costs up to its end.
 
-    steps: simulated control steps. seconds: of collecting and fitting; validating is no part of the method.
+    steps: simulated control steps. seconds: for collecting and fitting; validation is not part of the method.
     """
 
     round: int
@@ -35,7 +35,7 @@ class Round:
         return getattr(self, cost)
 
     def after(self, start: Round, *, fitted: float) -> Round:
-        """Return the round as of a run that began with what another's round 0 made. fitted: that took besides [s]."""
+        """Return the round plus the costs of `start`, the round that the run began from. fitted: seconds of that."""
         sums = {name: getattr(self, name) + getattr(start, name) for name in ("labels", "episodes", "steps")}
         return replace(self, **sums, seconds=self.seconds + fitted)
 
@@ -49,9 +49,9 @@ History = tuple[Round, ...]
 
 
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
-    """Return a run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` if they are not a run's.
+    """Return a run's rounds in order from the lines of its `metrics.jsonl`. Raises `ManipError` for other lines.
 
-    Of `manip-il rl gail`, `airl` and `ppo` those iterations are rounds that were validated.
+    For `manip-il rl gail`, `airl` and `ppo`, the rounds are the iterations that were validated.
     """
     unit: Literal["round", "iteration"] = "iteration" if records and "iteration" in records[0] else "round"
     rounds: list[Round] = []
@@ -62,7 +62,7 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
             seconds += record["seconds"]["collect"] + record["seconds"]["fit"]
             if record["validation_success"] is None:
                 continue
-            labels = record["labels"] if unit == "round" else 0  # reinforcement learning asks for none
+            labels = record["labels"] if unit == "round" else 0  # reinforcement learning uses none
             validation = Proportion(round(record["validation_success"] * n), n)
             steps = record.get("steps", labels)
             rounds.append(Round(record[unit], labels, record["episodes"], steps, seconds, validation, unit))
@@ -74,7 +74,7 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
 
 
 def has_unlabelled_steps(rounds: History) -> bool:
-    """Return whether steps were simulated without a label, so that they are a cost of their own."""
+    """Return whether some steps were simulated without a label, so that steps are a separate cost."""
     return any(one.steps != one.labels for one in rounds)
 
 
@@ -82,8 +82,8 @@ def has_unlabelled_steps(rounds: History) -> bool:
 class Rule:
     """The rule that chooses the round of each run, fixed before any test episode.
 
-    checkpoint: the last round, or the one with the highest validation success (of equals the later). at: rounds count
-    up to `limit` of this cost, the most that every run reached; with `end` all do.
+    checkpoint: the last round, or the one with the highest validation success (the later one if equal). at: only rounds
+    up to `limit` of this cost count, the largest amount that every run reached; with `end` all count.
     """
 
     checkpoint: Literal["best", "last"] = "best"
@@ -91,7 +91,7 @@ class Rule:
     limit: float | None = None
 
     def limited(self, histories: Mapping[str, History]) -> Rule:
-        """Return the rule with the limit of these runs, name -> rounds. Raises `UsageError` if one has no rounds."""
+        """Return the rule with the limit for these runs, name -> rounds. Raises `UsageError` if one has no rounds."""
         if self.at == "end":
             return self
         if name := next((name for name, rounds in histories.items() if not rounds), None):
@@ -99,7 +99,7 @@ class Rule:
         return replace(self, limit=min(rounds[-1].amount(self.at) for rounds in histories.values()))
 
     def select(self, rounds: History, name: str) -> Round:
-        """Return the round of one run that the rule chooses; `UsageError` if none ended within the limit."""
+        """Return the round of a run that the rule chooses. Raises `UsageError` if none ended within the limit."""
         if self.at != "end" and self.limit is not None:
             first = rounds[0].amount(self.at)
             rounds = tuple(one for one in rounds if one.amount(self.at) <= self.limit)
@@ -112,7 +112,7 @@ class Rule:
 
     @property
     def fact(self) -> str:
-        """A sentence on the rule."""
+        """A sentence that states the rule."""
         which = "last round" if self.checkpoint == "last" else "round that was best on validation"
         words = f"Of every run the {which}, chosen before the test"
         if self.at == "end" or self.limit is None:

@@ -1,4 +1,4 @@
-"""Evaluate policies on given seeds: what is finished is kept at once, and any episode can be run again alone."""
+"""Evaluate policies on given seeds: finished episodes are saved at once, and any episode can be rerun alone."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from manip_il.tasks.stock.envs import described_stock
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 _LOG = logging.getLogger(__name__)
-HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
-CHECK_EVERY = 100  # episodes after which the width of the interval is checked
+HOLD = 10  # control steps that an episode continues after success, to see whether it lasts
+CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
-FOLDER = "evaluations"  # of several policies
+FOLDER = "evaluations"  # folder for the evaluations of several policies
 _world = lru_cache(SCENES_KEPT)(World)
 
 
 class Progress(Protocol):
-    """Interface of what shows work under way, a stage of so many episodes or steps at a time."""
+    """Interface for showing progress, in stages of a given number of episodes or steps."""
 
     def start(self, description: str, total: int) -> None:
         """Begin a stage."""
@@ -70,10 +70,9 @@ def evaluate(
 ) -> EvalResult:
     """Run `job` on every seed, to the horizon unless it has a `hold`; episodes are in the order of `seeds`.
 
-    suite: name of the job's conditions. done: results by seed of an earlier run. until_width: stop once the interval,
-    high less low, is as narrow; checked after every `CHECK_EVERY` seeds in their order, whatever the workers.
-    on_result: called with every result as its episode ends. A seed that repeatedly kills its worker is left out, with a
-    warning.
+    suite: name of the job's conditions. done: seed -> result of an earlier run. until_width: stop once the width of the
+    interval is at most this; checked after every `CHECK_EVERY` seeds in order, independently of the workers. on_result:
+    called with every result as its episode ends. A seed that repeatedly kills its worker is skipped with a warning.
     """
     results: dict[int, EpisodeResult] = {}
     known = done or {}
@@ -103,7 +102,7 @@ def evaluate(
 
 
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
-    """Return how long after success an evaluation's episodes end; stock environments run to their own end."""
+    """Return how long after success an evaluation's episodes end; stock environments define their own end."""
     if env.robot not in STOCK:
         return hold
     return 0 if STOCK[env.robot].ends_solved else None
@@ -117,7 +116,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     start, end = (positions(job.env, states[row]) for row in (0, -1))
     drawn = draw(job.conditions, episode.seed, job.env.object)
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
-    if phase == 0 and episode.success_at_end:  # nobody asks the expert about a state in which the task is solved
+    if phase == 0 and episode.success_at_end:  # the expert is not queried in a solved state
         phase = -1
     return EpisodeResult(
         seed=episode.seed,
@@ -140,7 +139,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
 def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
     """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects, and `goal`.
 
-    The first object that the episode is about is called `object`; `goal` is where it, or the hand, is to go.
+    The first object that the episode is about is named `object`; `goal` is the target of the object or of the hand.
     """
     state = State.from_vector(sim_state)
     if env.robot in STOCK:
@@ -168,7 +167,7 @@ def measure(
     suite: str = NOMINAL.name,
     until_width: float | None = None,
 ) -> EvalResult:
-    """Return the evaluation of a job that lies in `folder`, and run what is missing; every episode is kept as it ends.
+    """Return a job's evaluation in `folder`, after running what is missing; every episode is saved as it ends.
 
     Raises what `finished_episodes` raises.
     """
@@ -187,10 +186,10 @@ def measure(
 
 
 def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, EpisodeResult]:
-    """Return seed -> result of the episodes in `folder`; begin their file, whose first line is what all have in common.
+    """Return seed -> result of the episodes in `folder`; create their file, whose first line holds their common data.
 
-    Raises `MismatchError` if they are those of another policy, environment or version of this program, `ManipError` for
-    a line that is not an episode.
+    Raises `MismatchError` if they are from another policy, environment or version of this program, `ManipError` for a
+    line that is not an episode.
     """
     path = folder / EPISODES_FILE
     common: dict[str, Any] = {
@@ -216,7 +215,7 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
 
 
 def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
-    """Return in what two runs of one episode differ; `MismatchError` if they had other conditions."""
+    """Return the differences between two runs of one episode. Raises `MismatchError` if their conditions differ."""
     now = dict(after.detail["drawn"])
     if before.detail.get("drawn", {}) != now:
         raise MismatchError("what is drawn for the episode", "then", before.detail.get("drawn"), "now", now)
@@ -227,7 +226,7 @@ def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]
 
 @dataclass(frozen=True)
 class Trial:
-    """Environment, seeds and conditions of a test; trust: whether models that checkpoints name may be loaded."""
+    """Environment, seeds and conditions of a test; trust: whether to load models that checkpoints name."""
 
     env: EnvConfig
     seeds: range
@@ -237,15 +236,15 @@ class Trial:
 
     @classmethod
     def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path] = (), trust: bool = False) -> Trial:
-        """Make one of a suite's conditions, without those of cameras if none of the policies uses any."""
+        """Return a trial under a suite's conditions, without those on cameras if no policy uses any."""
         sees = any(policy_cameras(policy) is not None for policy in policies)
         return cls(env, seeds, suite, suite_conditions(suite, env, sees=sees), trust)
 
     def job(self, policy: Path | None) -> RolloutJob:
-        """Return the rollouts of one policy; None: of the expert."""
+        """Return the rollouts of one policy, or of the expert if it is None."""
         driver = ExpertDriver() if policy is None else PolicyDriver((policy,), trust=self.trust)
         return RolloutJob(self.env, driver, episode_hold(self.env), label="last", conditions=self.conditions)
 
     def measure(self, policy: Path | None, name: str, folder: Path, engine: Engine, progress: Progress) -> EvalResult:
-        """Return the evaluation of a policy, or of the expert, in `folder`, see `measure`."""
+        """Return the evaluation of a policy, or of the expert, in `folder`; see the function `measure`."""
         return measure(engine, self.job(policy), self.seeds, name, folder, progress, suite=self.suite)

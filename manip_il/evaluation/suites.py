@@ -1,4 +1,4 @@
-"""Suites of conditions that evaluations run under, and what of a condition has an effect on a task."""
+"""Suites of conditions for evaluations, and the parts of a condition that affect a task."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _YAML = (".yaml", ".yml")
 
 
 def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
-    """Return the conditions of a suite, in the order in which seeds take turns.
+    """Return the conditions of a suite, in the order in which seeds cycle through them.
 
-    Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera; with
-    sizes that the task can take. Raises `UnknownName` for a suite, `UsageError` for a file that is not one or if
-    nothing is left.
+    Omits those without effect: on objects if the task has none, on cameras if `sees` is false; limits sizes to those
+    that the task allows. Raises `UnknownName` for an unknown suite, `UsageError` for an invalid file or if nothing is
+    left.
     """
     asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
     left = [one for condition in asked if (one := _for_task(condition, env, sees=sees)) is not None]
@@ -40,9 +40,9 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
 
 
 def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
-    """Return what `--vary` names as one condition, from which every episode draws; none for no names.
+    """Return one condition merged from the names in `--vary`, which every episode samples; empty without names.
 
-    Raises `UnknownName` for another name, `UsageError` for what is no YAML of ranges or changes nothing here.
+    Raises `UnknownName` for another name, `UsageError` for a file without a YAML of ranges or without effect here.
     """
     if not names:
         return ()
@@ -55,7 +55,7 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
 
 
 def require_suite(suite: str) -> None:
-    """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; nothing is read."""
+    """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; reads no file."""
     if suite.endswith(_YAML):
         if not Path(suite).is_file():
             raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")
@@ -64,7 +64,7 @@ def require_suite(suite: str) -> None:
 
 
 def read_condition(name: str) -> Condition:
-    """Return a condition by its name, or a YAML of ranges by its path; `UsageError` names what is wrong with it."""
+    """Return a condition by name, or from a YAML of ranges by path. Raises a `UsageError` that names what is wrong."""
     require_suite(name)
     path = Path(name) if name.endswith(_YAML) else _suites_folder() / f"{name}.yaml"
     tree = checks.read_yaml(path, "a YAML of ranges")
@@ -74,11 +74,11 @@ def read_condition(name: str) -> Condition:
 
 
 def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
-    """What of a condition has an effect in an environment, see `Condition.for_world`."""
+    """Return the part of a condition that affects an environment, see `Condition.for_world`."""
     from manip_il.sim.task import TakesShape
-    from manip_il.tasks.table import get_task  # here, as a wrong name needs no simulator
+    from manip_il.tasks.table import get_task  # imported here, as a wrong name is found without the simulator
 
-    if env.robot in STOCK:  # which takes none
+    if env.robot in STOCK:  # stock environments take no ranges
         return None if condition.ranges else condition
     task = get_task(env.task, env.object)
     if "shape" in condition.ranges and isinstance(task, TakesShape) and not draws_shape(env.object):
@@ -89,7 +89,7 @@ def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition 
 
 
 def _suites_folder() -> Path:
-    """The suites' folder: beside the package in a checkout, else where an installation puts data."""
+    """Return the folder of suites: beside the package in a checkout, else in the installation's data folder."""
     places = (Path(manip_il.__file__).parents[1] / "configs", Path(sys.prefix) / "share" / "manip_il")
     for place in places:
         if (place / "suites" / "nominal.yaml").is_file():

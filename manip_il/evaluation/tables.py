@@ -1,4 +1,4 @@
-"""Tables of text, for the terminal and reports."""
+"""Tables of text, for the terminal and for reports."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from manip_il.errors import printable
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.evaluation.results import EvalResult
 
-INTERVAL = f"[{CONFIDENCE:.0%} interval]".replace("%", " %")  # in a column's head
-# Okabe and Ito's colours, told apart with every kind of colour blindness.
+INTERVAL = f"[{CONFIDENCE:.0%} interval]".replace("%", " %")  # part of a column's header
+# Okabe and Ito's colours, distinguishable with every kind of colour blindness
 DAGGER, CLONING, EXPERT, BASELINE = "#0072b2", "#d55e00", "#00835f", "#868e98"
 NO_CONDITION = "without a condition"
-_PLAIN_WIDTH = 240  # a file or a pipe has no width to fold lines at
-_ROOMY = 112  # columns of a terminal: below it, intervals go under their rates
+_PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at
+_ROOMY = 112  # terminal width in columns below which intervals go under their rates
 
 
 @dataclass(frozen=True)
 class Table:
     """Columns and rows of text; an empty cell was not measured. The first column names the row.
 
-    colours: of the rows, `#0072b2`; empty if they have none.
+    colours: one per row, such as `#0072b2`; empty for none.
     """
 
     columns: tuple[str, ...]
@@ -34,14 +34,14 @@ class Table:
     colours: tuple[str, ...] = ()
 
     def filled(self) -> Table:
-        """Return the table without the columns that no row fills."""
+        """Return the table without its empty columns."""
         keep = [i for i in range(len(self.columns)) if i == 0 or any(row[i] for row in self.rows)]
         rows = tuple(tuple(row[i] for i in keep) for row in self.rows)
         return Table(tuple(self.columns[i] for i in keep), rows, self.colours)
 
 
 def print_table(table: Table, console: Console | None = None, empty: str = "") -> None:
-    """Print the filled columns: in colour on a terminal, as plain text elsewhere. empty: stands for an empty cell."""
+    """Print the non-empty columns: in colour on a terminal, else as plain text. empty: text for an empty cell."""
     console = console or Console(highlight=False)
     terminal = console.is_terminal
     gap = "\n" if terminal and console.width < _ROOMY else " "
@@ -53,16 +53,16 @@ def print_table(table: Table, console: Console | None = None, empty: str = "") -
         drawn.add_column(Text(name.replace(" ", gap, 1)), justify="right" if index else "left")
     for index, row in enumerate(table.rows):
         style = table.colours[index] if terminal and table.colours else None
-        # Text, as Rich would take the brackets of an interval for markup.
+        # Text objects, as Rich would parse the brackets of an interval as markup
         drawn.add_row(*(Text(printable(cell or empty).replace(" [", f"{gap}[")) for cell in row), style=style)
     console.print(drawn)
 
 
 @dataclass(frozen=True)
 class PolicyRow:
-    """One policy's line in the table. labels: expert labels that it learnt from, None for the expert itself.
+    """One policy's row in the table. labels: number of expert labels that it learnt from, None for the expert itself.
 
-    disturbed: its evaluation under a disturbance, if there is one.
+    disturbed: its evaluation under a disturbance, if any.
     """
 
     name: str
@@ -78,7 +78,7 @@ class PolicyRow:
 
 
 def policy_table(rows: Sequence[PolicyRow]) -> Table:
-    """Return a row a policy: labels, success, success at the end, steps to success, success under the disturbance."""
+    """Return one row per policy: labels, success, success at the end, steps to success, success when disturbed."""
     cells = tuple(
         (
             row.name,
@@ -93,7 +93,7 @@ def policy_table(rows: Sequence[PolicyRow]) -> Table:
 
 
 def evaluation_table(result: EvalResult) -> Table:
-    """Return success, success at the end and control steps until success: of all episodes, then of each condition."""
+    """Return success, success at the end and control steps to success: first over all episodes, then per condition."""
     parts, conditions, colours = {result.policy: result}, result.by_condition, (DAGGER,)
     if len(conditions) > 1:
         parts = {"all conditions": result} | {name or NO_CONDITION: part for name, part in conditions.items()}

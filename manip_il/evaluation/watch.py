@@ -1,4 +1,4 @@
-"""Episodes as they happen: in a window, whose sliders may drive, or as Rerun shows them, live or from a file."""
+"""Episodes as they happen: in a window, whose sliders may drive the robot, or in Rerun, live or from a file."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _JPEG_QUALITY = 90
 
 
 class WindowScreen:
-    """MuJoCo's viewer of one environment, with its phase and progress; objects can be pulled with the mouse.
+    """MuJoCo's viewer for one environment, with its phase and progress; objects can be dragged with the mouse.
 
-    sliders: its control sliders drive. Raises `RenderError` where there is no display.
+    sliders: whether its control sliders drive the robot. Raises `RenderError` if there is no display.
     """
 
     def __init__(self, env: ManipEnv, *, sliders: bool = False):
@@ -36,7 +36,7 @@ class WindowScreen:
         self.act = slider_actions(self._window, env) if sliders else None
 
     def add(self, step: Transition) -> bool:
-        """Show the world after a step, in real time; returns False once the window is closed."""
+        """Show the world after a step, in real time; return False once the window is closed."""
         phase = f"  {self._phases[step.label.phase]}" if step.label else ""
         solved = "  solved" if step.success else ""
         text = f"seed {step.seed}  step {step.step + 1}{phase}  progress {100 * self._env.progress:.0f} %{solved}"
@@ -50,9 +50,9 @@ class WindowScreen:
 
 
 def slider_actions(window: Window, env: ManipEnv) -> Act:
-    """Return a driver that executes what the control sliders of a window say, joint targets and gripper command (n,).
+    """Return a driver that executes a window's control sliders: joint targets and gripper command (n,).
 
-    An episode begins with those that it starts from.
+    An episode begins with the environment's initial controls.
     """
 
     def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
@@ -66,22 +66,22 @@ def slider_actions(window: Window, env: ManipEnv) -> Act:
 
 
 def outcome(step: Transition) -> str:
-    """Return how the episode ended whose last step this is."""
+    """Return how an episode ended, given its last step."""
     return f"seed {step.seed}: {'solved' if step.success or step.state.ever else 'not solved'}, {step.step + 1} steps"
 
 
 class RerunLog:
-    """Steps of episodes, sent to a file, or in real time to whoever opens `address`.
+    """Steps of episodes, written to a file, or sent in real time to viewers that open `address`.
 
-    address: of the viewer, for a browser; empty if a file is written. ports: of the viewer and the stream.
+    address: URL of the viewer, for a browser; empty if a file is written. ports: of the viewer and the stream.
     Raises `OSError` if the file cannot be written.
     """
 
-    act = None  # nobody drives by it
+    act = None  # it does not drive the robot
 
     def __init__(self, env: EnvConfig, output: Path | None = None):
         if output:
-            output.open("wb").close()  # first: rerun adds lines of its own if it cannot write
+            output.open("wb").close()  # check first: rerun prints lines of its own if it cannot write
         self._spec, self._frames = env_spec(env), 0
         self._clock = None if output else Clock(env.control_hz)
         self._hz = env.control_hz
@@ -90,7 +90,7 @@ class RerunLog:
         if output:
             self._stream.save(output)
         else:
-            self.ports = web, grpc = _free_port(9090), _free_port(9876)  # Rerun's own, if they are free
+            self.ports = web, grpc = _free_port(9090), _free_port(9876)  # Rerun's default ports, if they are free
             uri = self._stream.serve_grpc(grpc_port=grpc)
             rerun.serve_web_viewer(web_port=web, open_browser=False, connect_to=uri)
             self.address = f"http://localhost:{web}/?url=rerun%2Bhttp://localhost:{grpc}/proxy"
@@ -98,7 +98,7 @@ class RerunLog:
             self._stream.log(name, rerun.SeriesLines(names=self._spec.joint_names), static=True)
 
     def add(self, step: Transition) -> bool:
-        """Send a step; live, then wait for real time. Returns True: there is always more room."""
+        """Send a step; if live, then wait for real time. Always returns True."""
         stream = self._stream
         stream.set_time("time", duration=self._frames / self._hz)
         stream.set_time(FRAME, sequence=self._frames)
@@ -122,13 +122,13 @@ class RerunLog:
         return True
 
     def close(self) -> None:
-        """Write or send what is still waiting."""
+        """Write or send what is pending."""
         self._stream.flush()
         self._stream.disconnect()
 
 
 def _free_port(wanted: int) -> int:
-    """A port on which nobody listens: the wanted one, or any other."""
+    """Return a free port: the wanted one if possible, else any other."""
     try:
         with socket.create_server(("", wanted)):
             return wanted

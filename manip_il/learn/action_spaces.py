@@ -1,32 +1,32 @@
-"""The spaces in which a policy may learn a robot's action, and the way there and back.
+"""Action spaces that a policy may learn in, and the conversion to and from joint targets.
 
-With s = (q, w) the measured joints [rad] and gripper opening [m] of a frame, a = (q*, w*) its action (joint targets and
-the opening's command, what a dataset holds and an environment takes), and (p, R) = FK(q) position and rotation of `ee`:
+Let s = (q, w) be a frame's measured joints [rad] and gripper opening [m], a = (q*, w*) its action (joint targets and
+commanded opening, as in datasets and environments), and (p, R) = FK(q) the position and rotation of `ee`:
 
     joint_target   y = (q*, w*)
     joint_delta    y = (q* - q, w*)
     ee_delta       y = (p* - p, log(R* R^T), 0 ..., w*)      with (p*, R*) = FK(q*)
 
-`joint_target` and `joint_delta` lose nothing. The opening is absolute in all: it is a command to close, not a motion.
+`joint_target` and `joint_delta` are lossless. The opening is absolute in all three: it is a command, not a motion.
 
-`ee_delta` is a position [m] and a rotation vector [rad] in the world's axes, not the hand's: objects and goals are
-observed there, so that "towards it" is the same numbers however the hand is turned, and stock environments
-(robosuite's OSC_POSE, gymnasium-robotics) mean the same by it. It has as many numbers as the robot's action, so that a
-network has the environment's shape; those between the six and the opening are 0 and are not read. Six numbers need an
-arm of six joints or more. The way back finds q* near q with FK(q*) = (p + dp, exp(dR) R) (`ArmIK.moved`). The pose is
-reached again to rounding, the joints are not: an arm of seven joints has a motion of the elbow that leaves the hand
-where it is, which six numbers do not hold. It is chosen as the expert chooses it, by the pull to the home posture. A
-pose out of reach is approached.
+`ee_delta` is a translation [m] and a rotation vector [rad] in the world frame, not the hand's: objects and goals are
+observed in the world frame, so that "towards it" is the same numbers for any orientation of the hand, and stock
+environments (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It has as many numbers as the robot's
+action, so that the network has the environment's shape; those between the six and the opening are 0 and are not read.
+Six numbers need an arm with at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R)
+(`ArmIK.moved`). It recovers the pose up to rounding, but not the joints: an arm with seven joints has an elbow motion
+that leaves the hand in place, which six numbers do not encode. As in the expert, the pull to the home posture
+determines it. A pose out of reach is approached.
 
-The measured state is the frame's own. An action of a plan is thus converted in the step in which it is executed, with
-the joints measured there, so that plans of many actions (ACT's chunks, diffusion's horizons) are converted exactly,
-too; what learns them sees target minus state of each frame of the window.
+The measured state is the frame's own: an action of a plan is converted at the step in which it is executed, with the
+joints measured then, so that plans of many actions (ACT's chunks, diffusion's horizons) are also converted exactly.
+Policies that learn plans see, for each frame of the window, the target minus the state of that frame.
 
-Robots whose YAML says `lerobot` have degrees and 0 to 100 in s and a; their hand's motion is in [m] and [rad], too.
+Robots whose YAML has `lerobot` use degrees and 0 to 100 in s and a; the motion of their hand is also in [m] and [rad].
 
-`mlp` and `cnn` learn `joint_delta` by default, inside of their network (`MLPNetwork`), which holds the measured joints
-anyway and so goes into an exported file whole; `joint_target` is the same network without the sum. What a network
-cannot hold is in the checkpoint's processors (`action_steps`): both deltas of LeRobot's policies, every `ee_delta`.
+`mlp` and `cnn` learn `joint_delta` by default, inside the network (`MLPNetwork`), which has the measured joints as
+inputs anyway and so is exported whole; `joint_target` is the same network without the sum. All other conversions are
+in the checkpoint's processors (`action_steps`): both deltas for LeRobot's policies, and `ee_delta` for every policy.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TAR
 from manip_il.robots import ROBOTS
 from manip_il.robots.rotations import rotation_vector
 
-if TYPE_CHECKING:  # inverse kinematics takes a second to import
+if TYPE_CHECKING:  # importing inverse kinematics takes a second
     from manip_il.robots.ik import ArmIK
     from manip_il.robots.robot import Robot
 
-ARM, GRIPPER = slice(None, -1), -1  # of joint state and action, as every robot's `ActionSpace` orders them
+ARM, GRIPPER = slice(None, -1), -1  # slices of joint state and action, in the order of every robot's `ActionSpace`
 _POSITION, _ROTATION, _POSE = slice(0, 3), slice(3, 6), 6
 Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
 
 @dataclass(frozen=True)
 class Conversion:
-    """The way from actions to targets of a space and back, row by row. robot: whose hand moves, of `ee_delta` alone.
+    """Converts actions to the targets of a space and back, row by row. robot: the arm, for `ee_delta` only.
 
-    Raises `UnknownName` for a space or robot, `UsageError` for an arm that has fewer joints than a pose has numbers.
+    Raises `UnknownName` for a space or robot, `UsageError` for an arm with fewer joints than a pose has numbers.
     """
 
     space: str = JOINT_TARGET
@@ -68,7 +68,7 @@ class Conversion:
             raise UnknownName("action space", self.space, ACTION_SPACES)
         if self.space != EE_DELTA:
             return
-        if self.robot not in ROBOTS:  # no path either: the name may be a downloaded checkpoint's
+        if self.robot not in ROBOTS:  # paths are refused too: the name may come from a downloaded checkpoint
             hint = f"{EE_DELTA} needs its kinematics; known: {', '.join(ROBOTS)}"
             raise UnknownName("robot", self.robot, ROBOTS, hint)
         if (joints := len(self._robot.joints)) < _POSE:
@@ -77,7 +77,7 @@ class Conversion:
             )
 
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return targets (N, n) of joint targets and openings (N, n), measured from joint states (N, n)."""
+        """Return targets (N, n) for actions (N, n), joint targets and openings, relative to joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return actions
         targets = actions.copy()
@@ -92,7 +92,7 @@ class Conversion:
         return targets
 
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return joint targets [rad] and openings [m] (N, n) of targets (N, n), measured from joint states (N, n)."""
+        """Return joint targets [rad] and openings [m] (N, n) for targets (N, n), relative to joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return targets
         actions = targets.copy()
@@ -105,7 +105,7 @@ class Conversion:
         return actions
 
     def _to_radians(self, joints: NDArray[Any]) -> NDArray[np.float64]:
-        """Joints (..., n - 1) [rad] in double precision of an action's or a state's."""
+        """Return the joints (..., n - 1) [rad] of actions or states, in double precision."""
         in_degrees = self._robot.lerobot is not None
         return np.radians(joints, dtype=np.float64) if in_degrees else np.asarray(joints, np.float64)
 
@@ -119,8 +119,8 @@ class Conversion:
 def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
     """Return the conversion of a space for data of `spec`.
 
-    Raises `MismatchError` naming both sides if the data's actions are not joint targets of a robot that is known
-    here with these joints, if that matters, and what `Conversion` raises.
+    Raises `MismatchError` naming both sides if the data's actions are not joint targets of a known robot with these
+    joints, in so far as the space needs that, and what `Conversion` raises.
     """
     found = Conversion(space, spec.robot if space == EE_DELTA else "")
     if space != JOINT_TARGET and spec.action_meaning not in JOINT_TARGETS:

@@ -1,9 +1,9 @@
-"""The steps of LeRobot's processors that carry an action space: see `action_spaces`.
+"""LeRobot processor steps that convert actions: see `action_spaces`.
 
-`MeasuredJointsStep`, in the preprocessor, keeps the measured joints of an observation; `JointTargetsStep`, at the end
-of the postprocessor, makes joint targets of the policy's output with them. A checkpoint that has them works wherever
-LeRobot calls both once a step, as lerobot-eval does. LeRobot connects the two when it loads them, as it does its own
-steps of this kind, which are their base classes; those measure a whole plan from the joints at its beginning.
+`MeasuredJointsStep`, in the preprocessor, stores the measured joints of an observation; `JointTargetsStep`, at the end
+of the postprocessor, uses them to convert the policy's output to joint targets. A checkpoint with both works wherever
+LeRobot calls each once per step, as lerobot-eval does. LeRobot connects the two on loading, as it does its own steps
+of this kind, which are their base classes; those convert a whole plan relative to the joints at its start.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _NORMALISER = "normalizer_processor"
 @ProcessorStepRegistry.register(MEASURED)
 @dataclass
 class MeasuredJointsStep(RelativeActionsProcessorStep):
-    """Keeps an observation's joint state (B, n), raw; changes nothing.
+    """Stores the raw joint state (B, n) of an observation; changes nothing.
 
-    converted: the actions that come with observations are in the space already, as the trainer makes them.
+    converted: whether the actions that come with observations are converted already, as in training.
     """
 
     converted: bool = False
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the same transition. Raises `ManipError` for one with an action of a dataset's."""
+        """Return the same transition. Raises `ManipError` if it has an action from a dataset."""
         if transition.get(TransitionKey.ACTION) is not None and not self.converted:
             raise ManipError(
                 "this policy learns actions in a space of manip_il's, which are not in the dataset; go on with "
@@ -51,20 +51,20 @@ class MeasuredJointsStep(RelativeActionsProcessorStep):
         return transition
 
     def get_config(self) -> dict[str, Any]:
-        """Return nothing: whose joints are measured is the postprocessor's to know."""
+        """Return an empty configuration: the postprocessor's step holds the robot."""
         return {}
 
 
 @ProcessorStepRegistry.register(DECODER)
 @dataclass
 class JointTargetsStep(AbsoluteActionsProcessorStep):
-    """Makes joint targets and opening (B, n) of a policy's output (B, n), against the joints measured in this step."""
+    """Converts a policy's output (B, n) to joint targets and opening (B, n), relative to the joints measured now."""
 
     action_space: str = JOINT_TARGET
     robot: str = ""
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the transition with joint targets. Raises `ManipError` for another output than one step's."""
+        """Return the transition with joint targets. Raises `ManipError` unless the output is that of one step."""
         targets = transition.get(TransitionKey.ACTION)
         states = self.relative_step.get_cached_state() if self.relative_step is not None else None
         if not isinstance(targets, torch.Tensor) or states is None or targets.shape != states.shape:
@@ -78,17 +78,17 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
         return cast(EnvTransition, {**transition, TransitionKey.ACTION: torch.from_numpy(actions).to(targets)})
 
     def get_config(self) -> dict[str, Any]:
-        """Return the options that a checkpoint keeps."""
+        """Return the options that are saved in a checkpoint."""
         return {"action_space": self.action_space, "robot": self.robot}
 
 
 def is_in_processors(kind: str, found: Conversion) -> bool:
-    """Return whether the processors of a policy type carry a conversion, rather than nothing or its network."""
+    """Return whether the processors of a policy type do a conversion, rather than its network or nothing."""
     return found.space == EE_DELTA or (found.space == JOINT_DELTA and kind not in OWN_SPACE)
 
 
 def add_steps(before: Pipeline, after: Pipeline, found: Conversion) -> None:
-    """Add the steps of a conversion to a policy's pre- and postprocessor, which will see converted actions alone."""
+    """Add a conversion's steps to a policy's pre- and postprocessor; the policy then sees only converted actions."""
     measured = MeasuredJointsStep(converted=True)
     names = [getattr(step, "_registry_name", "") for step in before.steps]
     place = names.index(_NORMALISER) if _NORMALISER in names else len(names)

@@ -1,4 +1,4 @@
-"""Options of PPO and of discriminators, without what they are made of."""
+"""Options of PPO and of discriminators; importing them needs neither torch nor stable-baselines3."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from manip_il.option import check_bounds, option
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Options of PPO, by its paper's names. Raises `UsageError` for a value out of range."""
+    """Options of PPO, named as in its paper. Raises `UsageError` for a value out of range."""
 
     lr: float | None = option(
         None,
@@ -34,11 +34,11 @@ class PPOConfig:
         check_bounds(self, "ppo.")
 
     def first_lr(self, *, clone: bool) -> float:
-        """Return the first learning rate. clone: whether the actor is one."""
+        """Return the initial learning rate. clone: whether the actor starts from a clone."""
         return self.lr if self.lr is not None else 2e-4 if clone else 5e-4
 
     def discount(self, *, clone: bool) -> float:
-        """Return gamma, by default longer for a clone, which lives to see what comes of its actions."""
+        """Return gamma; by default higher for a clone, whose episodes last long enough to show delayed effects."""
         return self.gamma if self.gamma is not None else 0.97 if clone else 0.9
 
 

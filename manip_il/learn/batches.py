@@ -1,6 +1,6 @@
-"""Batches on their way to the network: the order of the samples, and pictures as floats.
+"""Batches for the network: the order of the samples, and pictures as floats.
 
-Pictures may be cropped and their colours changed by chance while learning.
+While training, pictures can be cropped and recoloured at random.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-_AT_ONCE = 16  # pictures: what is made of them on the way stays near the processor
-_GREY = (0.299, 0.587, 0.114)  # of red, green and blue: ITU-R BT.601
+_AT_ONCE = 16  # pictures processed at a time, so that intermediate results stay in the cache
+_GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue: ITU-R BT.601
 
 
 def generator_of(*key: int) -> torch.Generator:
-    """Return a generator on the CPU whose draws are a function of the key alone."""
+    """Return a CPU generator whose draws depend only on the key."""
     return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
 
 
 class Order:
-    """Row numbers in batches: every row once an epoch, in an order of its own each epoch, or as often as it weighs.
+    """Row numbers in batches: a new shuffle of all rows every epoch, or draws in proportion to weights.
 
-    weights: of each row, (N,), to draw in proportion to, with replacement; None for epochs. A batch is a function of
-    the seed and the step alone, so there is no state to save.
+    weights: of the rows, (N,), for drawing with replacement; None for epochs. A batch depends only on the seed and the
+    step, so there is no state to save.
     """
 
     def __init__(self, rows: int, weights: NDArray[np.float64] | None, batch_size: int, seed: int) -> None:
@@ -37,7 +37,7 @@ class Order:
         self._epoch, self._order = -1, np.empty(0, np.int64)
 
     def batch(self, step: int) -> NDArray[np.int64]:
-        """Return row numbers of the batch of `step`, (batch_size,)."""
+        """Return the row numbers of the batch at `step`, (batch_size,)."""
         if self._edges is not None:
             draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
             return np.minimum(np.searchsorted(self._edges, draws, side="right"), self.rows - 1)
@@ -53,7 +53,7 @@ class Order:
 
 
 def to_float(pictures: Tensor) -> Tensor:
-    """Return levels 0 to 255 (B, ...) as float32 in [0, 1]: the values that LeRobot's loader gives."""
+    """Return pixel values 0 to 255 (B, ...) as float32 in [0, 1], equal to those of LeRobot's loader."""
     return pictures.to(torch.float32).div_(255)
 
 
@@ -66,9 +66,9 @@ def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str
 class Augment:
     """Random crops and colour jitter.
 
-    shift: pixels that a crop moves by at most, each way; the border repeats the outermost pixels (DrQ, Kostrikov et
-    al. 2020, arXiv:2004.13649). brightness, contrast, saturation: how far the factor of each is from 1 at most, as in
-    torchvision's `ColorJitter`, but in one order (saturation, contrast, brightness) with one clamp at the end.
+    shift: largest shift of a crop in each direction [pixels]; the border repeats the outermost pixels (DrQ, Kostrikov
+    et al. 2020, arXiv:2004.13649). brightness, contrast, saturation: largest deviation of each factor from 1, as in
+    torchvision's `ColorJitter`, but in a fixed order (saturation, contrast, brightness) with one clamp at the end.
     """
 
     shift: int = 4
@@ -79,7 +79,7 @@ class Augment:
     def __call__(self, pictures: Tensor, generator: torch.Generator) -> Tensor:
         """Return pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that shape in [0, 1].
 
-        One draw a sample, from a generator on the CPU; it is the same for all T.
+        One draw per sample, from a generator on the CPU; it is the same for all T.
         """
         flat = pictures.flatten(0, -4)
         changed = torch.empty(flat.shape, dtype=torch.float32, device=flat.device)
@@ -96,9 +96,9 @@ class Augment:
 
 
 def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
-    """Each picture (B, 3, H, W) out of itself and a border of `shift` pixels, from row and column `moves` (B, 2) on."""
+    """Crop pictures (B, 3, H, W), padded by `shift` pixels, starting at row and column `moves` (B, 2)."""
     height, width = pictures.shape[-2:]
-    # on bytes, before there are four times as many; not by torch's own padding, which knows no bytes on a GPU
+    # pad bytes, before they become floats of four times the size; torch's own padding takes no bytes on a GPU
     left, right = (side.expand(-1, -1, -1, shift) for side in (pictures[..., :1], pictures[..., -1:]))
     wide = torch.cat([left, pictures, right], dim=3)
     above, below = (side.expand(-1, -1, shift, -1) for side in (wide[..., :1, :], wide[..., -1:, :]))
@@ -108,10 +108,10 @@ def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
 
 
 def _jitter(values: Tensor, factors: Tensor) -> None:
-    """Change levels 0 to 255 (B, 3, H, W) by factors (B, 3) of saturation, contrast and brightness, to [0, 1].
+    """Scale values 0 to 255 (B, 3, H, W) to [0, 1] in place, by factors (B, 3) of saturation, contrast, brightness.
 
-    Saturation mixes with the grey picture, contrast with its mean, brightness with black: together
-    `own * picture + shared * grey + level`, without a product of matrices, whose precision torch may lower.
+    Saturation blends with the grey picture, contrast with its mean, brightness with black: together
+    `own * picture + shared * grey + level`, without a matrix product, whose precision torch may lower.
     """
     saturation, contrast, brightness = factors.view(-1, 3, 1, 1).unbind(1)
     grey = values[:, 0] * _GREY[0]

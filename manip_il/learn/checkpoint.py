@@ -1,8 +1,8 @@
-"""A `pretrained_model` folder, which is data from anywhere: opened once and checked before anything in it is loaded.
+"""A `pretrained_model` folder, which may be downloaded: it is checked before anything in it is loaded.
 
 LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
-`trust_remote_code`, which runs Python from the named repository. Policies that are built from their own configuration
-and weights alone are listed in `PLAIN`, the steps of their processors in `_STEPS`; all others need `--trust=true`.
+`trust_remote_code`, which runs Python from the named repository. Policies that are built only from their own
+configuration and weights are listed in `PLAIN`, their processors' steps in `_STEPS`; all others need `--trust=true`.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, 
 from manip_il.sim.config import CameraConfig, Look
 
 CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
-MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that carry an action space
+MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that convert actions
 LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
-_STEPS = (  # of LeRobot's default processors, and ours: they load nothing
+_STEPS = (  # registry names of LeRobot's default steps, and ours: they load nothing
     *("rename_observations_processor", "to_batch_processor", "device_processor"),
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-_FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
-_PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
+_FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
+_PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled")
 
 
@@ -38,9 +38,9 @@ _MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "cla
 class Origin:
     """Robot, task and data that a policy was trained for, and the options of its fit; `manip_il.json`.
 
-    observation: one of `OBSERVATIONS`. cameras, image_size: of the pictures that it was trained on, if it sees any;
-    look: their light, as arguments of `sim.look.Look`, None if that is not known. datasets: name, frames and weight
-    of each. action_space: in which it learnt, None in a checkpoint from before there was a choice.
+    observation: one of `OBSERVATIONS`. cameras, image_size: those of its training pictures, if any; look: the lighting
+    of these, as arguments of `sim.look.Look`, None if unknown. datasets: name, frames and weight of each. action_space:
+    the space that it learnt in, None for a checkpoint from before there was a choice.
     """
 
     robot: str
@@ -93,7 +93,7 @@ class Origin:
         return {name: value for name, value in asdict(self).items() if value or name != "object"}
 
     def check_fits(self, spec: RobotTaskSpec) -> None:
-        """Raise `MismatchError` naming both sides unless the policy's numbers mean what `spec`'s do."""
+        """Raise `MismatchError` naming both sides unless states and actions mean the same as in `spec`."""
         names, seen = spec.environment_state_names, self.observation != "images"
         other_task = seen and self.environment_state_names != names and self.task != spec.task
         ours = self if seen and not other_task else replace(self, environment_state_names=names)
@@ -103,7 +103,7 @@ class Origin:
 def read_origin(path: Path) -> Origin | None:
     """Return the origin in a `pretrained_model` folder, or None if another tool (lerobot-train) wrote it.
 
-    Raises `ManipError` for a file that is not ours or not whole.
+    Raises `ManipError` for a file that is incomplete or not ours.
     """
     file = Path(path) / META_FILE
     if not file.is_file():
@@ -117,11 +117,11 @@ def read_origin(path: Path) -> Origin | None:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A policy on disk. path: its `pretrained_model` folder. config: the `config.json` there.
+    """A policy on disk. path: its `pretrained_model` folder. config: its `config.json`.
 
-    numbers: column -> how many; pictures: camera -> (height, width) [pixels]; action: how many numbers. space: the
-    action space it has learnt in; robot: whose hand moves, for `ee_delta` alone. origin: None if another program
-    wrote it. processors: steps by file, each `registry_name` and `config`.
+    numbers: column -> size; pictures: camera -> (height, width) [pixels]; action: size of the action. space: the action
+    space that it learnt in; robot: the arm, for `ee_delta` only. origin: None if another program wrote it. processors:
+    file -> steps, each with `registry_name` and `config`.
     """
 
     path: Path
@@ -136,9 +136,9 @@ class Checkpoint:
 
     @classmethod
     def open(cls, path: Path) -> Checkpoint:
-        """Read and check a folder's files, but for its weights.
+        """Read and check the files of a folder, except its weights.
 
-        Raises `ManipError` for a folder that is not whole or asks to import code by its path.
+        Raises `ManipError` if the folder is incomplete or names code to import by its path.
         """
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
@@ -171,21 +171,21 @@ class Checkpoint:
 
     @property
     def observation(self) -> str:
-        """The one of `OBSERVATIONS` that the policy takes."""
+        """The member of `OBSERVATIONS` that the policy takes."""
         if not self.pictures:
             return "state"
         return "both" if ENVIRONMENT_STATE in self.numbers else "images"
 
     @property
     def mlp_options(self) -> dict[str, Any] | None:
-        """The options of another mlp of this architecture; None for another kind of policy."""
+        """The options for building another mlp of this architecture; None for another kind of policy."""
         if self.kind != MLP:
             return None
         kept = {name: self.config[name] for name in _MLP_SHAPE if name in self.config}
         return {"type": MLP, **kept, "sigma": self.config.get("sigma", 0.0)}
 
     def check_fits(self, spec: RobotTaskSpec) -> None:
-        """Raise `MismatchError` naming both unless an environment of `spec` has every input and takes the action."""
+        """Raise `MismatchError` naming both unless environments of `spec` have every input and take the action."""
         if self.origin is not None:
             self.origin.check_fits(spec)
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
@@ -199,12 +199,12 @@ class Checkpoint:
                 raise MismatchError(what, "the policy", needed, environment, has.get(what))
 
     def require_trust(self, trust: bool) -> None:
-        """Raise `ManipError` unless the policy and its processors load nothing by name, or `trust` is given."""
+        """Raise `ManipError` unless `trust` is given or the policy and its processors load nothing by name."""
         steps = [step for steps in self.processors.values() for step in steps]
         require_trust(self.config, str(self.path), trust, steps)
 
     def require_processors(self) -> None:
-        """Raise `ManipError` unless both processors are there."""
+        """Raise `ManipError` unless both processors exist."""
         for name in PROCESSORS:
             if name not in self.processors:
                 hint = "LeRobot's migrate_policy_normalization adds it to an old checkpoint"
@@ -212,7 +212,7 @@ class Checkpoint:
 
 
 def policy_sha256(policy: Path) -> str:
-    """Return the SHA-256 of everything in a policy's folder that decides how it acts, but not of where it lies."""
+    """Return the SHA-256 of everything in a policy's folder that decides how it acts, independent of its path."""
     digest = hashlib.sha256()
     for path in sorted(policy.iterdir()):
         if path.is_file() and path.name not in _FOR_PEOPLE:
@@ -221,10 +221,10 @@ def policy_sha256(policy: Path) -> str:
 
 
 def policy_cameras(policy: Path) -> CameraConfig | None:
-    """Return cameras, size and light of the pictures that a checkpoint was trained with; None for one without.
+    """Return cameras, size and lighting of a checkpoint's training pictures; None if it takes no pictures.
 
-    The light is the default if the checkpoint does not say. Raises `UsageError` for cameras that environments do not
-    have, and for a size that cannot be.
+    The lighting is the default if the checkpoint does not say. Raises `UsageError` for cameras that environments do not
+    have, and for an invalid size.
     """
     checkpoint = Checkpoint.open(policy)
     pictures, origin = checkpoint.pictures, checkpoint.origin
@@ -236,12 +236,12 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
 
 
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Name -> kind and shape of a policy's inputs or outputs."""
+    """Return name -> kind and shape of a policy's inputs or outputs."""
     return {key: (str(value["type"]), tuple(map(int, value["shape"]))) for key, value in features.items()}
 
 
 def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
-    """Action space and robot: the mlp's and cnn's by their configuration, all others' by the postprocessor's step."""
+    """Return action space and robot: from the configuration of mlp and cnn, else from the postprocessor's step."""
     options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
     own = config["type"] in OWN_SPACE
     space = config.get("action_space", JOINT_DELTA) if own else options.get("action_space", JOINT_TARGET)
@@ -252,7 +252,7 @@ def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tup
 
 @contextmanager
 def in_one_line(what: str) -> Iterator[None]:
-    """Turn errors of every kind, which others' code raises for files from anywhere, into `ManipError`: `what: ...`."""
+    """Turn errors of any type that other libraries raise on malformed files into `ManipError`: `what: ...`."""
     try:
         yield
     except ManipError:
@@ -264,10 +264,10 @@ def in_one_line(what: str) -> Iterator[None]:
 def require_trust(
     settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Raise `ManipError` unless a policy loads nothing by name, or `trust` is given; names what may be loaded.
+    """Raise `ManipError`, naming what would be loaded, unless a policy loads nothing by name or `trust` is given.
 
-    settings: its options with `type`, as `config.json` has them. source: of them, for the message. steps: of its
-    processors.
+    settings: its options with `type`, as in `config.json`. source: where these come from, for the message. steps: those
+    of its processors.
     """
     kind, named = settings["type"], list[Any]()
     if kind not in PLAIN or settings.get("vision_encoder_name"):
@@ -284,7 +284,7 @@ def require_trust(
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Return the `config.json` of a folder that is whole; else raise `ManipError`."""
+    """Return the `config.json` of a folder. Raises `ManipError` if the folder is incomplete."""
     if not (path / CONFIG).is_file():
         raise ManipError(f"no {CONFIG} in {path}; expected LeRobot's pretrained_model folder")
     if not (path / WEIGHTS).is_file():
@@ -296,9 +296,9 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def processor_steps(path: Path) -> list[dict[str, Any]]:
-    """Return the steps that a processor's file names, each `registry_name` and `config`.
+    """Return the steps in a processor's file, each with `registry_name` and `config`.
 
-    Refuses a step by import path, as LeRobot would import and call whatever a downloaded file names.
+    Refuses steps given by import path, as LeRobot would import and call whatever a downloaded file names.
     """
     values = checks.read_json(path, "a processor of LeRobot's", LARGEST_JSON)
     try:

@@ -1,6 +1,6 @@
 """The `cnn` policy in LeRobot's form: one action from joint state and the keypoints of every camera.
 
-Options, policy and processors are in one module, a package to LeRobot, as the `mlp`'s are.
+Options, policy and processors are in one module, which LeRobot treats as a package, as with the `mlp`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from manip_il.option import option
 __all__ = ["CNNConfig", "CNNPolicy", "make_cnn_pre_post_processors"]
 __path__: list[str] = []
 
-MIN_SIDE = 32  # of a picture [pixels]
-NUMBERS = 4  # a keypoint: x, y, spread, strength
-STRIDE = 4  # of heat maps [pixels]
-_LIGHT, _COLOUR = 4.0, 16.0  # pictures differ in light much more than in colour; these make them alike
-_SHARPNESS = 3.0  # of the softmax
-_SPREAD, _STRENGTH = 4.0, 0.3  # bring both to about -2 to 2
+MIN_SIDE = 32  # smallest side of a picture [pixels]
+NUMBERS = 4  # numbers per keypoint: x, y, spread, strength
+STRIDE = 4  # distance between cells of the heat maps [pixels]
+_LIGHT, _COLOUR = 4.0, 16.0  # pictures vary far more in brightness than in colour; these scales equalise them
+_SHARPNESS = 3.0  # gain before the softmax
+_SPREAD, _STRENGTH = 4.0, 0.3  # scale both to about -2 to 2
 
 
 @PreTrainedConfig.register_subclass("cnn")
@@ -40,27 +40,27 @@ _SPREAD, _STRENGTH = 4.0, 0.3  # bring both to about -2 to 2
 class CNNConfig(MLPConfig):
     """Keypoints of every camera, found by a small convolutional network, and the mlp's perceptron on top.
 
-    channels: of the encoder's layers; the first two halve the picture, the rest keep its size. keypoints: a
-    camera. aux_weight: while learning, weight of the mean absolute error, in standard deviations, of reading
-    `observation.environment_state` off joints and keypoints by a perceptron, if the dataset has that column and
-    it is not an input. The action is read off what was read off, too, and off joints and keypoints; acting never sees
-    the true state. scales: as the mlp's, of the offsets in what was read off, or in the state if it is an input;
-    scaled: their columns there. heatmap_weight: while learning, weight of the cross-entropy [nats] of heat maps against
-    the places of points that the scene names (`privileged.keypoints.<camera>`), each of which has a keypoint of its own
-    beside the others; 0: off. What is not said here is the mlp's.
+    channels: those of the encoder's layers; the first two halve the picture, the rest keep its size. keypoints: number
+    per camera. aux_weight: weight, in training, of the mean absolute error, in standard deviations, of a perceptron
+    that predicts `observation.environment_state` from joints and keypoints, if the dataset has that column and it is
+    not an input. The action is predicted from that prediction as well as from joints and keypoints; the true state is
+    never used to act. scales: as in the mlp, for the offsets in the predicted state, or in the true one if it is an
+    input; scaled: their columns there. heatmap_weight: weight, in training, of the cross-entropy [nats] between heat
+    maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a keypoint
+    of its own in addition to the others; 0: off. All other options are the mlp's.
 
-    `use_amp` takes the convolutions of learning to half precision, if the processor has bfloat16: twice as fast.
+    `use_amp` runs the convolutions in half precision while training, if the processor has bfloat16: twice as fast.
     Acting is always in single precision.
 
-    Raises what `MLPConfig` raises, `UsageError` for sizes and weights out of range.
+    Raises what `MLPConfig` raises, and `UsageError` for sizes and weights out of range.
     """
 
     channels: tuple[int, ...] = (16, 32, 32, 32)
     keypoints: int = option(32, "a camera", at_least=1)
     aux_weight: float = option(0.5, "of what is read off", at_least=0)
     heatmap_weight: float = option(0.0, "of heat maps", at_least=0)
-    privileged_size: int = 0  # of what is read off beside the action; taken from the dataset
-    named_points: int = 0  # that have a heat map; taken from the dataset
+    privileged_size: int = 0  # size of the predicted state; taken from the dataset
+    named_points: int = 0  # number of points with a heat map; taken from the dataset
 
     depth: int = 2
     loss: str = "l1"
@@ -94,14 +94,14 @@ def _perceptron(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequent
 
 
 class CNNPolicy(MLPPolicy):
-    """LeRobot's policy interface to a `KeypointEncoder` a camera and an `MLPNetwork` on joints and keypoints.
+    """LeRobot's policy interface to one `KeypointEncoder` per camera and an `MLPNetwork` on joints and keypoints.
 
-    Batches hold what the mlp's do (`observation.environment_state` if it is an input) and
+    Batches hold the columns of the mlp's (`observation.environment_state` only if it is an input) and
     `observation.images.<camera>` (B, 3, H, W), from 0 to 1.
 
-    dataset_meta: as for the mlp. While training, the state of the environment is then read off the keypoints
-    too (`CNNConfig.aux_weight`), and points that the scene names have heat maps (`heatmap_weight`); each frame's truth
-    is known by the batch's `index`.
+    dataset_meta: as for the mlp. In training, the environment state is then also predicted from the keypoints
+    (`CNNConfig.aux_weight`), and named points of the scene have heat maps (`heatmap_weight`); each frame's ground truth
+    is looked up by the batch's `index`.
     """
 
     config_class = CNNConfig  # type: ignore[assignment]
@@ -112,11 +112,11 @@ class CNNPolicy(MLPPolicy):
     @override
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return one absolute action a row, (B, n), each the same bits whatever the other rows are."""
+        """Return one absolute action per row, (B, n), bit-identical whatever the other rows are."""
         state = batch[STATE]
         if len(state) == 0:
             return torch.empty_like(state)
-        # A convolution's sums depend on the number of pictures: one row at a time. Half precision is for learning.
+        # The sums of a convolution depend on the batch size, so one row at a time. Half precision is for training only.
         with torch.autocast(state.device.type, enabled=False):
             keys = (*self.inputs, *self.cameras)
             rows = [self.network_inputs({key: batch[key][i : i + 1] for key in keys}) for i in range(len(state))]
@@ -128,13 +128,13 @@ class CNNPolicy(MLPPolicy):
         features = config.input_features or {}
         self.cameras = sorted(config.image_features)
         config.input_features = {key: features[key] for key in (*self.inputs, *self.cameras)}
-        self._by_index: dict[str, Tensor] = {}  # of every frame of the data, by its `index`
+        self._by_index: dict[str, Tensor] = {}  # values of every frame of the data, by its `index`
         self.privileged: nn.Module | None = None
         self.aux_weight, self.heatmap_weight = config.aux_weight, config.heatmap_weight
         self._make(config)
 
     def _make(self, config: CNNConfig) -> None:
-        """Make encoders, the perceptron that reads the state off, and the one for the action, of the sizes given."""
+        """Build the encoders, the perceptron that predicts the state and the one for the action, with these sizes."""
         features, size = config.input_features or {}, config.privileged_size
         n = features[STATE].shape[0]
         count, named = config.named_points + config.keypoints, config.named_points > 0
@@ -147,12 +147,12 @@ class CNNPolicy(MLPPolicy):
             self.register_buffer("truth_mean", torch.zeros(size))
             self.register_buffer("truth_scale", torch.ones(size))
         self.offsets = list(config.scaled) if size or ENVIRONMENT_STATE in self.inputs else []
-        shape = Shape.of(vars(config) | {"scales": (), "scaled": ()})  # offsets are squashed here
+        shape = Shape.of(vars(config) | {"scales": (), "scaled": ()})  # this class scales the offsets itself
         self.model = MLPNetwork(self.seen_size + size + len(config.scales) * len(self.offsets), n, shape)
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return joint state, keypoints, what is read off them, and offsets at each scale (B, d)."""
+        """Return joint state, keypoints, the predicted state, and offsets at each scale, (B, d)."""
         keypoints = [encoder(batch[key]) for encoder, key in zip(self.encoders, self.cameras, strict=True)]
         seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
         parts, around, config = [seen], batch.get(ENVIRONMENT_STATE), cast(CNNConfig, self.config)
@@ -185,19 +185,19 @@ class CNNPolicy(MLPPolicy):
             return losses
 
     def _of_frames(self, name: str, batch: dict[str, Tensor]) -> Tensor | None:
-        """What is known of the frames of a batch, (B, ...): of these LeRobot's preprocessor keeps `index` alone."""
+        """Return what is stored of a batch's frames, (B, ...), by `index`, which LeRobot's preprocessor keeps."""
         if name not in self._by_index or batch.get(INDEX) is None:
             return None
         return self._by_index[name][batch[INDEX].reshape(-1).cpu()].to(batch[STATE].device)
 
     def _remember(self, name: str, columns: Table, values: Tensor) -> None:
-        """Keep values (N, ...) of all frames of the data."""
+        """Store values (N, ...) of all frames of the data."""
         index = torch.from_numpy(columns[INDEX].reshape(-1))
         self._by_index[name] = values.new_zeros((int(index.max()) + 1, *values.shape[1:]))
         self._by_index[name][index] = values
 
     def _heat_map_losses(self, places: Tensor) -> Tensor:
-        """Mean over the cameras, (B,). places: (B, cameras, K, 3)."""
+        """Return the mean over the cameras, (B,). places: (B, cameras, K, 3)."""
         cameras = zip(self.encoders, places.unbind(1), strict=True)
         maps = [(cast(KeypointEncoder, one).maps, at) for one, at in cameras]
         found = [heat_map_losses(one[:, : at.shape[1]], at.to(one.device)) for one, at in maps if one is not None]
@@ -205,13 +205,13 @@ class CNNPolicy(MLPPolicy):
 
     @override
     def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
-        """The columns of the environment state, which is an input or read off, that are offsets."""
+        """Return the columns of the environment state, if it is an input or predicted, that are offsets."""
         reads = ENVIRONMENT_STATE in self.inputs or cast(CNNConfig, config).aux_weight > 0
         return offsets_of(features if reads else {})
 
     @override
     def _more_columns(self) -> Sequence[str]:
-        """The truth to read off, and the places of named points, if heat maps are learnt."""
+        """Return the columns of the true state, and of the named points' positions if heat maps are trained."""
         return [ENVIRONMENT_STATE, *self._place_columns()]
 
     def _place_columns(self) -> list[str]:
@@ -225,7 +225,7 @@ class CNNPolicy(MLPPolicy):
             config.privileged_size, config.named_points = sizes
             self._make(config)
         super()._learn_columns(columns)
-        if truth is not None and config.privileged_size == sizes[0]:  # a checkpoint from another task goes on without
+        if truth is not None and config.privileged_size == sizes[0]:  # else it comes from another task
             statistics = fit_statistics(truth.numpy(), truth.numpy(), "mse")
             self.truth_mean.copy_(statistics["input_mean"])
             self.truth_scale.copy_(statistics["input_scale"])
@@ -234,15 +234,15 @@ class CNNPolicy(MLPPolicy):
             self._remember(KEYPOINTS, columns, places)
 
     def _truth(self, columns: Table) -> Tensor | None:
-        """The state of the environment, (N, k), if it is to be read off."""
+        """Return the environment state, (N, k), if it is to be predicted."""
         if not self.aux_weight or ENVIRONMENT_STATE not in columns or ENVIRONMENT_STATE in self.inputs:
             return None
         return torch.from_numpy(columns[ENVIRONMENT_STATE].astype(np.float32))
 
     def _places(self, columns: Table) -> Tensor | None:
-        """Where named points are in every camera's picture, (N, cameras, K, 3), where heat maps are to be learnt.
+        """Return positions of named points in every camera's picture, (N, cameras, K, 3), if heat maps are trained.
 
-        Raises `UsageError` for a dataset without.
+        Raises `UsageError` for a dataset without them.
         """
         keys = self._place_columns()
         if not keys:
@@ -259,18 +259,18 @@ class CNNPolicy(MLPPolicy):
 class KeypointEncoder(nn.Module):
     """A few convolutions and a spatial softmax.
 
-    (Levine et al., End-to-end training of deep visuomotor policies, JMLR 2016, section 5.1.) Every keypoint is a
-    channel's softmax over the picture. Of it come the mean x and y, -1 to 1, finer than a pixel, and two numbers
-    more: the deviation, which says how large a thing is and so how far away; and the mean activation, which says
-    whether the thing is to be seen at all, as the softmax of nothing is a place too.
+    (Levine et al., End-to-end training of deep visuomotor policies, JMLR 2016, section 5.1.) Every keypoint is the
+    softmax of one channel over the picture. It yields the mean x and y, -1 to 1, with subpixel resolution, and two more
+    numbers: the deviation, which indicates the size of a thing and hence its distance, and the mean activation, which
+    says whether the thing is visible at all, as the softmax of an empty picture has a mean, too.
 
-    A keypoint learns only from what it looks at, so some must begin on every small thing of a colour of its own.
-    Hence the picture is split into light and colour, and the weights begin with variance 2 / inputs (He et al.,
-    Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own weights every softmax
-    began as the mean over the picture, and in 1,100 steps a goal of 5 pixels was not found; so it is in 300.
+    A keypoint learns only where its softmax is large, so some must start on every small thing of a distinct colour.
+    Hence the picture is split into brightness and colour, and the weights start with variance 2 / inputs (He et al.,
+    Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own initialisation
+    every softmax began as the picture's mean; a goal of 5 pixels was not found in 1,100 steps, but now in 300.
 
-    channels: of the layers; the first two halve the picture's sides. keeps_maps: have `maps`, logarithms of the last
-    pictures' heat maps, (B, K, height, width), while learning.
+    channels: those of the layers; the first two halve the picture's sides. keeps_maps: whether `maps` holds the
+    logarithms of the last pictures' heat maps, (B, K, height, width), while training.
     """
 
     maps: Tensor | None = None
@@ -291,17 +291,17 @@ class KeypointEncoder(nn.Module):
         self.size = NUMBERS * keypoints
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Return numbers of the keypoints, (B, 4 K) in single precision, from pictures (B, 3, H, W) from 0 to 1."""
-        # Channels last is faster on a CPU. The weights stay contiguous, as safetensors wants an optimiser's state.
+        """Return the numbers of the keypoints, (B, 4 K) in single precision, for pictures (B, 3, H, W) from 0 to 1."""
+        # Channels-last is faster on a CPU. The weights stay contiguous, as safetensors needs for an optimiser's state.
         features = self.layers(_light_and_colour(pictures).contiguous(memory_format=torch.channels_last))
         # In half precision a keypoint would jump from pixel to pixel.
         with torch.autocast(pictures.device.type, enabled=False):
             return self._keypoints(features.float())
 
     def _keypoints(self, features: Tensor) -> Tensor:
-        """Numbers of the keypoints, (B, 4 K), from features (B, C, height, width)."""
+        """Return the numbers of the keypoints, (B, 4 K), from features (B, C, height, width)."""
         height, width = features.shape[2:]
-        # A convolution of one pixel as a product, whose result lies in memory as the softmax wants it.
+        # A 1 x 1 convolution as a matrix product, whose result is laid out in memory for the softmax.
         cells = features.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)  # (B, C, cells), without a copy
         heat = self.heat.weight.flatten(1) @ cells + self.heat.bias.unsqueeze(1)  # type: ignore[union-attr]
         weights = (_SHARPNESS * heat).softmax(-1)
@@ -316,18 +316,18 @@ class KeypointEncoder(nn.Module):
 
 
 def _places(height: int, width: int, device: torch.device) -> Tensor:
-    """Across, down, and the sum of their squares, of every cell of a heat map, row by row, (height width, 3)."""
+    """Return x, y and x^2 + y^2 of every cell of a heat map, row by row, (height width, 3)."""
     x = torch.linspace(-1.0, 1.0, width, device=device).repeat(height)
     y = torch.linspace(-1.0, 1.0, height, device=device).repeat_interleave(width)
     return torch.stack([x, y, x.square() + y.square()], dim=1)
 
 
 def heat_map_losses(maps: Tensor, places: Tensor) -> Tensor:
-    """Return the mean cross-entropy [nats] of the points in view, (B,), 0 if none is.
+    """Return the mean cross-entropy [nats] of the visible points, (B,), 0 if none is visible.
 
-    maps: logarithms of heat maps (B, K, height, width), whose cells are `STRIDE` pixels apart from the first pixel on.
-    places: across and down from 0 to 1, and whether that is in view, (B, K, 3); a place between cells counts for the
-    four around it, the nearer the more.
+    maps: logarithms of heat maps (B, K, height, width), whose cells are `STRIDE` pixels apart, starting at the first
+    pixel. places: x and y from 0 to 1, and whether the point is visible, (B, K, 3); a point between cells is shared
+    among the four around it by bilinear weights.
     """
     size = torch.tensor([maps.shape[3], maps.shape[2]], device=maps.device)
     at = ((places[..., :2] * STRIDE * size - 0.5) / STRIDE).clamp(min=0).minimum(size - 1.0)
@@ -343,6 +343,6 @@ def heat_map_losses(maps: Tensor, places: Tensor) -> Tensor:
 
 
 def _light_and_colour(pictures: Tensor) -> Tensor:
-    """Mean of red, green and blue, and what red and green have more than that, (B, 3, H, W)."""
+    """Return the mean of red, green and blue, and red and green minus that mean, (B, 3, H, W)."""
     light = pictures.mean(1, keepdim=True)
     return torch.cat([_LIGHT * (light - 0.5), _COLOUR * (pictures[:, :2] - light)], dim=1)

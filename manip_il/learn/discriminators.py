@@ -1,4 +1,4 @@
-"""Discriminators of adversarial imitation: who acted, the expert or the learner? Their answer is the reward.
+"""Discriminators of adversarial imitation, which tell expert from learner; their output is the reward.
 
 Both learn D = P(expert | transition) by logistic loss. `GailDiscriminator` is any function of state and action (Ho &
 Ermon, Generative adversarial imitation learning, NeurIPS 2016). `AirlDiscriminator` has the form
@@ -30,13 +30,13 @@ Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), 
 
 
 class Discriminator(nn.Module, ABC):
-    """A discriminator, its optimiser and its units. network: the actor, whose statistics scale the inputs."""
+    """A discriminator, its optimiser and its input scales. network: the actor, whose statistics scale the inputs."""
 
     mean: Tensor
     scale: Tensor
     clamp: Tensor
     free: Tensor
-    asks_density = False  # whether the logit depends on how likely an action is for the learner
+    asks_density = False  # whether the logit depends on the learner's log-density of the action
 
     def __init__(self, config: DiscriminatorConfig, network: MLPNetwork) -> None:
         super().__init__()
@@ -50,16 +50,16 @@ class Discriminator(nn.Module, ABC):
 
     @abstractmethod
     def build(self, e: int, n: int) -> None:
-        """Make the layers, for encoded states of e numbers and actions of n."""
+        """Build the layers, for encoded states of e numbers and actions of n."""
 
     @abstractmethod
     def logits(self, batch: Batch) -> Tensor:
         """Return log D - log(1 - D), (B,)."""
 
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
-        """Return the reward of every transition, (N,), within +-10.
+        """Return the reward of every transition, (N,), clipped to +-10.
 
-        log_probs: of its action for the learner, (N,), if the discriminator `asks_density`.
+        log_probs: the learner's log-density of each action, (N,), if the discriminator `asks_density`.
         """
         with torch.no_grad():
             rewards = self.logits(self._encode(learner, log_probs))
@@ -68,9 +68,9 @@ class Discriminator(nn.Module, ABC):
     def fit(
         self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32] | None, rng: np.random.Generator
     ) -> dict[str, float]:
-        """Take an iteration's gradient steps; return the loss, and accuracies before them.
+        """Take an iteration's gradient steps; return the loss, and the accuracies before them.
 
-        log_probs: of the expert's and the learner's actions for the learner, (N,) each, if it `asks_density`.
+        log_probs: the learner's log-densities of the expert's and its own actions, (N,) each, if it `asks_density`.
         """
         data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs or (None, None), strict=True)]
         with torch.no_grad():
@@ -92,7 +92,7 @@ class Discriminator(nn.Module, ABC):
         return loss.item()
 
     def _gradient_penalty(self, expert: Batch, learner: Batch, rng: np.random.Generator) -> Tensor:
-        """Mean of (|gradient of the logit| - 1)^2 between the two (Gulrajani et al., Improved training of WGANs)."""
+        """Return the mean (|gradient of logit| - 1)^2 between both (Gulrajani et al., Improved training of WGANs)."""
         share = torch.from_numpy(rng.random((len(expert[0]), 1), dtype=np.float32))
         mixed = [a * share + b * (1 - share) for a, b in zip(expert[:3], learner[:3], strict=True)]
         inputs = [one.requires_grad_() for one in mixed]
@@ -103,7 +103,7 @@ class Discriminator(nn.Module, ABC):
         return (gradients.norm(dim=1) - 1.0).square().mean()
 
     def perceptron(self, inputs: int) -> nn.Sequential:
-        """Return two hidden layers and one number, (B, inputs) to (B, 1)."""
+        """Return a network of two hidden layers with one output, (B, inputs) to (B, 1)."""
         width = self.config.width
         return nn.Sequential(
             nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)
@@ -136,8 +136,8 @@ class GailDiscriminator(Discriminator):
 class AirlDiscriminator(Discriminator):
     """f(s, a, s') against the learner's log-density, as above; the reward is log D - log(1 - D) = f - log pi.
 
-    pi is taken relative to exp(-H), H its entropy: else -log pi, which is H on average, rewards every step of living
-    on, but none in the absorbing state, where nothing is drawn, and f has to follow H while the spread changes.
+    pi is divided by exp(-H) with its entropy H. Otherwise -log pi, whose mean is H, would reward every step before the
+    absorbing state but none in it, where no action is sampled, and f would have to track H as the spread changes.
     """
 
     asks_density = True

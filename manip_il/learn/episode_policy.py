@@ -1,12 +1,12 @@
-"""LeRobot's policies in many episodes at once.
+"""LeRobot policies that run many episodes at once.
 
-They keep what they remember (queues of actions, past observations, ensembles) as plain attributes, one for all rows of
-a batch. Here every episode has a copy of its own that shares the weights and acts alone: it plans at its own clock, and
-its actions are the same bits whatever runs beside it.
+They keep their memory (queues of actions, past observations, ensembles) in plain attributes, one for all rows of a
+batch. Here every episode has its own copy, which shares the weights and acts alone: it plans at its own times, and its
+actions are bit-identical whatever runs beside it.
 
-Diffusion policies take long to plan, so episodes share calls of their network: an eighth of the time a plan. In its
-last bits a row's plan depends on how many rows there are and which of them it is, not on what the others hold. So every
-call has `ROWS` rows, and an episode's number says which is its own. LeRobot's plan, of one row, differs by rounding.
+Diffusion policies are slow to plan, so episodes share calls of the network, which takes an eighth of the time per plan.
+The last bits of a row's plan depend on the number of rows and on its index, not on the contents of other rows. So
+every call has `ROWS` rows, and an episode's number determines its row. LeRobot's plan, of one row, differs by rounding.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from torch import Tensor
 from manip_il.learn.checkpoint import in_one_line
 
 Batch = dict[str, Any]
-ROWS = 25  # of the episodes that run in lockstep, whose numbers follow each other: each has a row to itself
+ROWS = 25  # rows per call; episodes in lockstep have consecutive numbers, so each has a row to itself
 
 
 class EpisodePolicy:
-    """A LeRobot policy with its processors and one memory an episode.
+    """A LeRobot policy with its processors and one memory per episode.
 
-    module: the policy without a memory of any episode. task: instruction for one that reads language, in episodes that
-    `instruct` gives no other.
+    module: the policy without any episode's memory. task: instruction for a policy that reads language, in episodes
+    without one from `instruct`.
     """
 
     def __init__(
@@ -49,14 +49,14 @@ class EpisodePolicy:
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
         self._instructions: dict[int, str] = {}
-        self._steps = Counter[int]()  # taken in every episode
-        self._memories: dict[int, Any] = {}  # a copy of the policy; of diffusion its queues alone
+        self._steps = Counter[int]()  # steps taken in every episode
+        self._memories: dict[int, Any] = {}  # a copy of the policy; for diffusion only its queues
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> Tensor:
-        """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
+        """Return one action per row, (B, n). Episodes that are not listed have ended and are forgotten."""
         self.forget([episode for episode in self._steps if episode not in set(episodes)])
         seeds = [self._next_seed(episode) for episode in episodes]
-        # mixed precision if the policy was trained so, as lerobot-eval has it
+        # mixed precision if the policy was trained with it, as in lerobot-eval
         half = torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
         with in_one_line("the policy cannot act"), half:
             if self.module.config.type == "diffusion":
@@ -73,7 +73,7 @@ class EpisodePolicy:
                 kept.pop(episode, None)
 
     def instruct(self, instructions: Mapping[int, str]) -> None:
-        """Take the texts of episodes that begin, by their numbers."""
+        """Set the instructions of episodes that begin, by their numbers."""
         self._instructions.update({episode: text for episode, text in instructions.items() if text})
 
     def _one(self, row: Batch, episode: int, seed: int) -> Tensor:
@@ -86,13 +86,13 @@ class EpisodePolicy:
         return self._before({**batch, "task": [self._instructions.get(one, self._task) for one in episodes]})
 
     def _next_seed(self, episode: int) -> int:
-        """The seed of what is drawn in an episode's next step."""
+        """Return the random seed of an episode's next step."""
         step = self._steps[episode]
         self._steps[episode] += 1
         return int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
 
     def _planned(self, observed: Batch, episodes: Sequence[int], seeds: Sequence[int]) -> Tensor:
-        """Actions (B, n) as `DiffusionPolicy.select_action` has them, row by row, not yet in the data's units."""
+        """Return actions (B, n) as in `DiffusionPolicy.select_action`, row by row, still normalised."""
         policy: Any = self.module
         batch = {key: value for key, value in observed.items() if isinstance(value, Tensor)}
         if images := policy.config.image_features:
@@ -111,7 +111,7 @@ class EpisodePolicy:
         return torch.cat([self._memories[episode][ACTION].popleft() for episode in episodes])
 
     def _plan(self, block: Mapping[int, tuple[int, int]]) -> None:
-        """Make the plans of the episodes in these rows, each with its seed."""
+        """Compute the plans of the episodes in these rows, each with its seed."""
         policy: Any = self.module
         model, config = policy.diffusion, policy.config
         weight = next(model.parameters())
@@ -132,7 +132,7 @@ class EpisodePolicy:
 
 
 def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
-    """The parts that copies share, as a memo of `deepcopy`: weights, buffers, torch's own layers, the configuration."""
+    """Return the parts that copies share, as a memo for `deepcopy`: weights, buffers, torch's layers, configuration."""
     layers = (
         module
         for module in policy.modules()
@@ -143,10 +143,10 @@ def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
 
 @contextlib.contextmanager
 def _drawing(seed: int, device: torch.device) -> Iterator[None]:
-    """Let torch draw what depends on the seed alone; after it, the global generator is as before."""
+    """Seed torch's global generator inside; restore its state afterwards."""
     cuda = device.type == "cuda"
     with torch.random.fork_rng(devices=[device] if cuda else []):
-        # Not `torch.manual_seed`, which visits every kind of device and takes as long as a small policy.
+        # not `torch.manual_seed`, which seeds every kind of device and takes as long as a small policy
         torch.default_generator.manual_seed(seed)
         if cuda:
             with torch.cuda.device(device):
@@ -156,7 +156,7 @@ def _drawing(seed: int, device: torch.device) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _drawing_from(scheduler: Any, generators: Sequence[torch.Generator]) -> Iterator[None]:
-    """Let a noise scheduler draw each row's noise from a generator of its own."""
+    """Let a noise scheduler draw the noise of each row from its own generator."""
     own = scheduler.step
 
     def step(*args: Any, generator: None = None, **kwargs: Any) -> Any:

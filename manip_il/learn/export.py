@@ -1,7 +1,7 @@
-"""A policy in one file that runs without this package: ONNX, for onnxruntime and others.
+"""Export of a policy to one file that runs without this package: ONNX, for onnxruntime and others.
 
-Observations go in by LeRobot's names, raw; absolute actions come out. Everything between, units and clipping too, is
-in the file. What names, shapes and units mean is in its metadata.
+Its inputs are raw observations under LeRobot's names, its outputs absolute actions. Everything between, normalisation
+and clipping too, is in the file. Its metadata say what the names, shapes and units mean.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 
-TOLERANCE = 1e-5  # [rad] or [m], between the file's actions and the checkpoint's
+TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
 _OPSET = 17
 _ROWS = 64  # observations on which file and checkpoint are compared
 _UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
@@ -40,7 +40,7 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Exported:
-    """A file's content and metadata. difference: the largest from the checkpoint's actions over random observations."""
+    """A file's content and metadata. difference: the largest from the checkpoint's actions on random observations."""
 
     data: bytes
     metadata: dict[str, Any]
@@ -48,7 +48,7 @@ class Exported:
 
 
 class PolicyFunction(nn.Module):
-    """A policy as a function of one moment: observations in the order of `inputs`, absolute actions (B, n) out.
+    """A policy as a function of one observation: inputs in the order of `inputs`, absolute actions (B, n) as output.
 
     Joint state (B, n) and environment state (B, k) are float32, pictures uint8 (B, H, W, 3), as cameras give them.
     """
@@ -74,7 +74,7 @@ class PolicyFunction(nn.Module):
 def export_onnx(path: Path, policy_sha256: str) -> Exported:
     """Return the policy in a `pretrained_model` folder as ONNX.
 
-    Raises `ManipError` if the file would act otherwise than the checkpoint, and what `LearnedPolicy.load` raises.
+    Raises `ManipError` if the file would act differently from the checkpoint, and what `LearnedPolicy.load` raises.
     """
     import onnx
     import onnxruntime
@@ -85,11 +85,11 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
     example = _observations(policy, function, rows=2)
     content = io.BytesIO()
     with warnings.catch_warnings(action="ignore"):
-        # The exporter that torch prefers needs two packages more, and gives the same graph.
+        # Torch's preferred exporter needs two more packages and gives the same graph.
         torch.onnx.export(
             function,
             tuple(map(torch.from_numpy, example.values())),
-            content,  # pyright: ignore[reportArgumentType]  # it takes what can be written to
+            content,  # pyright: ignore[reportArgumentType]  # it takes any writable file
             input_names=list(example),
             output_names=[ACTION],
             dynamic_axes={name: {0: "batch"} for name in (*example, ACTION)},
@@ -131,7 +131,7 @@ def file_metadata(policy: LearnedPolicy, inputs: Sequence[str], sha256: str) -> 
 
 
 def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
-    """The name, type and shape of an input or output, and what its numbers mean, if that is known."""
+    """Return the name, type and shape of an input or output, and what its numbers mean, if known."""
     checkpoint, meta = policy.checkpoint, policy.checkpoint.origin
     if key.startswith(IMAGES):
         shape = ["batch", *checkpoint.pictures[key.removeprefix(IMAGES)], 3]
@@ -148,7 +148,7 @@ def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
 
 
 def _load(path: Path) -> LearnedPolicy:
-    """The policy of a folder; raises `ManipError` for one that no file can hold."""
+    """Return the policy in a folder. Raises `ManipError` for a policy that cannot be exported."""
     policy = LearnedPolicy.load(path)
     modes = policy.checkpoint.config.get("normalization_mapping", {})
     if any(mode != "IDENTITY" for mode in mapping(f"{path / CONFIG}: normalization_mapping", modes).values()):
@@ -159,7 +159,7 @@ def _load(path: Path) -> LearnedPolicy:
 
 
 def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) -> Arrays:
-    """Random observations, spread as the training data were."""
+    """Return random observations, distributed as in the training data."""
     rng = np.random.default_rng(0)
     widths = [policy.checkpoint.numbers[key] for key in function.numbers]
     network, size = function.network, sum(widths)
@@ -173,7 +173,7 @@ def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) ->
 
 
 def _actions(policy: LearnedPolicy, function: PolicyFunction, observation: Arrays) -> NDArray[np.float64]:
-    """What the checkpoint does, (B, n)."""
+    """Return the checkpoint's actions, (B, n)."""
     images = {key.removeprefix(IMAGES): observation[key] for key in function.cameras}
     around = observation.get(ENVIRONMENT_STATE, np.empty((len(observation[STATE]), 0), np.float32))
     return policy.act(observation[STATE], around, images)

@@ -1,4 +1,4 @@
-"""The options of a fit by LeRobot's names. Help reads them: neither torch nor LeRobot is imported for it."""
+"""The options of a fit, by LeRobot's names. Help imports this module, so it imports neither torch nor LeRobot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # it imports numpy
 
 
 class Defaults(NamedTuple):
-    """Gradient steps, samples in the batch of one, steps from one checkpoint to the next."""
+    """Gradient steps, samples per batch, and steps between checkpoints."""
 
     steps: int
     batch_size: int
@@ -26,24 +26,24 @@ class Defaults(NamedTuple):
 
 ActionSpace = Literal["joint_target", "joint_delta", "ee_delta"]
 LEROBOT = Defaults(100_000, 8, 20_000)
-DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}  # if they are not LeRobot's
+DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}  # where these differ from LeRobot's
 
 
 def _by_default(name: str) -> str:
-    """Return what a number is if it is not given, by the kind of the policy."""
+    """Return a phrase for help with the default of a number for each kind of policy."""
     own = ", ".join(f"{getattr(numbers, name):,} for {kind}" for kind, numbers in DEFAULTS.items())
     return f"by default {own}, else {getattr(LEROBOT, name):,}"
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Options of a fit; None is the default of the policy's kind.
+    """Options of a fit; None stands for the default of the policy's kind.
 
-    policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). action_space: see
-    `manip_il.learn.action_spaces`; by default that of a checkpoint to start from, too. threads: a second one is up to
-    1.8 times as fast if a core is free, and tens of times slower if none is. trust: whether models that the
-    policy or its checkpoint names may be loaded. seed: of weights and batches. init_from: a `pretrained_model` folder
-    whose weights to start from.
+    policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`, ...). action_space: see
+    `manip_il.learn.action_spaces`; by default that of the initial checkpoint, if there is one. threads: a second thread
+    is up to 1.8 times as fast if a core is free, and tens of times slower if none is. trust: whether models that the
+    policy or its checkpoint names may be loaded. seed: for weights and batches. init_from: a `pretrained_model` folder
+    with the initial weights.
 
     Raises `UsageError` for a number out of range.
     """
@@ -95,7 +95,7 @@ class FitConfig:
 
     @cached_property
     def start(self) -> Checkpoint | None:
-        """The checkpoint in `policy.path`. Raises `ManipError` for one that cannot be read."""
+        """The checkpoint in `policy.path`. Raises `ManipError` if it cannot be read."""
         if "path" not in self.policy:
             return None
         from manip_il.learn.checkpoint import Checkpoint
@@ -114,7 +114,7 @@ class FitConfig:
 
     @property
     def observes(self) -> str:
-        """The one of `OBSERVATIONS` asked for, else the checkpoint's, else that of the policy's kind."""
+        """The requested member of `OBSERVATIONS`, else the checkpoint's, else that of the policy's kind."""
         return self.observation or (self.start.observation if self.start else "images" if self.kind == CNN else "state")
 
     @property
@@ -124,12 +124,12 @@ class FitConfig:
 
     @property
     def defaults(self) -> Defaults:
-        """Numbers that hold if none are given."""
+        """Default numbers for this kind of policy."""
         return DEFAULTS.get(self.kind, LEROBOT)
 
     @property
     def augments(self) -> bool:
-        """Whether pictures are changed by chance; cropped ones do not show the cnn where things are."""
+        """Whether pictures are randomly changed; by default not for cnn, as crops hide where things are."""
         return self.kind != CNN if self.image_augment is None else self.image_augment
 
     @property

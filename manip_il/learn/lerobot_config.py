@@ -1,4 +1,4 @@
-"""LeRobot's configurations (policy, optimiser, schedule, ...) from the options that a user gave, by LeRobot's names."""
+"""LeRobot's configurations (policy, optimiser, schedule, ...), built from the user's options."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from manip_il.learn.fit_config import FitConfig, check_convertible
 from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
-# Where a policy's configuration is kept with what was meant for one machine or one command.
+# Options of LeRobot's policies that are meant for one machine or one command.
 NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
 
 
@@ -40,7 +40,7 @@ def policy_types() -> tuple[str, ...]:
 
 
 def policy_class(kind: str) -> type[PreTrainedConfig]:
-    """Return the configuration class of a policy type; `UnknownName` for another."""
+    """Return the configuration class of a policy type. Raises `UnknownName` for an unknown type."""
     policy_types()
     return _registered(PreTrainedConfig, kind, "policy")
 
@@ -53,13 +53,13 @@ def _registered(base: type[Any], kind: Any, what: str) -> Any:
 
 
 def policy_config(fit: FitConfig) -> PreTrainedConfig:
-    """Return the configuration of the policy of a fit: new, or that of the checkpoint to start from, changed.
+    """Return the policy configuration of a fit: new, or that of the initial checkpoint with changes.
 
-    The device is the graphics card if there is one. Raises `UnknownName` for a type or an option that is not there,
-    `UsageError` for a value that LeRobot refuses, `ManipError` if models are named that would have to be trusted.
+    The device is the GPU if there is one. Raises `UnknownName` for an unknown type or option, `UsageError` for a value
+    that LeRobot refuses, `ManipError` if it names models that are not trusted.
     """
     given = {name: value for name, value in fit.policy.items() if name not in ("type", "path")}
-    if str(given.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot takes another
+    if str(given.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot would choose another
         raise UsageError(f"--policy.device={given['device']}, but torch sees no graphics card here; expected cpu")
     given.setdefault("device", "cuda" if torch.cuda.is_available() else "cpu")
     source, options = f"--policy.type={fit.kind}", dict(given)
@@ -67,26 +67,26 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     if fit.start is not None:
         source, saved = f"--policy.path={fit.start.path}", fit.start.config
         options = {name: value for name, value in saved.items() if name not in ("type", *NOT_OURS)}
-        if "pretrained_backbone_weights" in saved:  # they are in the checkpoint; torchvision would download its own
+        if "pretrained_backbone_weights" in saved:  # the checkpoint has these; torchvision would download its own
             options["pretrained_backbone_weights"] = None
         options |= given
     require_trust({**options, "type": fit.kind}, source, fit.trust)
     config = typing.cast(PreTrainedConfig, decode(cls, options, source))
-    config.push_to_hub = False  # LeRobot's default is to upload; here nothing leaves the machine unasked
+    config.push_to_hub = False  # LeRobot uploads by default; nothing leaves this machine unless asked to
     start = fit.init_from or (fit.start.path if fit.start else None)
     config.pretrained_path = None if start is None else Path(start)
     return config
 
 
 def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
-    """Return one of the configurations registered under `base`, by `settings["type"]`: an optimiser, a schedule."""
+    """Return a configuration registered under `base`, such as an optimiser or schedule, by `settings["type"]`."""
     own = {name: value for name, value in settings.items() if name != "type"}
     cls = _registered(base, settings.get("type"), f"--{group}.type")
     return decode(cls, own, f"--{group}.type={settings.get('type')}")
 
 
 def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
-    """Return a dataclass of LeRobot's from options by name; `UsageError` for what it refuses. source: of them."""
+    """Return a LeRobot dataclass from options by name. Raises `UsageError` if it refuses them. source: their origin."""
     known = [field.name for field in dataclasses.fields(cls) if field.init and field.name not in NOT_OURS]
     for name in settings:
         if name not in known:
@@ -99,7 +99,7 @@ def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
 
 
 def option_lines(kind: str) -> list[tuple[str, str]]:
-    """List name and default of every option of a policy type, for the help."""
+    """Return name and default of every option of a policy type, for the help."""
     rows = []
     for field in dataclasses.fields(policy_class(kind)):
         if not field.init or field.name in (*NOT_OURS, "input_features", "output_features"):
@@ -111,7 +111,7 @@ def option_lines(kind: str) -> list[tuple[str, str]]:
 
 
 def _printed(value: Any) -> str:
-    """The default as a user would type it."""
+    """Return the default as a user would type it."""
     return json.dumps(draccus.encode(value)).replace('"', "")
 
 
@@ -130,10 +130,10 @@ def policy_features(
 def set_features(
     policy: PreTrainedConfig, features: Mapping[str, dict[str, Any]], inputs: Sequence[str], observation: str
 ) -> None:
-    """Give a policy its inputs and outputs, from a dataset's features.
+    """Set a policy's inputs and outputs from a dataset's features.
 
-    LeRobot's policies for states leave `observation.environment_state` in its raw units unless told otherwise: here
-    it is normalised as the joint state is. Raises `ManipError` for what the policy refuses.
+    By default LeRobot's state-based policies leave `observation.environment_state` in its raw units; here it is
+    normalised like the joint state. Raises `ManipError` for features that the policy refuses.
     """
     policy.input_features, policy.output_features = policy_features(features, inputs)
     modes: dict[str, NormalizationMode] = getattr(policy, "normalization_mapping", {})
@@ -146,12 +146,12 @@ def set_features(
 
 
 def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[TrainPipelineConfig, str]:
-    """Return a fit's options as LeRobot has them (policy, optimiser, schedule, logger, ...), and its action space.
+    """Return a fit's options in LeRobot's form (policy, optimiser, schedule, logger, ...), and its action space.
 
-    They are what LeRobot writes as `train_config.json`, but for the dataset and the folder, which are not known yet.
-    action_meaning: of the data's numbers; if they are no joint targets, they are learnt as they are by default. Raises
-    what `policy_config` raises, `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot
-    does not know, `MismatchError` for a checkpoint to start from that has learnt in another action space.
+    LeRobot writes these as `train_config.json`, apart from the dataset and the folder, which are not known yet.
+    action_meaning: that of the data; by default, actions that are not joint targets are learnt unchanged. Raises what
+    `policy_config` raises, `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot does not
+    know, `MismatchError` for an initial checkpoint that learnt in another action space.
     """
     policy = policy_config(fit)
     space = _action_space(policy, fit, action_meaning)
@@ -178,7 +178,7 @@ def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[Tra
 
 
 def _action_space(policy: PreTrainedConfig, fit: FitConfig, meaning: str) -> str:
-    """The action space of a fit, also put into the configuration of a policy that has it there."""
+    """Return the action space of a fit; also set it in a policy configuration that has the option."""
     wanted = fit.action_space
     if wanted is None and "action_space" not in fit.policy and meaning not in JOINT_TARGETS:
         wanted = JOINT_TARGET

@@ -1,4 +1,4 @@
-"""LeRobot's policies and processors: made for a fit, and loaded from a checkpoint."""
+"""LeRobot's policies and processors, built for a fit or loaded from a checkpoint."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 
 from manip_il.data.schema import IMAGES
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.action_steps import add_steps  # known here, they are known to what is loaded
+from manip_il.learn.action_steps import add_steps  # importing it registers our steps for loading
 from manip_il.learn.checkpoint import MEASURED, PROCESSORS, Checkpoint, in_one_line
 from manip_il.learn.lerobot_config import policy_class
 from manip_il.learn.names import MLP
 from manip_il.learn.network import warm_start
 
 _DEVICE_STEP = "device_processor"
-_SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all of the data is noise, not scale
+_SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less variation than this in all of the data is noise
 
 
 def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = None) -> PreTrainedPolicy:
-    """Return LeRobot's policy, its weights new, from `config.pretrained_path`, or those of a run that is resumed.
+    """Return a LeRobot policy with new weights, those in `config.pretrained_path`, or those of the run to resume.
 
-    An mlp that starts from another one's weights has the units of its own data, see `warm_start`. Raises `ManipError`
-    for a checkpoint that cannot be loaded, and with the two ways out if a backbone's weights would have to be
-    downloaded and cannot be.
+    An mlp that starts from another mlp's weights has the statistics of its own data, see `warm_start`. Raises
+    `ManipError` for a checkpoint that cannot be loaded, and, with two alternatives in the message, if a backbone's
+    weights would have to be downloaded and cannot be.
     """
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
     warm = config.type == MLP and start is not None and resumed is None
@@ -50,16 +50,16 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     if warm:
         model: Any = policy.model
         warm_start(model, Path(str(start)))
-    if weights:  # a checkpoint has its own: it shall load if there is no network
+    if weights:  # the checkpoint has its own, so loading needs no network
         config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
     config.pretrained_path = None
     return policy
 
 
 def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion | None = None) -> tuple[Any, Any]:
-    """Return LeRobot's pre- and postprocessor, new, with the dataset's statistics.
+    """Return new LeRobot pre- and postprocessors with the dataset's statistics.
 
-    conversion: of the actions, which the dataset's metadata then has, if the processors are to carry one.
+    conversion: that of the actions in the dataset's metadata, if the processors are to do one.
     """
     before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
     if conversion is not None:
@@ -70,9 +70,9 @@ def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion
 def load_processors(
     checkpoint: Checkpoint, config: PreTrainedConfig, *, trust: bool = False, learns: bool = False
 ) -> tuple[Any, Any]:
-    """Return the processors of a checkpoint, on the configuration's device. learns: going on with a fit.
+    """Return the processors of a checkpoint, on the configuration's device. learns: whether a fit continues from it.
 
-    Raises `ManipError` if they are not there, and what `Checkpoint.require_trust` raises.
+    Raises `ManipError` if they do not exist, and what `Checkpoint.require_trust` raises.
     """
     checkpoint.require_processors()
     checkpoint.require_trust(trust)
@@ -83,9 +83,9 @@ def load_processors(
 
 
 def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return a dataset's statistics with a least deviation and range for vectors.
+    """Return a dataset's statistics with lower bounds on the deviations and ranges of vectors.
 
-    Without it, a joint that hardly moved in the data would be many deviations off wherever it does move.
+    Otherwise a joint that hardly moved in the data would be many deviations off as soon as it moves.
     """
     usable: dict[str, dict[str, Any]] = {}
     for key, values in stats.items():
@@ -100,18 +100,18 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 
 
 def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tuple[PreTrainedPolicy, Any, Any]:
-    """Return the policy of a checkpoint and its processors, without a network if LeRobot needs none.
+    """Return the policy of a checkpoint and its processors; downloads nothing unless LeRobot needs to.
 
-    Raises `UnknownName` for a type that is not known, `ManipError` if packages are missing, if what it names would have
-    to be trusted and is not, or if LeRobot cannot load the folder.
+    Raises `UnknownName` for an unknown type, `ManipError` if packages are missing, if the policy names models that are
+    not trusted, or if LeRobot cannot load the folder.
     """
     cls = policy_class(checkpoint.kind)
     own = {key: value for key, value in checkpoint.config.items() if key != "type"}
     checkpoint.require_trust(trust)
     with _lerobot(f"{checkpoint.path}: LeRobot cannot load it"):
-        # Not `PreTrainedConfig.from_pretrained`, which leaves a temporary file behind each time
+        # not `PreTrainedConfig.from_pretrained`, which leaves a temporary file behind each time
         config = draccus.decode(cls, own | {"device": device})
-        # Weights come from the checkpoint; torchvision would download its own first.
+        # The weights come from the checkpoint; torchvision would download its own first.
         if hasattr(config, "pretrained_backbone_weights"):
             config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
         processors = load_processors(checkpoint, config, trust=trust)
@@ -121,6 +121,6 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
 
 @contextlib.contextmanager
 def _lerobot(what: str) -> Iterator[None]:
-    """`in_one_line`, and what LeRobot prints is dropped, as standard output belongs to the caller."""
+    """Like `in_one_line`; also drops what LeRobot prints, as standard output belongs to the caller."""
     with in_one_line(what), contextlib.redirect_stdout(io.StringIO()):
         yield

@@ -1,11 +1,11 @@
-"""Behaviour cloning as maximum likelihood: the losses, and how each acts.
+"""Behaviour cloning as maximum likelihood: the losses, and the action that each yields.
 
 fit(D) = argmin over policies of the mean over D of -log pi(a* | s): empirical risk minimisation
 (imitation-learning chapter, Eqs. 8.2 to 8.4; the same reduction to supervised learning in
-Ross, Gordon and Bagnell, AISTATS 2011, section 2). A head says what family pi(. | s) is taken
-from. The network gives `params` (B, size) for a row; targets (B, n) are in normalised units.
+Ross, Gordon and Bagnell, AISTATS 2011, section 2). A head defines the family of distributions
+pi(. | s). The network gives `params` (B, size) for B rows; targets (B, n) are in normalised units.
 
-Acting is deterministic: one action for a state. `mse` and `l1` say nothing about spread.
+Acting is deterministic: one action per state. `mse` and `l1` do not model the spread.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from torch.nn.functional import softplus
 
 LOSSES = ("mse", "l1", "gaussian", "mixture", "categorical")
 
-# A deterministic expert lets the likelihood grow without bound as the deviation goes to zero. The
+# With a deterministic expert the likelihood grows without bound as the deviation goes to zero. The
 # floor, 2 % of a target's own standard deviation, keeps the gradients finite.
 MIN_LOG_STD = -4.0
-_REACH = 3.0  # deviations that a smeared target reaches
+_REACH = 3.0  # half-width of a smeared target [standard deviations]
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Head(ABC):
-    """A family of action distributions. n: numbers in an action. size: parameters a row."""
+    """A family of action distributions. n: numbers in an action. size: parameters per row."""
 
     n: int
     size: int
 
     @abstractmethod
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
-        """Return loss of each row, (B,), from params (B, size) and target (B, n)."""
+        """Return the loss of each row, (B,), from params (B, size) and target (B, n)."""
 
     @abstractmethod
     def action(self, params: Tensor) -> Tensor:
@@ -66,12 +66,12 @@ class L1Head(MSEHead):
 
 
 class GaussianHead(Head, nn.Module):
-    """Diagonal Gaussian: the network gives the mean; one learned log-deviation a dimension. Acts with the mean.
+    """Diagonal Gaussian: the network gives the mean; one log-deviation per dimension is learnt. Acts with the mean.
 
-    The deviation does not depend on the state: if it does, easy states outweigh hard ones by
-    orders of magnitude in the mean's gradient and the mean underfits (Seitzer et al., On the
-    pitfalls of heteroscedastic uncertainty estimation, ICLR 2022). In closed loop that lost
-    nearly every episode.
+    The deviation does not depend on the state. If it did, easy states would outweigh hard ones by
+    orders of magnitude in the mean's gradient and the mean would underfit (Seitzer et al., On the
+    pitfalls of heteroscedastic uncertainty estimation, ICLR 2022). In closed loop, that made
+    nearly every episode fail.
     """
 
     def __init__(self, n: int) -> None:
@@ -92,7 +92,7 @@ class MixtureHead(Head):
     """Mixture of `components` diagonal Gaussians (Bishop, Mixture density networks, 1994).
 
     Acts with the mean of the heaviest component: the mixture's own mean may lie between two ways
-    round an obstacle, where no demonstration goes.
+    around an obstacle, where no demonstration goes.
     """
 
     def __init__(self, n: int, components: int) -> None:
@@ -119,17 +119,17 @@ class MixtureHead(Head):
 
 
 class CategoricalHead(Head):
-    """Each dimension in `bins` equal bins over [-1, 1], the range of the data; cross-entropy.
+    """`bins` equal bins over [-1, 1], the range of the data, for each dimension; cross-entropy.
 
     A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother et al., Stop
-    regressing, ICML 2024, section 3.1), which says that neighbouring bins are near. `pad` bins of the same width beside
-    either end hold what is smeared over the edge: else a target there, as a capped joint step is, would be pulled
-    inwards. With `sigma` 0 there are none, and a target is shared out between the two nearest bin centres (two-hot, as
-    in Schrittwieser et al., MuZero, 2020, appendix F). Either way the centres' expectation is the target itself.
+    regressing, ICML 2024, section 3.1), so that neighbouring bins count as near. `pad` bins of the same width at
+    either end hold what is smeared past it; else a target there, as of a capped joint step, would be pulled inwards.
+    With `sigma` 0 there are none, and a target is split between the two nearest bin centres (two-hot, as in
+    Schrittwieser et al., MuZero, 2020, appendix F). Either way the expectation over centres is the target.
 
-    Acts with the expectation over the likeliest bin and those that its target was smeared over (at least its two
-    neighbours): exact within a bin, unlike the argmax, and never between two modes that are apart, unlike the
-    expectation over all bins.
+    Acts with the expectation over the likeliest bin and the bins within the smearing's half-width (at least its two
+    neighbours): exact within a bin, unlike the argmax, and never between two separate modes, unlike the expectation
+    over all bins.
     """
 
     def __init__(self, n: int, bins: int, sigma: float = 0.0) -> None:
@@ -152,10 +152,10 @@ class CategoricalHead(Head):
         return -((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
 
     def smeared(self, target: Tensor) -> Tensor:
-        """Return the share of each bin in targets (B, n), (B, n, bins and padding): `sigma`'s Gaussian over the bin."""
+        """Return each bin's share of targets (B, n), (B, n, bins and padding): `sigma`'s Gaussian over the bin."""
         edges = torch.arange(self.total + 1, dtype=target.dtype, device=target.device) - 0.5
         below = torch.special.ndtr((edges - self._place(target).unsqueeze(-1)) / self.sigma)
-        # The ends are 3 sigma or more away from any target, so the whole is never 0.
+        # The ends are at least 3 sigma from any target, so the sum is never 0.
         return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
 
     @override
@@ -168,7 +168,7 @@ class CategoricalHead(Head):
         return (weights * self._centres(near, params)).sum(-1)
 
     def _place(self, target: Tensor) -> Tensor:
-        """Targets, taken as the edge where they lie outside, in bins from the first centre."""
+        """Return targets, clamped to the data's range, in bins from the first centre."""
         return (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1)) + self.pad
 
     def _centres(self, bins: Tensor, params: Tensor) -> Tensor:
@@ -179,7 +179,7 @@ class CategoricalHead(Head):
 
 
 def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float = 0.0) -> Head:
-    """Return the head for a name in `LOSSES`. sigma: of `categorical` [bins]."""
+    """Return the head for a name in `LOSSES`. sigma: smearing by `categorical` [bins]."""
     heads: dict[str, Head] = {
         "mse": MSEHead(n),
         "l1": L1Head(n),
@@ -191,7 +191,7 @@ def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float = 0
 
 
 def floored_log_std(raw: Tensor) -> Tensor:
-    """Return log-deviations of the shape of `raw`, (B, n), that go smoothly to `MIN_LOG_STD` from above."""
+    """Return log-deviations of the shape of `raw`, (B, n), smoothly bounded below by `MIN_LOG_STD`."""
     return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
 
 

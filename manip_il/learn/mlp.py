@@ -1,6 +1,6 @@
 """The `mlp` policy in LeRobot's form: its options, its policy class and its processors.
 
-LeRobot finds all three in the module of the options' class. A plugin of LeRobot's must be a package, for
+LeRobot expects all three in the module of the options class. A LeRobot plugin must be a package, for
 `--policy.discover_packages_path=manip_il.learn.mlp`: hence `__path__`.
 """
 
@@ -34,7 +34,7 @@ __path__: list[str] = []
 @LRSchedulerConfig.register_subclass("warm_up_and_cosine")
 @dataclass
 class WarmUpAndCosineConfig(LRSchedulerConfig):
-    """A linear warm-up of a tenth of the steps at most, then a cosine down to zero."""
+    """A linear warm-up of at most a tenth of the steps, then a cosine down to zero."""
 
     num_warmup_steps: int = 100  # type: ignore[assignment]
 
@@ -53,9 +53,9 @@ class WarmUpAndCosineConfig(LRSchedulerConfig):
 @PreTrainedConfig.register_subclass("mlp")
 @dataclass
 class MLPConfig(Shape, PreTrainedConfig):
-    """A multi-layer perceptron from joint and environment state to one action; its options are `Shape`'s.
+    """A multi-layer perceptron from joint and environment state to one action; its options are those of `Shape`.
 
-    A configuration with features but no sigma, as a checkpoint's, was saved before there was one, so it is 0.
+    A saved configuration with features but no sigma is from before sigma existed, so its sigma is 0.
 
     The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
@@ -80,7 +80,7 @@ class MLPConfig(Shape, PreTrainedConfig):
 
     @override
     def validate_features(self) -> None:
-        """Raise unless `observation.state` and `action` are there with one and the same size."""
+        """Raise unless `observation.state` and `action` exist and have the same size."""
         state, action = self.robot_state_feature, self.action_feature
         if state is None or action is None:
             have = ", ".join([*(self.input_features or {}), *(self.output_features or {})])
@@ -100,11 +100,11 @@ class MLPConfig(Shape, PreTrainedConfig):
 class MLPPolicy(PreTrainedPolicy):
     """LeRobot's policy interface to `MLPNetwork`.
 
-    Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, to learn,
+    Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, in training,
     `action` (B, n), all raw ([rad], [m]).
 
     dataset_meta: LeRobot's, given by `make_policy` for training, or with a `table` of the columns; the statistics are
-    then theirs, those of frames with a valid label.
+    then computed from it, over the frames with a valid label.
     """
 
     config_class = MLPConfig  # type: ignore[assignment]
@@ -122,37 +122,37 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """Return the mean loss over the rows of a batch, whose columns are (B, n), and no metrics."""
+        """Return the mean loss over the rows of a batch, whose columns are (B, n), and an empty dict of metrics."""
         losses = self._row_losses(self.network_inputs(batch), batch)
         return losses.sum() / len(losses), {}
 
     @override
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return one action a row, (B, n): absolute, but of `ee_delta` the motion of the hand."""
+        """Return one action per row, (B, n): absolute, except for `ee_delta`, where it is the motion of the hand."""
         return self.model.act(self.network_inputs(batch))
 
     @override
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return a chunk of one action a row, (B, 1, n)."""
+        """Return a chunk of one action per row, (B, 1, n)."""
         return self.select_action(batch).unsqueeze(1)
 
     @override
     def reset(self) -> None:
-        """Forget nothing: the policy has no memory."""
+        """Do nothing: the policy has no memory."""
 
     @override
     def get_optim_params(self) -> Any:
         return [{"params": list(self.parameters()), "fused": True}]
 
     def _build(self, config: MLPConfig) -> None:
-        """Make the network, and leave out the features that it does not look at."""
+        """Build the network, and drop the features that it does not use."""
         features = config.input_features or {}
         config.input_features = {key: features[key] for key in self.inputs}
         width = sum(features[key].shape[0] for key in self.inputs)
         self.model = MLPNetwork(width, features[STATE].shape[0], config)
 
     def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
-        """The columns of the inputs that say how far one thing is from another."""
+        """Return the columns of the inputs that are offsets between two things."""
         n = (config.input_features or {})[STATE].shape[0]
         return tuple(n + i for i in offsets_of(features if ENVIRONMENT_STATE in self.inputs else {}))
 
@@ -161,11 +161,11 @@ class MLPPolicy(PreTrainedPolicy):
         return self.model.row_losses(self.model.encode(inputs), targets)
 
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return the network's inputs (B, d) of a batch of observations."""
+        """Return the network's inputs (B, d) for a batch of observations."""
         return torch.cat([batch[key] for key in self.inputs], dim=-1)
 
     def _columns(self, config: MLPConfig, dataset_meta: Any) -> Table:
-        """The columns of the data that is learnt from; those that nobody has read yet are read."""
+        """Return the columns of the training data; read those that have not been read yet."""
         table = dict(getattr(dataset_meta, "table", {}))
         if config.action_space == EE_DELTA and not table:
             raise ManipError(
@@ -178,11 +178,11 @@ class MLPPolicy(PreTrainedPolicy):
         return table
 
     def _more_columns(self) -> Sequence[str]:
-        """Columns that learning looks at beside the mlp's."""
+        """Return the columns that training needs in addition to the mlp's."""
         return ()
 
     def _learn_columns(self, columns: Table) -> None:
-        """Take statistics from a dataset's columns."""
+        """Compute statistics from a dataset's columns."""
         valid = torch.from_numpy(valid_frames(columns))
         seen = torch.cat([torch.from_numpy(columns[key])[valid] for key in self.inputs], dim=1).float()
         actions = torch.from_numpy(columns[ACTION])[valid].float()
@@ -192,7 +192,7 @@ class MLPPolicy(PreTrainedPolicy):
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
-    """Return the columns of the environment state that say how far one thing is from another; `UsageError` for none."""
+    """Return the columns of the environment state that are offsets between things. Raises `UsageError` if none is."""
     names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
     found = tuple(i for i, name in enumerate(names) if "_from_" in name)
     if not found:
@@ -203,7 +203,7 @@ def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
 def make_mlp_pre_post_processors(
     config: MLPConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[PolicyProcessorPipeline[Any, Any], PolicyProcessorPipeline[Any, Any]]:
-    """Return LeRobot's default pair: rename, batch (B, ...), device, normalise; and back.
+    """Return LeRobot's default pair: rename, batch (B, ...), device, normalise; and the inverse.
 
     `config.normalization_mapping` makes the normaliser steps the identity. They stay in the
     pipelines because LeRobot's tools override them by name.

@@ -1,6 +1,6 @@
-"""The `mlp` policy's network with the units of its data, in torch alone.
+"""The `mlp` policy's network with the statistics of its data, in pure torch.
 
-Apart from LeRobot's interface to it (`manip_il.learn.mlp`), so that a worker that only acts need not spend seconds on
+Separate from its LeRobot interface (`manip_il.learn.mlp`), so that a worker that only acts need not spend seconds on
 importing LeRobot.
 """
 
@@ -27,29 +27,28 @@ from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
 from manip_il.option import check_bounds, option
 
-# The order of the sums in a matrix product changes with the number of rows. Acting always
-# multiplies this many, filled up with zeros.
+# The order of summation in a matrix product depends on the number of rows. Acting always
+# multiplies this many, padded with zeros.
 ROWS = 64
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
 SIGMA = 3.0  # [bins]
 # [rad] or [m]. An input that moves less than this in all of the data is noise that division by its
-# deviation would blow up: it is multiplied by zero instead, so the network never sees it.
+# deviation would amplify: it is multiplied by zero instead, so the network never sees it.
 CONSTANT_INPUT = 1e-4
 CONSTANT_TARGET = 1e-6
 
 
 @dataclass
 class Shape:
-    """Sizes and kinds that a network is built from: the options of the `mlp` policy, which are `MLPConfig`'s, too.
+    """Sizes and kinds that a network is built from: the options of the `mlp` policy, and so of `MLPConfig`.
 
-    loss: one of `LOSSES`. components: of `mixture`. bins: a dimension, of `categorical`, over the range of the data.
-    sigma: how far `categorical` smears a target, in bins; 0: over the two nearest. clamp: bound of the normalised
-    inputs, in standard deviations, so that a state far off the data cannot blow the outputs up. action_space: of
-    `manip_il.learn.action_spaces`, in which it learns. scales: lengths s [m]; of every offset x among the inputs
-    (`object_from_ee.x`, ...) tanh(x / s) is an input, too. scaled: the columns of these offsets, taken from the
-    dataset.
+    loss: one of `LOSSES`. components: of `mixture`. bins: per dimension, for `categorical`, over the range of the data.
+    sigma: how far `categorical` smears a target, in bins; 0: over the two nearest. clamp: bound on the normalised
+    inputs, in standard deviations, so that states far from the data cannot blow up the outputs. action_space: one of
+    `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among the inputs (`object_from_ee.x`,
+    ...), tanh(x / s) is an input, too. scaled: the columns of these offsets, taken from the dataset.
 
-    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of range.
+    Raises `UnknownName` for an unknown loss or activation, `UsageError` for a size out of range.
     """
 
     width: int = option(256, "units per layer", at_least=1)
@@ -76,13 +75,13 @@ class Shape:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Shape:
-        """Return the shape in a policy's `config.json`; one from before there was a sigma has none."""
+        """Return the shape in a policy's `config.json`; sigma is 0 in a file from before sigma existed."""
         given: dict[str, Any] = {"sigma": 0.0}
         given |= {one.name: config[one.name] for one in fields(Shape) if one.name in config}
         return cls(**given)
 
 
-Statistics = Mapping[str, Tensor]  # by the names of `MLPNetwork`'s buffers
+Statistics = Mapping[str, Tensor]  # named as the buffers of `MLPNetwork`
 
 
 def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str) -> Statistics:
@@ -91,8 +90,8 @@ def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], lo
     x = (input - input_mean) * input_scale; target = target_mean + target_scale * y, clamped to
     [target_low, target_high], the range of the data.
 
-    Targets are scaled by mean and deviation, for `categorical` by the middle and half-width of
-    their range, which puts them in [-1, 1]. A constant target has scale 0: it is its mean.
+    Targets are scaled by mean and deviation, or, for `categorical`, by the middle and half-width of
+    their range, which puts them in [-1, 1]. A constant target has scale 0: it equals its mean.
     """
     low, high = targets.min(0).astype(np.float64), targets.max(0).astype(np.float64)
     if loss == "categorical":
@@ -108,17 +107,17 @@ def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], lo
 
 
 def _mean_and_deviation(values: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and standard deviation of each column."""
+    """Return mean and standard deviation of each column."""
     mean = values.mean(0, dtype=np.float64)
     return mean, np.sqrt(np.square(values - mean).mean(0))
 
 
 class MLPNetwork(nn.Module):
-    """Perceptron, head and units. Inputs (B, n + k) are raw, the first n the measured joints.
+    """Perceptron, head and normalisation. Inputs (B, n + k) are raw; the first n are the measured joints.
 
-    In the space `joint_delta` its targets are relative to the measured joints, but for the gripper's, the last, which
-    is absolute: it adds the joints itself. In any other its actions are its targets, for `action_spaces` to convert. A
-    row's action does not depend on the rows beside it, bit for bit.
+    In the space `joint_delta` its targets are relative to the measured joints, except for the gripper's, the last,
+    which is absolute: the network adds the joints itself. In all others its actions are its targets, to be converted by
+    `action_spaces`. A row's action does not depend on the other rows, bit for bit.
     """
 
     input_mean: Tensor
@@ -146,47 +145,47 @@ class MLPNetwork(nn.Module):
         self.register_buffer("target_high", torch.full((n,), torch.inf))
 
     def set_statistics(self, statistics: Statistics) -> None:
-        """Take the units of the data, saved with the weights. Inputs beyond those of `statistics` have none."""
+        """Set the statistics of the data, saved with the weights. Inputs beyond those of `statistics` have none."""
         for name, tensor in statistics.items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
     def expanded(self, inputs: Tensor) -> Tensor:
-        """Return inputs (B, n + k) and, of those at several scales, each scale's: close to, a millimetre counts."""
+        """Return inputs (B, n + k) with their offsets at each scale appended, so that millimetres count up close."""
         if not self.scales:
             return inputs
         return torch.cat([inputs, *(torch.tanh(inputs[:, self.scaled] / scale) for scale in self.scales)], dim=1)
 
     def encode(self, inputs: Tensor) -> Tensor:
-        """Return the perceptron's inputs from raw ones, (B, n + k)."""
+        """Return the perceptron's inputs for raw ones, (B, n + k)."""
         return ((self.expanded(inputs) - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
 
     def encode_targets(self, targets: Tensor) -> Tensor:
-        """Return the head's targets from raw relative ones, (B, n); 0 if the scale is 0."""
+        """Return the head's targets for raw relative ones, (B, n); 0 if the scale is 0."""
         inverse = torch.where(self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale))
         return (targets - self.target_mean) * inverse
 
     def row_losses(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return loss of each row, (B,), from encoded inputs and targets."""
+        """Return the loss of each row, (B,), from encoded inputs and targets."""
         return self.head.nll(self.layers(x), y)
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
-        """Return targets (B, n) of actions (B, n): the arm's from the measured joints if the network adds these."""
+        """Return targets (B, n) for actions (B, n): relative to the measured joints if the network adds these."""
         if not self.adds_joints:
             return actions
         return torch.cat([actions[:, ARM] - inputs[:, : self.n - 1], actions[:, GRIPPER:]], dim=1)
 
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
-        """Return actions, (B, n), each the same bits whatever the other rows are."""
-        rows = len(inputs)  # filled up with zeros to whole blocks
+        """Return actions, (B, n), each bit-identical whatever the other rows are."""
+        rows = len(inputs)  # padded with zeros to whole blocks
         padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
         padded[:rows] = inputs
         return torch.cat([self.actions(block) for block in padded.split(ROWS)])[:rows]
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """Return actions, (B, n), of all rows in one product, whose last bits depend on their number."""
+        """Return actions, (B, n), for all rows in one product, so that the last bits depend on their number."""
         y = self.head.action(self.layers(self.encode(inputs)))
-        # The expert's targets never left this range, so neither shall the learner's, wherever it is.
+        # The expert's targets never left this range, so the learner's must not either.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
         return self._absolute(inputs, target)
 
@@ -208,7 +207,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
-    """Return weights (n, d) and units (n,) by name from a `pretrained_model` folder; raises `ManipError`."""
+    """Return weights (n, d) and statistics (n,) by name from a `pretrained_model` folder. Raises `ManipError`."""
     path = Path(pretrained_model) / WEIGHTS
     try:
         return {name.removeprefix("model."): tensor for name, tensor in load_file(path).items()}
@@ -218,11 +217,11 @@ def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
-    """Copy the weights from a `pretrained_model` folder; `network` then acts as that one did, within rounding.
+    """Copy the weights from a `pretrained_model` folder; `network` then acts like that policy, up to rounding.
 
-    The input statistics stay those of the new data: the first layer takes up the difference. (An
+    The input statistics stay those of the new data: the first layer compensates the difference. (An
     input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
-    The range of the targets is that of the new data too; their mean and scale are taken over, being
+    The range of the targets is also that of the new data; their mean and scale are copied, as they are
     only the unit of the outputs. Raises `MismatchError` for other shapes, `ManipError` for a file that cannot be read.
     """
     saved = read_weights(pretrained_model)

@@ -1,4 +1,4 @@
-"""A checkpoint that acts: the one interface a rollout needs."""
+"""A policy loaded from a checkpoint, with the interface that rollouts use."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Batch = dict[str, torch.Tensor]
 
 
 class LearnedPolicy:
-    """Actions from a LeRobot checkpoint, for many episodes at once. checkpoint: what it sees, gives and is for."""
+    """Actions from a LeRobot checkpoint, for many episodes at once. checkpoint: its inputs, outputs and origin."""
 
     def __init__(self, policy: EpisodePolicy | _Perceptron, checkpoint: Checkpoint):
         self.checkpoint, self._policy = checkpoint, policy
@@ -36,12 +36,12 @@ class LearnedPolicy:
     def load(
         cls, checkpoint: Checkpoint | Path, device: str = "cpu", task: str = "", *, trust: bool = False
     ) -> LearnedPolicy:
-        """Load any LeRobot `pretrained_model` folder, from JSON and safetensors alone unless `trust`.
+        """Load any LeRobot `pretrained_model` folder, only from JSON and safetensors unless `trust`.
 
-        The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task:
-        text for a policy that reads language, if `instruct` gives no other. trust: load models and code that the
-        checkpoint names, too. Raises what `Checkpoint.open` raises, `ManipError` for files that do not match or,
-        without `trust`, name models to load; `UnknownName` for a type of policy that is not known.
+        The mlp is loaded without LeRobot, whose import takes seconds; other policies by LeRobot's own factory. task:
+        instruction for a policy that reads language, if `instruct` gives no other. trust: also load models and code
+        that the checkpoint names. Raises what `Checkpoint.open` raises, `ManipError` for files that do not match or,
+        without `trust`, that name models to load; `UnknownName` for an unknown type of policy.
         """
         if device.startswith("cuda") and not torch.cuda.is_available():
             raise UsageError(f"device is {device!r}, but torch sees no graphics card here; expected 'cpu'")
@@ -60,7 +60,7 @@ class LearnedPolicy:
 
     @property
     def module(self) -> torch.nn.Module:
-        """The network: an `MLPNetwork` of the mlp, LeRobot's policy of any other type."""
+        """The network: an `MLPNetwork` for the mlp, LeRobot's policy for any other type."""
         return self._policy.module
 
     @torch.inference_mode()
@@ -69,11 +69,10 @@ class LearnedPolicy:
     ) -> F64:
         """Return absolute actions, (B, n): joint targets [rad], gripper command [m].
 
-        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row,
-        its seed: what the policy remembers of an episode, and what it draws in it, belong to that number; by default
-        the row's place. An episode that is left out has ended. An action is the same bits whatever the other rows.
-        Raises `NotFiniteError` naming the row for an action that is not finite, `MismatchError` for pictures that are
-        missing or of another size.
+        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row, by
+        default its index; the policy's memory of an episode and its random draws depend on that number. An episode that
+        is left out has ended. An action is bit-identical whatever the other rows are. Raises `NotFiniteError` naming
+        the row for an action that is not finite, `MismatchError` for pictures that are missing or of another size.
         """
         if not len(states):
             return np.empty((0, self.checkpoint.action))
@@ -87,11 +86,11 @@ class LearnedPolicy:
         return found
 
     def reset(self, episodes: Iterable[int]) -> None:
-        """Forget the past of episodes that begin."""
+        """Reset the memory of episodes that begin."""
         self._policy.forget(episodes)
 
     def instruct(self, instructions: Mapping[int, str]) -> None:
-        """Take the texts of episodes that begin, by their numbers: for a policy that reads language."""
+        """Set the instructions of episodes that begin, by their numbers, for a policy that reads language."""
         self._policy.instruct(instructions)
 
     def _numbers(self, states: F32, environment_states: F32) -> Batch:
@@ -103,7 +102,7 @@ class LearnedPolicy:
         }
 
     def _pictures(self, images: Images) -> Batch:
-        """Pictures as LeRobot's evaluation feeds them: float32 (B, 3, H, W), from 0 to 1."""
+        """Return pictures as in LeRobot's evaluation: float32 (B, 3, H, W), from 0 to 1."""
         batch = {}
         for camera, size in self.checkpoint.pictures.items():
             picture = images.get(camera, np.empty((0, 0, 0, 3), np.uint8))
@@ -116,20 +115,20 @@ class LearnedPolicy:
 
 
 def actions_along(policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]) -> Iterator[tuple[NDArray[np.int64], F64]]:
-    """Yield rows (B,) and a policy's actions (B, n) in whole episodes that somebody else drove, in the order of time.
+    """Yield rows (B,) and a policy's actions (B, n) along whole recorded episodes, in order of time.
 
-    table: their `observation.state`, `observation.environment_state` and `episode_index`, an episode after the other.
+    table: their `observation.state`, `observation.environment_state` and `episode_index`, one episode after the other.
     """
     episodes = table[EPISODE_INDEX].reshape(-1)
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
     steps = np.arange(len(episodes)) - np.repeat(starts, np.diff(starts, append=len(episodes)))
-    for step in range(int(steps.max()) + 1):  # so that a policy with a memory remembers
+    for step in range(int(steps.max()) + 1):  # in order, for policies with a memory
         rows = np.flatnonzero(steps == step)
         yield rows, policy.act(table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, episodes[rows].tolist())
 
 
 class _Perceptron:
-    """The mlp: no memory, and one call for all rows, whose actions do not depend on each other."""
+    """The mlp: no memory, and one call for all rows, whose actions are independent of each other."""
 
     def __init__(self, checkpoint: Checkpoint, device: str):
         self._device = device
@@ -142,13 +141,13 @@ class _Perceptron:
             line = checks.one_line(error)
             raise ManipError(f"{checkpoint.path}: weights and {CONFIG} do not match: {line}") from error
         self.module.to(device).eval()
-        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # every other is the network's own
+        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network does the others itself
         self._conversion = Conversion(space, checkpoint.robot)
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
-        """Return one action a row (B, n).
+        """Return one action per row, (B, n).
 
-        The mlp's processors are the identity (see MLPConfig), but for the conversion of an action space.
+        The mlp's processors are the identity (see MLPConfig), except for the conversion of an action space.
         """
         targets = self.module.act(self._inputs(batch))
         if self._conversion.space == JOINT_TARGET:
@@ -156,10 +155,10 @@ class _Perceptron:
         return torch.from_numpy(self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy()))
 
     def forget(self, episodes: Iterable[int]) -> None:
-        """Forget nothing: the mlp has no memory."""
+        """Do nothing: the mlp has no memory."""
 
     def instruct(self, instructions: Mapping[int, str]) -> None:
-        """Read nothing: the mlp looks at numbers alone."""
+        """Do nothing: the mlp does not read language."""
 
     def _inputs(self, batch: Batch) -> torch.Tensor:
         return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)

@@ -1,10 +1,9 @@
-"""Proximal policy optimisation of the `mlp` policy's network, with a critic of its own, by stable-baselines3's `PPO`.
+"""Proximal policy optimisation of the `mlp` policy's network, with a separate critic, by stable-baselines3's `PPO`.
 
-The actor is new, or a clone's network with a spread of its own.
-
+The actor is new, or the network of a clone with a spread of its own.
 Schulman et al., Proximal policy optimization algorithms, 2017. An iteration is one rollout of whole episodes that all
-begin and end together, so that what is between two iterations is weights and the optimiser's state alone, and these
-are saved as safetensors and JSON.
+begin and end together, so that the only state between iterations is the weights and the optimiser's state, which are
+saved as safetensors and JSON.
 """
 
 from __future__ import annotations
@@ -43,19 +42,19 @@ from manip_il.learn.names import EE_DELTA, MLP
 from manip_il.learn.network import MLPNetwork, fit_statistics, read_weights
 from manip_il.learn.transitions import F32, Transitions
 
-EXTRA = 2  # numbers of an observation behind the policy's inputs: flag of the absorbing state, share of time gone
+EXTRA = 2  # numbers appended to the policy's inputs: flag of the absorbing state, elapsed share of the episode
 _GAUSSIAN = "gaussian"
-_CENTRED = ("mse", "l1", _GAUSSIAN)  # losses whose outputs are the mean of an action
-LAST_LR = 0.05  # share of the first learning rate that is left at the end
+_CENTRED = ("mse", "l1", _GAUSSIAN)  # losses whose outputs are the mean action
+LAST_LR = 0.05  # final learning rate as a share of the first
 _METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/explained_variance": "explained_variance"}
 
 
 class ActorCritic(ActorCriticPolicy):
-    """Actor and critic. Observations (B, d + 2): raw inputs, whether the state is absorbing, share of time gone.
+    """Actor and critic. Observations (B, d + 2): raw inputs, flag of the absorbing state, elapsed share of the episode.
 
-    The actor sees the inputs alone, so that it is the policy that is saved; the critic sees all: an episode has a last
-    step, before which less is to come. In the absorbing state actions do nothing, so their density is 1 there and
-    teaches the actor nothing. The same holds for a number of the action that never changed in the demonstrations.
+    The actor sees only the inputs, so that it is the policy that is saved; the critic sees all, as the return that is
+    left depends on the time to the end of the episode. In the absorbing state actions do nothing, so their density is 1
+    there and the actor learns nothing from it. The same holds for action dimensions that the demonstrations never vary.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class ActorCritic(ActorCriticPolicy):
 
     @override
     def _build(self, lr_schedule: Callable[[float], float]) -> None:
-        """Build nothing: what the base class would make is not used."""
+        """Do nothing: the base class's networks are not used."""
 
     @override
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
@@ -111,12 +110,12 @@ class ActorCritic(ActorCriticPolicy):
 
     @property
     def log_std(self) -> Tensor:
-        """Log-deviations of the numbers of an action that vary, (m,), in normalised units."""
+        """Log-deviations of the action dimensions that vary, (m,), in normalised units."""
         return floored_log_std(self.head.raw_log_std)[self._free > 0]
 
     @property
     def spread(self) -> Tensor:
-        """Deviations of the numbers of an action, (n,), in normalised units; 0 if they never change."""
+        """Deviations of the action dimensions, (n,), in normalised units; 0 for those that never vary."""
         return floored_log_std(self.head.raw_log_std).exp().detach() * self._free
 
     @property
@@ -129,9 +128,9 @@ class ActorCritic(ActorCriticPolicy):
 
 
 class Learner:
-    """An actor, a critic and PPO over `env`, whose episodes all have `horizon` steps.
+    """An actor, a critic and PPO on `env`, whose episodes all have `horizon` steps.
 
-    log_std: of the actor's exploration, in normalised units. clone: whether the actor is one, for the defaults.
+    log_std: initial log-deviation of the actor, in normalised units. clone: whether the actor starts from a clone.
     """
 
     def __init__(
@@ -175,7 +174,7 @@ class Learner:
         return policy
 
     def collect(self) -> Transitions:
-        """Run one episode in every environment; return all steps, those of a time together."""
+        """Run one episode in every environment; return all steps, grouped by time."""
         env, buffer = self.ppo.env, self.ppo.rollout_buffer
         assert env is not None
         self.ppo._last_obs = np.asarray(env.reset())
@@ -187,9 +186,9 @@ class Learner:
         return Transitions(states.astype(np.float32), actions.astype(np.float32), next_states.astype(np.float32))
 
     def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
-        """Take an iteration's gradient steps on what `collect` ran; rewards: (N,) in its order. Returns metrics.
+        """Take an iteration's gradient steps on what `collect` returned; rewards: (N,) in its order. Returns metrics.
 
-        actor: whether it moves, beside the critic. remaining: share of the run, with which the learning rate falls.
+        actor: whether to update the actor as well as the critic. remaining: share of the run, scales the learning rate.
         """
         buffer = self.ppo.rollout_buffer
         buffer.rewards[:] = rewards.reshape(buffer.rewards.shape)
@@ -203,9 +202,9 @@ class Learner:
         return {**found, "log_std": self.policy.log_std.mean().item()}
 
     def log_prob(self, rows: Transitions) -> F32:
-        """Return the log-density of every row's action for the actor, above its mean over actions [nats], (N,).
+        """Return the log-density of every row's action under the actor minus its expectation [nats], (N,).
 
-        That is log pi + H with the entropy H; 0 in the absorbing state, where nothing is drawn.
+        That is log pi + H with the entropy H; 0 in the absorbing state, where no action is sampled.
         """
         obs = torch.from_numpy(np.pad(rows.states, ((0, 0), (0, EXTRA - 1))))
         with torch.no_grad():
@@ -213,7 +212,7 @@ class Learner:
         return (log_prob + entropy).numpy()
 
     def explored(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
-        """Return the same rows, N, with noise of the actor's first spread on their actions, within their range."""
+        """Return the N rows with noise of the actor's initial spread added to their actions, clipped to their range."""
         noise = rng.standard_normal(rows.actions.shape, dtype=np.float32) * self._first_spread
         actions = np.clip(rows.actions + noise, *self._bounds) * (1.0 - rows.states[:, -1:])
         return Transitions(rows.states, actions.astype(np.float32), rows.next_states)
@@ -225,7 +224,7 @@ class Learner:
         return space.low, space.high
 
     def save(self, folder: Path, modules: Mapping[str, Any]) -> None:
-        """Write weights and optimisers' states of actor, critic and `modules`, by name, into `folder`."""
+        """Write weights and optimiser states of actor, critic and `modules`, by name, to `folder`."""
         for name, module in self._modules(modules).items():
             (folder / name).mkdir()
             save_file(module.state_dict(), folder / name / "weights.safetensors")
@@ -243,7 +242,7 @@ class Learner:
 
 @contextmanager
 def lent_generators(seed: int) -> Generator[None]:
-    """Replace the global generators of torch and numpy, which stable-baselines3 draws from, while the `with` lasts."""
+    """Seed torch's and numpy's global generators, which stable-baselines3 uses, inside; restore them afterwards."""
     before = np.random.get_state()  # noqa: NPY002
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -255,9 +254,9 @@ def lent_generators(seed: int) -> Generator[None]:
 
 
 def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec) -> Conversion:
-    """Return the way to the actor's actions: in the clone's space, else in `space`, by default that of the hand.
+    """Return the conversion of the actor's actions: the clone's, else for `space`, by default that of hand motions.
 
-    Raises `UsageError` for a `start` that cannot be gone on from, `MismatchError` for one for other data, and what
+    Raises `UsageError` for a `start` that is not usable, `MismatchError` for one trained on other data, and what
     `conversion_for` raises.
     """
     if start is None:
@@ -276,9 +275,9 @@ def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec)
 
 
 def start_policy(start: Path | None, space: str, spec: RobotTaskSpec, rows: tuple[F32, F32] | None) -> MLPPolicy:
-    """Return an mlp with a Gaussian's loss. rows: raw inputs (N, d) and targets (N, n), which give a new one its units.
+    """Return an mlp with a Gaussian loss. rows: raw inputs (N, d) and targets (N, n) for the statistics of a new one.
 
-    A clone keeps its own units, and acts as it did. Weights are drawn from torch's global generator.
+    A clone keeps its own statistics and acts as before. Weights are drawn from torch's global generator.
     """
     options = (None if start is None else Checkpoint.open(start).mlp_options) or {}
     options |= {"loss": _GAUSSIAN, "action_space": space}
@@ -297,7 +296,7 @@ def start_policy(start: Path | None, space: str, spec: RobotTaskSpec, rows: tupl
 
 
 def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:
-    """Write configuration, weights and processors of an mlp to a new folder, as LeRobot has them."""
+    """Write configuration, weights and processors of an mlp to a new folder, in LeRobot's layout."""
     folder.mkdir()
     policy.save_pretrained(folder)
     processors = make_pre_post_processors(policy.config)

@@ -1,12 +1,12 @@
 """A reward learnt from preferences: an ensemble of networks, its fit, and the folder that holds it.
 
-It is fitted by the Bradley-Terry model of preferences between clips, with folds: every pair is held out by some
+It is fitted with the Bradley-Terry model of preferences between clips, in folds: every pair is held out from some
 networks.
 
     P(left is better) = (1 - E) sigmoid(R(left) - R(right)) + E / 2,    R(clip) = sum over its steps of r(s, a)
 
-(Bradley & Terry 1952; Christiano et al. 2017, section 2.2.3, where E = 0.1: the share of answers that are given by
-chance, whatever the clips.)
+(Bradley & Terry 1952; Christiano et al. 2017, section 2.2.3, where E = 0.1 is the share of answers that are random,
+whatever the clips.)
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, read_c
 from manip_il.learn.network import read_weights, threads
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
-PREFERENCE = "preference"  # its type, in config.json
-_KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # of its inputs, in LeRobot's words
-_ROWS = 16_384  # evaluated at once
-BY_CHANCE = 0.1  # E
+PREFERENCE = "preference"  # its type in config.json
+_KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # LeRobot's types of its inputs
+_ROWS = 16_384  # rows evaluated at a time
+BY_CHANCE = 0.1  # E, the share of random answers
 _LR, _WEIGHT_DECAY, _BATCH = 1e-4, 1.0, 16
 _EPOCHS, _PATIENCE = 200, 15
 _RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
@@ -45,12 +45,12 @@ _RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
 
 @dataclass(frozen=True)
 class RewardShape:
-    """Sizes of the networks. members: of the ensemble; width: units a layer; depth: hidden layers.
+    """Sizes of the networks. members: networks in the ensemble; width: units per layer; depth: hidden layers.
 
-    ways: columns of inputs that are the way from one thing to another [m], x, y and z or x and y alone; its length is
-    an input, too, or with `logarithms` the logarithm of that: the last centimetres count as much as the first
-    decimetres. How far things are apart is most of what progress is, and a few hundred answers are few to learn a
-    square root from. unread: columns that are no inputs of the networks.
+    ways: columns of inputs that are an offset between two things [m], x, y and z, or x and y only; its length is an
+    input, too, or, with `logarithms`, the logarithm of that, so that the last centimetres count as much as the first
+    decimetres. Distances make up most of what progress is, and a few hundred answers are too few to learn a square
+    root from. unread: columns that the networks do not use.
     """
 
     members: int = 8
@@ -62,9 +62,9 @@ class RewardShape:
 
 
 def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
-    """Return the columns of every way in a dataset's environment state, such as `goal_from_object`, after its state.
+    """Return the columns of every offset in a dataset's environment state, such as `goal_from_object`, after its state.
 
-    Each once in space and once over the table: hands approach from above.
+    Each once in 3D and once in the table's plane: hands approach from above.
     """
     place = {name: len(spec.joint_names) + at for at, name in enumerate(spec.environment_state_names)}
     names = [name.removesuffix(".x") for name in place if "_from_" in name and name.endswith(".x")]
@@ -75,7 +75,7 @@ def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
 def joints_of(spec: RobotTaskSpec) -> tuple[int, ...]:
     """Return the columns of the arm's joints and of their targets, if the environment state has the hand's pose.
 
-    None if it has not. A few hundred answers are few to find out that joints say the same in another way.
+    Else return none. A few hundred answers are too few to learn that joints are redundant with the pose.
     """
     if not {"ee.x", "ee.y", "ee.z"} <= set(spec.environment_state_names):
         return ()
@@ -84,19 +84,19 @@ def joints_of(spec: RobotTaskSpec) -> tuple[int, ...]:
 
 
 def shape_for(spec: RobotTaskSpec, members: int) -> RewardShape:
-    """Return the networks that are fitted to answers about a task's clips."""
+    """Return the shape of the networks to fit to answers about a task's clips."""
     return RewardShape(members, ways=ways_of(spec), unread=joints_of(spec), logarithms=True)
 
 
 class RewardNetwork(nn.Module):
     """M perceptrons from (state, environment state, action) to a reward.
 
-    Inputs are standardised and clamped to `CLAMP` standard deviations, so that a state far off the data has the reward
-    of the border. `low`, `high`: rewards of the mean network that `forward` puts at 0 and 1.
+    Inputs are standardised and clamped to `CLAMP` standard deviations, so that states far from the data have the reward
+    at the bound. `low`, `high`: rewards of the mean network that `forward` maps to 0 and 1.
     """
 
     CLAMP = 5.0
-    NEAR = 0.01  # added to a length before its logarithm is taken [m]
+    NEAR = 0.01  # added to a length before taking its logarithm [m]
     mean: Tensor
     std: Tensor
     low: Tensor
@@ -117,7 +117,7 @@ class RewardNetwork(nn.Module):
         self.register_buffer("high", torch.ones(()))
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Draw the weights: normal, of variance 2 / fan-in (He et al. 2015), the last layer's a hundredth as wide."""
+        """Draw normal weights of variance 2 / fan-in (He et al. 2015), a hundredth as wide in the last layer."""
         with torch.no_grad():
             for number, weight in enumerate(self.weights):
                 last = number == len(self.weights) - 1
@@ -125,14 +125,14 @@ class RewardNetwork(nn.Module):
                 weight.copy_(spread * torch.randn(weight.shape, generator=generator))
 
     def features(self, inputs: Tensor) -> Tensor:
-        """Return the columns of inputs (B, d) that are read, with the lengths of their ways, (B, up to d + K)."""
+        """Return the columns of inputs (B, d) that are used, with the lengths of their offsets, (B, up to d + K)."""
         lengths = [inputs[:, way].norm(dim=-1, keepdim=True) for way in self.ways]
         if self.logarithms:
             lengths = [(one + self.NEAR).log() for one in lengths]
         return torch.cat([inputs[:, self.read], *lengths], dim=-1)
 
     def members(self, inputs: Tensor) -> Tensor:
-        """Return each network's reward, (M, B), of inputs (B, d), in the units in which preferences are log-odds."""
+        """Return each network's reward, (M, B), for inputs (B, d), in units in which preferences are log-odds."""
         x = ((self.features(inputs) - self.mean) / self.std).clamp(-self.CLAMP, self.CLAMP)
         hidden = x.expand(len(self.weights[0]), *x.shape)
         for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -143,14 +143,14 @@ class RewardNetwork(nn.Module):
 
     @override
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the mean network's reward, (B,), of inputs (B, d): 0 at `low`, 1 at `high`."""
+        """Return the mean network's reward, (B,), for inputs (B, d): 0 at `low`, 1 at `high`."""
         return (self.members(inputs).mean(0) - self.low) / (self.high - self.low)
 
 
 class LearnedReward:
-    """A reward that was learnt from preferences. origin: robot, task and columns that it is for.
+    """A reward learnt from preferences. origin: robot, task and columns that it is for.
 
-    About 0 at the poorest and 1 at the best of the states it was learnt on.
+    It is about 0 for the worst and 1 for the best of the states that it was trained on.
     """
 
     def __init__(self, network: RewardNetwork, origin: Origin) -> None:
@@ -158,9 +158,9 @@ class LearnedReward:
 
     @classmethod
     def load(cls, path: Path) -> LearnedReward:
-        """Load a folder of `manip-il reward fit`, from JSON and safetensors alone.
+        """Load a folder written by `manip-il reward fit`, only from JSON and safetensors.
 
-        Raises `ManipError` for a folder that is not whole or is no such reward.
+        Raises `ManipError` for a folder that is incomplete or not such a reward.
         """
         config = read_config(path)
         if config["type"] != PREFERENCE:
@@ -168,7 +168,7 @@ class LearnedReward:
         origin = read_origin(path)
         if origin is None:
             raise ManipError(f"{path} does not say for which robot and task it is: {META_FILE} is missing")
-        try:  # what an older one does not say is the default
+        try:  # fields missing in older files have their defaults
             shape = RewardShape(**{one.name: config[one.name] for one in fields(RewardShape) if one.name in config})
             network = RewardNetwork(sum(_widths(origin).values()), shape)
             network.load_state_dict(read_weights(path))
@@ -178,18 +178,18 @@ class LearnedReward:
         return cls(network, origin)
 
     def check_fits(self, name: str, spec: RobotTaskSpec) -> None:
-        """Raise `MismatchError` unless a dataset's columns, and its task, are those of this reward. name: of it."""
+        """Raise `MismatchError` unless a dataset's columns and task are those of this reward. name: the reward's."""
         if self.origin.task != spec.task:
             raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
         self.origin.check_fits(spec)
 
     def __call__(self, states: F32, environment_states: F32, actions: F32) -> F32:
-        """Return the reward of every row, (B,): states (B, n), environment states (B, k), absolute actions (B, n)."""
+        """Return every row's reward, (B,), for states (B, n), environment states (B, k), absolute actions (B, n)."""
         return self.of_inputs(np.concatenate([states, environment_states, actions], axis=1, dtype=np.float32))
 
     @torch.inference_mode()
     def of_inputs(self, inputs: F32) -> F32:
-        """Return the reward of inputs (B, n + k + n) that are one array, (B,). Raises `NotFiniteError` for others."""
+        """Return the reward, (B,), of concatenated inputs (B, n + k + n). Raises `NotFiniteError` unless finite."""
         with threads(1):
             parts = [self.network(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
         rewards = np.concatenate(parts) if parts else np.empty(0, np.float32)
@@ -200,7 +200,7 @@ class LearnedReward:
 
     @torch.inference_mode()
     def members(self, inputs: F32) -> F64:
-        """Return every network's reward, (M, B), of inputs (B, n + k + n), in units of log-odds a step."""
+        """Return every network's reward, (M, B), for inputs (B, n + k + n), in log-odds per step."""
         with threads(1):
             parts = [self.network.members(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
         return np.concatenate(parts, axis=1).astype(np.float64)
@@ -214,9 +214,9 @@ def write_reward(
     options: Mapping[str, Any],
     fingerprint: Mapping[str, Any],
 ) -> None:
-    """Write a `pretrained_model` folder: config.json, model.safetensors, and for what it was trained, manip_il.json.
+    """Write a `pretrained_model` folder: config.json, model.safetensors, and its origin, manip_il.json.
 
-    options: of the fit. Raises `OSError` if it cannot be written.
+    options: those of the fit. Raises `OSError` if it cannot be written.
     """
     origin = Origin.of(spec, fingerprint, options)
     features = {key: {"type": _KINDS[key], "shape": [width]} for key, width in _widths(origin).items()}
@@ -228,16 +228,16 @@ def write_reward(
 
 
 def _widths(origin: Origin) -> dict[str, int]:
-    """Numbers of each input, in order."""
+    """Return the size of each input, in order."""
     n = len(origin.joint_names)
     return {STATE: n, ENVIRONMENT_STATE: len(origin.environment_state_names), ACTION: n}
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Answers about pairs of clips. left, right: rows of their steps, (A, L); better: of the left one, (A,), 0 to 1.
+    """Answers on pairs of clips. left, right: rows of their steps, (A, L); better: preference for left, (A,), 0 to 1.
 
-    pair: number of the pair that was asked about, (A,); answers about one pair are held out together.
+    pair: index of the pair that was asked about, (A,); answers about one pair are held out together.
     """
 
     left: I64
@@ -248,9 +248,9 @@ class Compared:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Networks, and what the one that did not learn from a pair says of it.
+    """The networks, and the held-out prediction for every answer.
 
-    logits: R(left) - R(right) of every answer, (A,). epochs: that the networks were trained for.
+    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs: of training.
     """
 
     network: RewardNetwork
@@ -261,11 +261,11 @@ class Fit:
 def fit_reward(
     inputs: F32, compared: Compared, shape: RewardShape, seed: int, on_epoch: Callable[[], None] = lambda: None
 ) -> Fit:
-    """Fit the networks to answers; inputs: of every frame, (N, d).
+    """Fit the networks to answers; inputs: those of every frame, (N, d).
 
-    The pairs are dealt into as many folds as there are networks: network m leaves fold m out and learns from the
-    others. All stop at the epoch at which the loss on what they leave out is lowest. The same arguments give the same
-    bits. Raises `ManipError` for fewer pairs than networks.
+    The pairs are split into as many folds as there are networks: network m holds out fold m and trains on the others.
+    All stop at the epoch with the lowest loss on the held-out folds. The same arguments give the same bits. Raises
+    `ManipError` for fewer pairs than networks.
     """
     folds = deal(compared.pair, shape.members, seed)
     with threads(1):
@@ -287,7 +287,7 @@ def fit_reward(
 
 
 def deal(pair: I64, folds: int, seed: int) -> I64:
-    """Return the fold of every answer, (A,); all answers about a pair are in one."""
+    """Return the fold of every answer, (A,); all answers about a pair are in the same fold."""
     names, place = np.unique(pair, return_inverse=True)
     if len(names) < folds:
         raise ManipError(f"{len(names)} pairs are answered by left, right or equal; expected at least {folds}")
@@ -298,10 +298,10 @@ def deal(pair: I64, folds: int, seed: int) -> I64:
 def _train(
     network: RewardNetwork, inputs: Tensor, compared: Compared, folds: I64, seed: int, on_epoch: Callable[[], None]
 ) -> int:
-    """Train all networks at once, each on its own folds; return the epoch with the lowest loss, and go back to it.
+    """Train all networks at once, each on its own folds; return the epoch with the lowest loss, its weights restored.
 
-    The loss by which it is chosen is that of every network on the fold that it leaves out, so of every answer once: one
-    number for all networks, as a single fold of some 25 answers would choose by chance.
+    That loss is over every network's held-out fold, so it covers every answer once: one number for all networks, as a
+    choice by a single fold of some 25 answers would be mostly noise.
     """
     member = np.arange(len(network.weights[0]))[:, None]
     left_out = torch.from_numpy(folds == member)
@@ -330,13 +330,13 @@ def _train(
 
 
 def answer_losses(logits: Tensor, better: Tensor) -> Tensor:
-    """Return the negative log-likelihood of answers, (M, A): logits (M, A), better (A,)."""
+    """Return the negative log-likelihood of answers, (M, A), for logits (M, A) and better (A,)."""
     p = (1 - BY_CHANCE) * torch.sigmoid(logits) + BY_CHANCE / 2
     return nn.functional.binary_cross_entropy(p, better.expand_as(p), reduction="none")
 
 
 def _logits(network: RewardNetwork, inputs: Tensor, compared: Compared, rows: NDArray[np.int64] | slice) -> Tensor:
-    """R(left) - R(right) by every network, (M, A)."""
+    """Return R(left) - R(right) for every network, (M, A)."""
     both = [torch.from_numpy(side[rows]) for side in (compared.left, compared.right)]
     returns = [network.members(inputs[side.reshape(-1)]).view(-1, *side.shape).sum(-1) for side in both]
     return returns[0] - returns[1]

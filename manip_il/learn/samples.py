@@ -1,7 +1,7 @@
 """The samples of a fit in memory: numbers as tables, pictures decoded once.
 
-LeRobot's policies say by `*_delta_indices` which frames around a sample's own they want: its window. A frame outside of
-the episode is the nearest one inside, and `<column>_is_pad` says so.
+LeRobot's policies define by `*_delta_indices` which frames around its own a sample includes: its window. Frames outside
+the episode are replaced by the nearest one inside, and `<column>_is_pad` marks them.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from manip_il.mdp import require_finite
 
 I64 = NDArray[np.int64]
 Table = Mapping[str, NDArray[Any]]
-Batch = dict[str, Any]  # as LeRobot's DataLoader gives it: tensors, and `task` as a list of text
+Batch = dict[str, Any]  # as from LeRobot's DataLoader: tensors, and `task` as a list of strings
 TASK = "task"
 _ALWAYS = (EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP)  # LeRobot's own columns
-_MAX_HELD_OUT = 1_024  # samples that a validation looks at
+_MAX_HELD_OUT = 1_024  # number of validation samples
 
 
 @dataclass(frozen=True)
 class Windows:
-    """The frames that each sample is made of. episodes: the episode of every frame, (N,), ascending.
+    """The frames that each sample consists of. episodes: the episode of every frame, (N,), ascending.
 
-    deltas: column -> frames relative to the sample's own, (K,); a column that is not there is taken as it is.
+    deltas: column -> frame offsets from the sample's own, (K,); other columns have only the sample's own frame.
     """
 
     episodes: I64
@@ -47,7 +47,7 @@ class Windows:
 
     @cached_property
     def _first(self) -> I64:
-        """Row of the first frame of every frame's episode, (N,)."""
+        """Return the row of the first frame of every frame's episode, (N,)."""
         return np.searchsorted(self.episodes, self.episodes)
 
     @cached_property
@@ -55,9 +55,9 @@ class Windows:
         return np.searchsorted(self.episodes, self.episodes, side="right") - 1
 
     def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
-        """Return the rows of one column's frames (B, K), and by LeRobot's name which are padding (B, K).
+        """Return the rows of one column's frames, (B, K), and a padding mask, (B, K), under LeRobot's name.
 
-        Without a window the samples themselves (B,), and no padding.
+        For a column without a window, return the samples themselves, (B,), and no mask.
         """
         if key not in self.deltas:
             return samples, {}
@@ -66,9 +66,9 @@ class Windows:
         return inside, {f"{key}_is_pad": torch.from_numpy(inside != wanted)}
 
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
-        """Return the samples to learn from (S,): every label in the window is sound, `drop_last` frames left out.
+        """Return the samples to train on, (S,): all labels in the window valid, without the last `drop_last` frames.
 
-        valid: whether each frame's label is sound, (N,). drop_last: LeRobot's `drop_n_last_frames`. Raises
+        valid: whether each frame's label is valid, (N,). drop_last: LeRobot's `drop_n_last_frames`. Raises
         `ManipError` if nothing is left.
         """
         samples = np.flatnonzero(np.arange(len(valid)) + drop_last <= self._last)
@@ -80,7 +80,7 @@ class Windows:
 
 
 def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
-    """Return the windows that a policy learns from, of frames whose episodes are `episodes`, (N,)."""
+    """Return the windows of a policy's training samples; episodes: the episode of every frame, (N,)."""
     actions, observations = policy.action_delta_indices, policy.observation_delta_indices
     wanted = {key: actions if key == ACTION else observations for key in columns}
     return Windows(episodes, {key: np.asarray(one, np.int64) for key, one in wanted.items() if one is not None})
@@ -88,7 +88,7 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
 
 @dataclass(frozen=True)
 class Samples:
-    """A batch is one gather a column.
+    """Samples in memory; a batch is one gather per column.
 
     columns: numbers, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8 (N, 3, H, W). tasks: text of
     every `task_index`, (M,).
@@ -113,7 +113,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class TrainingData(Samples):
-    """The data of one fit. train, held_out: samples; table: columns that are learnt from."""
+    """The data of one fit. train, held_out: samples; table: columns to train on."""
 
     train: I64
     held_out: I64
@@ -129,11 +129,11 @@ def load_data(
     encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]] | None = None,
     on_frames: Callable[[int], None] | None = None,
 ) -> TrainingData:
-    """Return the samples of datasets, taken as one, for a policy that has its features.
+    """Return the samples of the concatenated datasets for a policy that has its features.
 
-    meta: of the datasets; its statistics follow the actions. encode: of actions (N, n) and states (N, n), if others
-    are learnt than the datasets'. on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and
-    what `Windows.usable` raises.
+    meta: that of the datasets; its statistics are updated to the encoded actions. encode: maps actions (N, n) and
+    states (N, n) to the targets, if these are not the datasets' actions. on_frames: called with the number of newly
+    decoded frames. Raises `NotFiniteError` and what `Windows.usable` raises.
     """
     features = [*(policy.input_features or {}), ACTION]
     cameras = [key for key in features if key in meta.camera_keys]
@@ -164,14 +164,14 @@ def load_data(
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Return whether each frame takes part in the loss, (N,): all do if no column says otherwise."""
+    """Return whether each frame counts in the loss, (N,): all do unless a column says otherwise."""
     if LABEL_VALID not in table:
         return np.ones(len(table[ACTION]), dtype=bool)
     return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
 
 
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
-    """Return the rows (of N) to train on and to hold out: about `fraction` of the episodes (N,), whole ones.
+    """Return the rows (of N) to train on and to hold out: whole episodes (N,), about `fraction` of them held out.
 
     Nothing is held out if that would be less than half an episode or all of them.
     """
@@ -185,13 +185,13 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
 
 
 def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
-    """Return the weight of every frame, (N,), 1 at most, by the progress in a file.
+    """Return the weight of every frame, (N,), at most 1, from the progress in a file.
 
-    By LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9), which multiplies losses with them; here
-    samples are drawn in proportion to them: the same gradient, without computing what has no weight.
+    The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9), which multiplies
+    losses by them; here samples are drawn in proportion: the same gradient, without computing what has no weight.
 
-    episodes: the dataset's `episode_index`, (N,). ahead: frames that an action reaches. Raises `ManipError` for a file
-    that is no such table and if every frame weighs 0, `MismatchError` for one of another dataset.
+    episodes: the dataset's `episode_index`, (N,). ahead: number of frames that an action spans. Raises `ManipError` if
+    the file is no such table or every frame weighs 0, `MismatchError` if it is for another dataset.
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 

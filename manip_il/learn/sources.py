@@ -1,7 +1,7 @@
-"""Several datasets learnt from as one: what must agree between them, and how often each is drawn.
+"""Training on several datasets as one: what must agree between them, and how often each is sampled.
 
-Statistics for normalisation are those of the union of the datasets' frames, each counted once, whatever the weights:
-weights are then free to change without changing the units in which a policy sees and acts.
+Normalisation statistics are those of the union of the datasets' frames, each counted once, whatever the weights: so the
+weights can change without changing the units in which a policy observes and acts.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ F64, I64 = NDArray[np.float64], NDArray[np.int64]
 
 
 def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64) -> F64:
-    """Return how often each of the rows (S,) that are drawn from is drawn, relative to the others, (S,).
+    """Return the relative sampling weight of each training row, (S,).
 
-    shares: of the samples drawn from each dataset, relative to the others. rows: numbers of frames through all
-    datasets. Raises `ManipError` for a dataset without any row.
+    shares: relative shares of the samples drawn from each dataset. rows: frame numbers in the concatenated datasets.
+    Raises `ManipError` for a dataset without any row.
     """
     which = np.searchsorted(np.cumsum([*map(len, datasets)]), rows, side="right")
     counts = np.bincount(which, minlength=len(datasets))
@@ -40,10 +40,10 @@ def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64)
 def check_same_sources(
     roots: Sequence[Path], specs: Sequence[RobotTaskSpec], *, pictures: bool, language: bool
 ) -> None:
-    """Raise `MismatchError` naming both sides unless datasets can be learnt from as one.
+    """Raise `MismatchError` naming both sides unless datasets can be used as one.
 
-    pictures: the policy sees some, so cameras and sizes must agree, too. language: it reads which task it is to do;
-    for any other the task must be the same.
+    pictures: whether the policy takes them, so that cameras and sizes must agree, too. language: whether it reads its
+    task; for any other the task must be the same.
     """
     what = (*(("cameras", "image_size") if pictures else ()), *(() if language else ("task",)))
     for root, spec in zip(roots[1:], specs[1:], strict=True):
@@ -57,7 +57,7 @@ def check_same_sources(
 def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
     """Return the columns of a dataset that a policy observes, by LeRobot's names.
 
-    Raises `ManipError` for one that the dataset lacks, with the way out.
+    Raises `ManipError`, which says what to do, for a column that the dataset lacks.
     """
     cameras = [key for key, feature in info.features.items() if feature.is_rgb]
     about, observes = f"{root}: the dataset has no", config.observes
@@ -81,11 +81,11 @@ def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
 
 
 def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the light in which a dataset's pictures were made, as arguments of `sim.look.Look`; {} is the default.
+    """Return the lighting of a dataset's pictures, as arguments of `sim.look.Look`; {} is the default.
 
-    None if that is not known: another program's dataset, or one without pictures.
+    None if unknown: for another program's dataset, or one without pictures.
     """
     if "cameras_sha256" not in fingerprint:
         return None
-    rendered = provenance.get("rendered", {}).get("cameras", {})  # `record` has the default light alone
+    rendered = provenance.get("rendered", {}).get("cameras", {})  # `record` always uses the default lighting
     return dict(rendered.get("look", {}))

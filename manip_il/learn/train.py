@@ -1,6 +1,6 @@
 """Behaviour cloning with any policy of LeRobot's or ours: its optimiser and schedule, its processors, its checkpoints.
 
-The data are in memory, so that a batch is one gather a column; a batch is a function of seed and step alone.
+The data are in memory, so that a batch is one gather per column; a batch depends only on seed and step.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from manip_il.learn.training_state import (
     write_own_files,
 )
 
-_METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # that LeRobot's update fills in
+_METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # those that LeRobot's update sets
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
@@ -61,12 +61,12 @@ class Trainer:
     """Policy, processors, optimiser and data of one run that clones the labels of datasets.
 
     shares: of the samples drawn from each dataset. weights: how often each frame is drawn, relative to the others,
-    (N,); without either, each once an epoch. on_frames: sees how many pictures more have been decoded. On one CPU the
-    same data, config and threads give the same bits, resumed or not. Started by `accelerate launch` or `torchrun`,
-    every process takes `batch_size` samples a step.
+    (N,); without either, each is drawn once per epoch. on_frames: called with the number of newly decoded pictures. On
+    one CPU the same data, config and threads give the same bits, resumed or not. If started by `accelerate launch` or
+    `torchrun`, every process takes `batch_size` samples per step.
 
-    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data that is not
-    finite, and what the policy refuses as `ManipError`.
+    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data that are not
+    finite, and `ManipError` for what the policy refuses.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Trainer:
         conversion = conversion_for(space, spec)
         self._conversion = conversion if is_in_processors(policy.type, conversion) else None
         self.accelerator = _accelerator(policy)
-        self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
+        self.accelerator.wait_for_everyone()  # the first process may be emptying the folder
         checkpoint = last_checkpoint(output_dir, resume=resume)
         self.meta: Any = JoinedDatasets(datasets)
         set_features(policy, self.meta.features, input_columns(config, first.root, first.info), config.observes)
@@ -139,12 +139,12 @@ class Trainer:
                 self.preprocessor, self.postprocessor = processors
                 self.step, optimizer, scheduler = load_training_state(checkpoint, optimizer, scheduler)
         self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
-        self.unwrapped = self.accelerator.unwrap_model(self.policy)  # of the processes that share a batch
+        self.unwrapped = self.accelerator.unwrap_model(self.policy)  # without the wrapper of distributed training
 
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
-        """Take the steps that are left, with metrics and checkpoints; return the last one's `pretrained_model`.
+        """Take the remaining steps, with metrics and checkpoints; return the last one's `pretrained_model`.
 
-        on_step: called after every step, with the metrics if there are some, else with {}; an exception from it ends
+        on_step: called after every step, with the metrics if there are any, else with {}; an exception from it ends
         the fit, `KeyboardInterrupt` after a checkpoint. Raises `NotFiniteError` for a loss that is not finite.
         """
         main = self.accelerator.is_main_process
@@ -167,7 +167,7 @@ class Trainer:
         return self.output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
 
     def run(self) -> Iterator[dict[str, Any]]:
-        """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
+        """Take the remaining steps; yield the metrics every `log_freq` steps and at the last, else {}."""
         preset, since, started = self.pipeline.optimizer, self.step, time.perf_counter()
         assert preset is not None
         metrics = MetricsTracker(1, 1, 1, {name: AverageMeter(name) for name in _METRICS})
@@ -197,22 +197,22 @@ class Trainer:
             since, started = self.step, time.perf_counter()
 
     def batch(self, step: int) -> Batch:
-        """Return the samples of this process at a step, as they are stored."""
+        """Return this process's samples at a step, as stored."""
         size, place = self.batch_size, self.accelerator.process_index
         rows = self._order.batch(step)[place * size : (place + 1) * size]
         return self.data.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:
-        """Return mean loss on samples of the held-out episodes, without touching the training's random state.
+        """Return the mean loss on samples of held-out episodes, without changing the random state of training.
 
-        Beside `val_loss`, the numbers that the policy gives with it. Every process looks at all of them.
+        Also returns the other numbers that the policy outputs. Every process evaluates all samples.
         """
         held_out, size = self.data.held_out, self.batch_size
         policy = self.unwrapped
         policy.eval()
         sums = defaultdict[str, float](float)
         with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
-            torch.manual_seed(self.config.seed)  # a policy that draws (diffusion) draws the same every time
+            torch.manual_seed(self.config.seed)  # policies that sample (diffusion) draw the same every time
             for start in range(0, len(held_out), size):
                 rows: I64 = held_out[start : start + size]
                 batch = pictures_to_float(self.data.batch(rows), self.data.pictures)
@@ -234,7 +234,7 @@ class Trainer:
         self.accelerator.wait_for_everyone()
 
     def _augmented(self, batch: Batch) -> Batch:
-        """Put pictures on the device, shifted and recoloured by draws that depend on seed, step and process alone."""
+        """Move pictures to the device, shifted and recoloured by draws that depend only on seed, step and process."""
         cameras, augment = self.data.pictures, self._augment
         batch = batch | {key: batch[key].to(self.accelerator.device, non_blocking=True) for key in cameras}
         if augment is None:
@@ -244,25 +244,25 @@ class Trainer:
 
 
 def _portable(path: Path) -> Path:
-    """A path that names no place of this machine: from the current folder on, or else the folder's name alone."""
+    """Return a path without machine-specific parts: relative to the current folder, or else only the folder's name."""
     if not path.is_absolute():
         return path
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else Path(path.name)
 
 
 def _on_this_cpu() -> str:
-    """Half precision if the processor has it, else single."""
+    """Return half precision if the processor has it, else single."""
     return "bf16" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "no"  # pyright: ignore[reportPrivateUsage]
 
 
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:
-    """As lerobot-train makes it: half precision by the policy's `dtype`, else by its `use_amp`."""
+    """Return an accelerator as in lerobot-train: half precision by the policy's `dtype`, else by its `use_amp`."""
     precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
     if not hasattr(policy, "dtype") and policy.use_amp:
         precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
-    if not torch.distributed.is_initialized():  # accelerate keeps the precision of a process's first fit
+    if not torch.distributed.is_initialized():  # accelerate keeps the precision of the first fit in a process
         AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
-    ours = policy.type in OWN_SPACE  # their buffers are units of the data, which do not change
+    ours = policy.type in OWN_SPACE  # their buffers are statistics of the data, which do not change
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,

@@ -1,4 +1,4 @@
-"""What a run keeps: its metrics, and checkpoints in LeRobot's layout, written whole or not at all, and gone on from.
+"""A run's metrics, and its checkpoints in LeRobot's layout: how they are written, atomically, and resumed from.
 
     OUTPUT/metrics.jsonl, OUTPUT/tensorboard
     OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors policy_*processor*.json|safetensors
@@ -7,8 +7,8 @@
                                                   rng_state.safetensors training_step.json
     OUTPUT/checkpoints/last -> 004000
 
-A checkpoint is written under a temporary name and `last` is switched over in one rename, so that a kill leaves the one
-before. A run goes on with `lerobot-train --config_path=.../pretrained_model/train_config.json --resume=true`, too.
+A checkpoint is written under a temporary name and `last` is switched over by one rename, so that a killed run keeps the
+previous one. `lerobot-train --config_path=.../pretrained_model/train_config.json --resume=true` can also resume a run.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Writer = Callable[[Record], None]
 
 
 def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
-    """Return the folder `checkpoints/last` to go on from, or None if there is none.
+    """Return the folder `checkpoints/last` to resume from, or None if there is none.
 
     Raises `FolderExistsError` if there is one, unless `resume`.
     """
@@ -56,13 +56,13 @@ def read_step(checkpoint: Path) -> dict[str, Any]:
 
 @contextmanager
 def new_checkpoint(final: Path) -> Generator[Path]:
-    """Give an empty folder to write a checkpoint into; on leaving, it gets its name and is `last`.
+    """Yield an empty folder to write a checkpoint into; on exit it gets its name and becomes `last`.
 
-    An exception removes it. Raises `ManipError` if the disk is full or read-only.
+    It is removed after an exception. Raises `ManipError` if the disk is full or read-only.
     """
-    with new_folder(final, replace=True) as new:  # of a run that was killed before it could switch `last` over
+    with new_folder(final, replace=True) as new:  # replaces the folder of a run killed before it switched `last`
         yield new
-        for path in new.rglob("*.safetensors"):  # hidden from other users, a container's among them
+        for path in new.rglob("*.safetensors"):  # otherwise hidden from other users, such as a container's
             path.chmod(new.stat().st_mode & 0o666)
     link = final.parent / ".last.tmp"
     link.unlink(missing_ok=True)
@@ -71,7 +71,7 @@ def new_checkpoint(final: Path) -> Generator[Path]:
 
 
 def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:
-    """Write what LeRobot's checkpoints have not: the origin, and the step with the resume key."""
+    """Write the files that LeRobot's checkpoints lack: the origin, and the step with the resume key."""
     for path, values in (
         (f"{PRETRAINED_MODEL}/{META_FILE}", origin.to_json()),
         (f"{TRAINING_STATE}/{STEP_FILE}", step),
@@ -81,10 +81,10 @@ def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -
 
 @contextmanager
 def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
-    """Give the functions to call with each record: of the file of lines, and of what else the user asked for.
+    """Yield the functions to call with each record: for the metrics file, and for the other outputs asked for.
 
-    step: the fit goes on from there. curves: for TensorBoard. pipeline: with the options for Weights & Biases. Raises
-    `UsageError` if one of them is not installed.
+    step: the fit resumes from there. curves: whether to write to TensorBoard. pipeline: has the options for Weights &
+    Biases. Raises `UsageError` if one of them is not installed.
     """
     with ExitStack() as stack:
         writers = [json_lines(output_dir / METRICS_FILE, step)]
@@ -97,7 +97,7 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
 
 
 def json_lines(path: Path, step: int) -> Writer:
-    """Return a function that adds a line, null if a number is not finite; lines after `step` are dropped first."""
+    """Return a function that appends a line, with null for non-finite numbers; drop the lines after `step` first."""
     kept = [record for record in read_lines(path) if record["step"] <= step] if step > 0 else []
     write_file(path, "".join(f"{json.dumps(record)}\n" for record in kept).encode())
     return functools.partial(append_line, path)
@@ -105,7 +105,7 @@ def json_lines(path: Path, step: int) -> Writer:
 
 @contextmanager
 def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
-    """Give a function that adds a point to every curve."""
+    """Yield a function that adds a point to every curve."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -121,9 +121,9 @@ def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
 
 
 def _weights_and_biases(config: TrainPipelineConfig) -> Writer:
-    """Return a function that adds a point by LeRobot's own logger."""
+    """Return a function that adds a point with LeRobot's own logger."""
     try:
-        importlib.import_module("wandb")  # LeRobot's logger imports it, and says less
+        importlib.import_module("wandb")  # LeRobot's logger imports it, with a less helpful error
         from lerobot.common.wandb_utils import WandBLogger
     except ImportError as error:
         raise UsageError("--wandb.enable=true needs Weights & Biases: pip install wandb") from error

@@ -1,15 +1,15 @@
-"""Transitions of episodes of one length: what discriminators see of demonstrations and of the learner.
+"""Transitions of episodes of equal length: the discriminators' samples of demonstrations and of the learner.
 
-Learning needs episodes of one length H: if an episode that succeeds ends early, a reward that is positive (or
-negative) everywhere rewards (or punishes) living on, whatever was demonstrated (Kostrikov et al., Discriminator-actor-
-critic, ICLR 2019, section 4.2; Orsini et al., What matters for adversarial imitation learning?, NeurIPS 2021, section
-4). So an episode that has ended goes on in an absorbing state, marked by a flag, until step H. Demonstrations are
-padded in the same way.
+Learning needs episodes of equal length H: if an episode that succeeds ends early, a reward that is positive (or
+negative) everywhere rewards (or punishes) staying alive, whatever was demonstrated (Kostrikov et al., Discriminator-
+actor-critic, ICLR 2019, section 4.2; Orsini et al., What matters for adversarial imitation learning?, NeurIPS 2021,
+section 4). So an episode that has ended continues in an absorbing state, marked by a flag, until step H.
+Demonstrations are padded in the same way.
 
-An episode ends the demonstrations' `hold` steps after success. To go on acting after it would be no sounder: nobody
-demonstrated how to stay at the goal for long, so that the learner's many states there would look unlike the
-demonstrations' few, and arriving late would pay. In the absorbing state both have the same share of time exactly
-if the learner arrives as fast as it was shown.
+An episode ends the demonstrations' `hold` steps after success. To continue acting after that would be no better: nobody
+demonstrated how to stay at the goal for long, so the learner's many states there would look unlike the demonstrations'
+few, and arriving late would pay off. The learner's share of time in the absorbing state equals that of the
+demonstrations exactly if it arrives as fast as they do.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TELLING = (LABEL_VALID, ACTOR, SUCCESS)  # columns that say whether an episode 
 class Transitions:
     """Steps of episodes, N rows. states, next_states: (N, d + 1), raw inputs and the flag of the absorbing state.
 
-    actions: (N, n), normalised as the policy's head has them, within their range.
+    actions: (N, n), normalised as for the policy's head, clipped to their range.
     """
 
     states: F32
@@ -57,7 +57,7 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, these in a policy's action space.
+    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, in a policy's action space.
 
     hold: steps from success to the end; None if no column says when an episode succeeds.
     """
@@ -68,18 +68,18 @@ class Demonstrations:
 
     @property
     def longest(self) -> int:
-        """Frames of the longest episode."""
+        """Number of frames in the longest episode."""
         return max(map(len, self.inputs))
 
     @cached_property
     def stacked(self) -> tuple[F32, F32]:
-        """All inputs (N, d) and targets (N, n), raw."""
+        """Return all inputs (N, d) and targets (N, n), raw."""
         return np.concatenate(self.inputs), np.concatenate(self.targets)
 
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
-        """Return all episodes as `steps` transitions each. encode: raw targets (T, n) to normalised ones.
+        """Return all episodes as `steps` transitions each. encode: normalises raw targets (T, n).
 
-        Without a `hold` nothing is padded: how the episodes would have gone on is not known.
+        Without a `hold` nothing is padded, as it is unknown how the episodes would have continued.
         Raises `UsageError` if one is longer.
         """
         if self.longest > steps:
@@ -92,9 +92,9 @@ class Demonstrations:
 
 
 def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32]:
-    """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode of T steps that ended.
+    """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode with T steps that ended.
 
-    N: T, or `steps` if it is larger: the rest is absorbing. steps 0: it did not end; N is T - 1.
+    N is the larger of T and `steps`: the rest is absorbing. With `steps` 0 the episode did not end and N is T - 1.
     """
     states = np.pad(inputs, ((0, 0), (0, 1)))
     if not steps:
@@ -109,11 +109,10 @@ def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32
 def read_demonstrations(
     roots: Sequence[Path], encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 ) -> Demonstrations:
-    """Read the expert's whole episodes from datasets. encode: `Conversion.encode` of actions (T, n), states (T, n).
+    """Read the expert's whole episodes from datasets. encode: `Conversion.encode` for actions (T, n), states (T, n).
 
-    Left out are episodes that a learner drove at some step, that hold a label that is not valid, or of which a column
-    says that they failed. Raises `NothingToLearnError` if none is left, `NotFiniteError` and what `joined_columns`
-    raises.
+    Skips episodes in which a learner drove at some step or a label is invalid, and those that failed according to their
+    columns. Raises `NothingToLearnError` if none is left, `NotFiniteError`, and what `joined_columns` raises.
     """
     table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
     for name in (STATE, ENVIRONMENT_STATE, ACTION):
@@ -135,13 +134,13 @@ def read_demonstrations(
 
 
 def _episodes(table: Table) -> list[slice]:
-    """The rows of every episode."""
+    """Return the rows of every episode."""
     bounds = np.flatnonzero(np.diff(np.asarray(table[EPISODE_INDEX]).reshape(-1), prepend=-1, append=-1))
     return [slice(*pair) for pair in itertools.pairwise(bounds)]
 
 
 def _is_demonstration(table: Table, piece: slice) -> bool:
-    """Whether an episode is the expert's, valid and successful, as far as there are columns that say so."""
+    """Return whether an episode is the expert's, valid and successful, as far as its columns say so."""
     rows = {name: np.asarray(table[name][piece]).reshape(-1) for name in _TELLING if name in table}
     valid = LABEL_VALID not in rows or bool((rows[LABEL_VALID] != 0).all())
     driven = ACTOR not in rows or bool((rows[ACTOR] == Actor.EXPERT).all())
@@ -149,6 +148,6 @@ def _is_demonstration(table: Table, piece: slice) -> bool:
 
 
 def _optional(roots: Sequence[Path]) -> list[str]:
-    """The columns beside those of learning that every dataset has."""
+    """Return the columns, besides those for training, that every dataset has."""
     known = [set(Dataset.open(root).features) for root in roots]
     return [name for name in _TELLING if all(name in names for names in known)]

@@ -1,1 +1,1 @@
-"""A virtual arm behind serial ports: LeRobot's own drivers, unmodified, cannot tell it from a real one."""
+"""A virtual arm on serial ports, which LeRobot's unmodified drivers use like a real one."""

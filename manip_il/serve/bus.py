@@ -1,4 +1,4 @@
-"""A chain of Feetech STS3215 servos behind a pseudo-terminal: their serial protocol, in LeRobot's own tables.
+"""A chain of Feetech STS3215 servos behind a pseudo-terminal: their serial protocol, from LeRobot's own tables.
 
 A packet is `FF FF id length instruction parameters checksum`; an answer has an error byte in place of the instruction.
 The checksum is the complement of the sum of all bytes from the id on. Present_Position = encoder - Homing_Offset.
@@ -28,43 +28,43 @@ I64, U8 = NDArray[np.int64], NDArray[np.uint8]
 _LOG = logging.getLogger(__name__)
 _MODEL = "sts3215"
 _TABLE, _SIGNS = tables.MODEL_CONTROL_TABLE[_MODEL], tables.MODEL_ENCODING_TABLE[_MODEL]
-STEPS: int = tables.MODEL_RESOLUTION[_MODEL]  # of the encoder in a turn
-STEP = 2 * math.pi / STEPS  # of the encoder [rad]
-_CENTRE = STEPS // 2  # of the encoder where a joint is at zero
+STEPS: int = tables.MODEL_RESOLUTION[_MODEL]  # encoder steps per turn
+STEP = 2 * math.pi / STEPS  # angle per encoder step [rad]
+_CENTRE = STEPS // 2  # encoder value at joint angle zero
 _HEAD = b"\xff\xff"
-_SIZE = 96  # bytes of a servo's memory that can be read
+_SIZE = 96  # readable bytes of a servo's memory
 _READ_ONLY = {*range(5), *range(56, 71)}
-_LONGEST = 250  # of a packet's length byte
+_LONGEST = 250  # largest length byte of a packet
 _ID, _POSITION = (_TABLE[name][0] for name in ("ID", "Present_Position"))
-_BUSY = 0.25  # a program that has read within so long still has the port [s]
-_KEPT = {  # without power, by its names in LeRobot's calibration file
+_BUSY = 0.25  # a program that has read within this time still uses the port [s]
+_KEPT = {  # registers kept without power, by key in LeRobot's calibration file
     "id": "ID",
     "homing_offset": "Homing_Offset",
     "range_min": "Min_Position_Limit",
     "range_max": "Max_Position_Limit",
 }
-_FACTORY = {  # what a new servo holds
+_FACTORY = {  # register values of a new servo
     "Firmware_Major_Version": 3,
     "Firmware_Minor_Version": 10,
     "Model_Number": tables.MODEL_NUMBER_TABLE[_MODEL],
-    "Max_Torque_Limit": 1000,  # a thousandth of the stall torque
+    "Max_Torque_Limit": 1000,  # [0.1 % of the stall torque]
     "Torque_Limit": 1000,
     "P_Coefficient": 32,
     "CW_Dead_Zone": 1,
-    "Present_Voltage": 120,  # a tenth of a volt
-    "Present_Temperature": 30,  # degrees Celsius
+    "Present_Voltage": 120,  # [0.1 V]
+    "Present_Temperature": 30,  # [degrees Celsius]
 }
 Calibration = dict[str, dict[str, int]]
 
 
 class Bus:
-    """Servos that answer on a pseudo-terminal, from a thread of its own.
+    """Servos on a pseudo-terminal, answered by a thread of their own.
 
-    calibration: what they keep without power, by their joints' names. bus[NAME]: a register of every servo, (n,), by
-    the name that LeRobot has for it. path: to be opened by any program that speaks to serial ports. lock: is held while
-    a packet is answered; hold it to read several registers of one moment. connected: numbers of the joints whose servos
-    are on the bus. commands: how often several were told something at once. on_read: called when one packet has asked
-    several where they are: a step of a client.
+    calibration: what they keep without power, by joint name. bus[NAME]: a register of every servo, (n,), by LeRobot's
+    name. path: for any program that uses serial ports. lock: held while a packet is answered; hold it to read several
+    registers at one moment. connected: indices of the joints whose servos are on the bus. commands: number of writes to
+    several servos at once. on_read: called when one packet has read the positions of several servos, which is once per
+    step of a client.
     """
 
     def __init__(self, calibration: Calibration):
@@ -79,7 +79,7 @@ class Bus:
         self.commands = 0
         self.on_read: Callable[[], None] = lambda: None
         self._waiting, self._was_read = b"", -math.inf
-        self._master, self._slave = pty.openpty()  # our hold on the other end keeps the port open between two clients
+        self._master, self._slave = pty.openpty()  # keeping the other end open keeps the port alive between clients
         tty.setraw(self._master)
         tty.setraw(self._slave)
         self.path = Path(os.ttyname(self._slave))
@@ -101,12 +101,12 @@ class Bus:
 
     @property
     def calibration(self) -> Calibration:
-        """What the servos keep without power, as LeRobot's calibration file has it."""
+        """What the servos keep without power, in the form of LeRobot's calibration file."""
         kept = {"drive_mode": np.zeros(len(self._names), int)} | {key: self[name] for key, name in _KEPT.items()}
         return {name: {key: int(kept[key][joint]) for key in kept} for joint, name in enumerate(self._names)}
 
     def goals(self) -> F64:
-        """Return where the servos were told last to go, within their limits [rad], (n,)."""
+        """Return the servos' last goals, within their limits [rad], (n,)."""
         with self.lock:
             low, high, goal = self["Min_Position_Limit"], self["Max_Position_Limit"], self["Goal_Position"]
             encoder = np.where(low < high, np.clip(goal, low, high), goal) + self["Homing_Offset"]
@@ -115,7 +115,7 @@ class Bus:
     def show(self, q: F64, velocity: ArrayLike = 0.0, load: ArrayLike = 0.0, *, settled: bool = False) -> None:
         """Set what the servos measure, (n,): angle [rad], velocity [rad/s], share of the stall torque, -1 to 1.
 
-        settled: they are told to stay there, too.
+        settled: whether to set their goals there, too.
         """
         with self.lock:
             self["Present_Position"] = encoder_steps(q) - self["Homing_Offset"]
@@ -125,7 +125,7 @@ class Bus:
                 self["Goal_Position"] = self["Present_Position"]
 
     def close(self) -> None:
-        """End the thread, and the port with it."""
+        """Stop the thread and close the port."""
         self._closing.set()
         self._thread.join()
         os.close(self._master)
@@ -137,9 +137,9 @@ class Bus:
                 os.write(self._master, self.feed(os.read(self._master, 4096)))
 
     def feed(self, received: bytes) -> bytes:
-        """Return the answers to all packets that are whole with these bytes; what comes after them waits for more.
+        """Return the answers to all packets that these bytes complete; keep the rest for the next call.
 
-        What is no packet, or has a wrong checksum, is skipped a byte at a time, as what follows may be one.
+        Invalid data, including packets with a wrong checksum, is skipped byte by byte, as a packet may begin anywhere.
         """
         answers, self._waiting = b"", self._waiting + received
         while (begin := self._waiting.find(_HEAD)) >= 0:
@@ -188,7 +188,7 @@ class Bus:
 
 
 def encoder_steps(q: F64) -> I64:
-    """Return what encoders read of joints that stand at `q` [rad], (n,)."""
+    """Return the encoder values of joints at angles `q` [rad], (n,)."""
     return np.rint(_CENTRE + q / STEP).astype(int)
 
 
@@ -197,14 +197,14 @@ def _part(memory: U8, address: int, size: int) -> bytes:
 
 
 def _store(memory: U8, address: int, values: Iterable[int]) -> None:
-    """Take what was written to a servo's memory; read-only places stay as they are."""
+    """Write values to a servo's memory, except to read-only addresses."""
     for place, value in enumerate(values, address):
         if place < _SIZE and place not in _READ_ONLY:
             memory[place] = value
 
 
 def _packet(number: int, parameters: bytes = b"") -> bytes:
-    """An answer without an error."""
+    """Return an answer without an error."""
     body = bytes([number, len(parameters) + 2, 0]) + parameters
     return _HEAD + body + bytes([_checksum(body)])
 

@@ -1,4 +1,4 @@
-"""Cameras over ZMQ, as LeRobot's own image server sends them: JSON with JPEG in base64."""
+"""Cameras over ZMQ, in the format of LeRobot's own image server: JSON with JPEG in base64."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from manip_il.serve.station import Station
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
 
-RATE = 30  # pictures a second
-_QUALITY = 90  # of a JPEG
+RATE = 30  # pictures per second
+_QUALITY = 90  # JPEG quality
 
 
 class Cameras:
-    """A thread that shows a station's world on one port, `RATE` times a second.
+    """A thread that streams a station's cameras on one port, `RATE` times per second.
 
-    rate: how many of each camera this machine draws a second. Raises `UsageError` for a port that is taken,
+    rate: pictures of each camera that this machine renders per second. Raises `UsageError` for a port that is taken,
     `RenderError` without off-screen OpenGL.
     """
 
@@ -39,7 +39,7 @@ class Cameras:
         except zmq.ZMQError as error:
             raise UsageError(f"--camera_port={port} cannot be used ({error}); give another one") from error
         self._stop = threading.Event()
-        render.close()  # OpenGL belongs to the thread that made it: from here on that is this one
+        render.close()  # an OpenGL context belongs to the thread that made it, from here on the new one
         self._thread = ThreadPoolExecutor(1)
         self._thread.submit(self._send).result()
         begun = time.perf_counter()
@@ -48,7 +48,7 @@ class Cameras:
         self._thread.submit(self._run)
 
     def close(self) -> None:
-        """End the thread and free the port."""
+        """Stop the thread and free the port."""
         self._stop.set()
         self._thread.submit(render.close)
         self._thread.shutdown()
@@ -64,6 +64,6 @@ class Cameras:
         env = self._station.env
         self._data.qpos[:], self._data.mocap_pos[:] = self._station.seen
         images = render.pictures(env.scene, self._data, self._cameras, env.world.variation)
-        # RGB goes in as it is and comes out of the client's `imdecode` as it is, so that red stays red.
+        # RGB is encoded without swapping and the client's `imdecode` does not swap either, so red stays red.
         texts = {name: encode_image(image, _QUALITY) for name, image in images.items()}
         self._socket.send_string(json.dumps({"timestamps": dict.fromkeys(texts, time.time()), "images": texts}))

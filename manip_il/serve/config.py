@@ -1,7 +1,7 @@
-"""How servos move, and how a session is served: settings without the simulator.
+"""Settings of servos and of sessions, without the simulator.
 
 Published and measured values of the servos: Feetech's data sheet of the STS3215-C018 (12 V: 30 kg cm at stall, 45 turns
-a minute without load); play of the gears of about 1 degree and an error of 1.8 to 2.6 degrees under 1.5 kg on 10 cm
+per minute without load); gear play of about 1 degree and an error of 1.8 to 2.6 degrees under 1.5 kg at 10 cm
 (github.com/TheRobotStudio/SO-ARM100, issue 134; robonine.com); friction as in MuJoCo Menagerie's SO-101. The delay is
 an assumption.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 _IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}
-VARIED = {  # ranges of `--vary=servo`: factors, but for what is a place or a time
+VARIED = {  # ranges of `--vary=servo`: factors, except for delay and offset, which are added
     "stiffness": (0.7, 1.3),
     "torque": (0.8, 1.1),
     "speed": (0.8, 1.1),
@@ -32,7 +32,7 @@ _ADDED = ("delay", "offset")
 
 @dataclass(frozen=True)
 class ServoConfig:
-    """Numbers of every servo of an arm. `UsageError` for one out of bounds."""
+    """Parameters of every servo of an arm. Raises `UsageError` for one out of bounds."""
 
     stiffness: float = option(27.0, "torque for an error at P_Coefficient 32 [N m/rad]", at_least=1, at_most=1000)
     torque: float = option(2.94, "at stall [N m]", at_least=0.1, at_most=20)
@@ -46,11 +46,11 @@ class ServoConfig:
         check_bounds(self, "servo.")
 
     def ideal(self) -> ServoConfig:
-        """Return servos that are stiff and without play, friction and delay."""
+        """Return stiff servos without play, friction or delay."""
         return replace(self, **_IDEAL)
 
     def varied(self, rng: np.random.Generator) -> ServoConfig:
-        """Draw servos that differ from these within `VARIED`."""
+        """Draw servos that differ from these by amounts within `VARIED`."""
         drawn: dict[str, float] = {}
         for name, ends in VARIED.items():
             own, change = getattr(self, name), rng.uniform(*ends)
@@ -60,7 +60,7 @@ class ServoConfig:
 
 @dataclass(frozen=True)
 class SessionConfig(Seeded):
-    """A session: how the follower's servos move, when a new world is drawn, and what is kept."""
+    """Options of a session: how the follower's servos move, when a new world is drawn, and what is saved."""
 
     output_dir: Path = option(Path("runs/serve"), "folder of the links follower and leader, and of their calibrations")
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
@@ -73,4 +73,4 @@ class SessionConfig(Seeded):
     )
     log: Path | None = option(None, "folder for journals of what the client cannot see: states and labels")
     servos: ServoConfig = field(default_factory=ServoConfig)
-    varies: bool = False  # whether each world's servos are drawn anew
+    varies: bool = False  # whether to redraw the servos for each world

@@ -1,6 +1,6 @@
-"""Worlds of a session, one after another, and what a client did in each that it cannot see: states, labels, who drove.
+"""Successive worlds of a session, and the data on each that a client does not see: states, labels, and who drove.
 
-A frame is logged when the client asks where the follower is, so that the frames are those of its own dataset.
+A frame is logged when the client reads the follower's position, so that the frames match those of its own dataset.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from manip_il.tasks.envs import env_of
 
 
 class Episodes:
-    """Episodes of a station: those that are kept are journals in a folder, for `manip-il data build`.
+    """Episodes of a station; those to keep are journals in a folder, for `manip-il data build`.
 
     folder: None for no journals. seed: shifts the worlds; those that have a journal are not drawn again. driver: who
-    moves the follower at the moment.
+    moves the follower now.
     """
 
     def __init__(self, station: Station, config: EnvConfig, folder: Path | None = None, seed: int = 0):
@@ -39,45 +39,45 @@ class Episodes:
         self.renew()
 
     def renew(self, *, keep: bool = True) -> None:
-        """End the episode, and draw the next world, in which nobody moves yet."""
+        """End the episode and draw the next world, in which nothing moves yet."""
         self.end(keep=keep)
         self._station.mover = lambda: None
         self._station.reset(next(self._seeds))
 
     def begin(self, driver: Actor) -> None:
-        """Begin an episode in the world as it is."""
+        """Begin an episode in the current world."""
         self._reads, self._running = [], self._journal is not None
         self.drive(driver)
 
     def drive(self, driver: Actor) -> None:
-        """Let somebody move the follower from now on: the expert by the leader, or a policy."""
+        """Set who moves the follower from now on: the expert, through the leader, or a policy."""
         self.driver = driver
         self._station.mover = self._station.expert if driver is Actor.EXPERT else lambda: None
 
     def frame(self, read: Read) -> None:
-        """Log a moment at which the client has read where the follower is."""
+        """Log a moment at which the client has read the follower's position."""
         if not self._running:
             return
-        if self._reads and self._reads[-1][0].commands == read.commands:  # it asks once more, as it got no answer
+        if self._reads and self._reads[-1][0].commands == read.commands:  # the client asks again, as it got no answer
             self._reads.pop()
         self._reads.append((read, self.driver))
 
     def end(self, *, keep: bool) -> None:
-        """End the episode; its journal is written at once if it is to be kept."""
+        """End the episode; if it is to be kept, write its journal at once."""
         reads, self._reads, self._running = [*self._reads, (self._station.look(), self.driver)], [], False
         if self._journal is not None and keep and len(reads) > 1:
             frames = [self._transition(step, reads) for step in range(len(reads) - 1)]
             self._journal.write(to_episode(frames))
 
     def _transition(self, step: int, reads: list[tuple[Read, Actor]]) -> Transition:
-        """A frame, with what the follower was told and what came of it until the next one."""
+        """Return a frame, with the follower's command and its outcome at the next frame."""
         (now, actor), (after, _) = reads[step : step + 2]
         env = self._env
         env.set_state(after.state)
         reward, success = env.reward, env.solved
         env.set_state(now.state)
         label = self._expert.label(now.state)
-        if label.valid:  # as the leader would have shown it: beyond by what the follower sags
+        if label.valid:  # as the leader would show it: beyond the label by the follower's sag
             label = replace(label, action=self._station.to_action(self._station.to_joints(label.action) + now.sag))
         return Transition(
             seed=self._station.seed,

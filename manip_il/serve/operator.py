@@ -1,4 +1,4 @@
-"""Runs one of LeRobot's programs against a station and does what a person would: presses its keys, moves its arms."""
+"""Runs a LeRobot program against a station and does what a person would: presses its keys and moves the arms."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from manip_il.serve.episodes import Episodes
 from manip_il.serve.station import Read, Station
 
 RIGHT, LEFT, ENTER, PAUSE, CORRECT, INTERRUPT = b"\x1b[C", b"\x1b[D", b"\n", b" ", b"\t", b"\x03"
-_SETTLED = 0.5  # a new world, or a joint at the end of its range, stands for so long before a key is pressed [s]
-_TERMINAL = 0.001  # that what is printed may take to get here [s]
-_PATIENCE = 2  # horizons before an episode counts as failed
-_DIFFERS = 0.25  # how long a policy differs from the expert before it is corrected [s]
-_TELEOPERATED = 3  # commands that are no setup any more
-_REMEMBERED = 400  # letters of what was said that may belong to what is said next
+_SETTLED = 0.5  # time for a new world, or a joint at the end of its range, to settle before a key is pressed [s]
+_TERMINAL = 0.001  # time for printed text to arrive [s]
+_PATIENCE = 2  # number of horizons after which an episode counts as failed
+_DIFFERS = 0.25  # how long a policy must differ from the expert before it is corrected [s]
+_TELEOPERATED = 3  # number of commands after which a client is past its setup
+_REMEMBERED = 400  # characters of output that are kept, as a message may arrive in parts
 _HIDDEN = ("DISPLAY", "WAYLAND_DISPLAY")  # without them LeRobot reads its keys from the terminal
 
 
 class Operator:
-    """A program in a terminal of its own, and who sits at it.
+    """A program in a terminal of its own, and its simulated operator.
 
-    intervene: by how much a policy's targets may differ from the expert's before it is corrected, with LeRobot's DAgger
+    intervene: how far a policy's targets may differ from the expert's before it is corrected, with LeRobot's DAgger
     strategy [rad]. failed, solved: episodes so far. status: the program's exit code, once it has ended.
     """
 
@@ -42,7 +42,7 @@ class Operator:
         self._driver, self._keep, self.solved, self.failed = Actor.EXPERT, True, 0, 0
         self._heard, self.status = "", None
         self._happened = deque[str | Read]()
-        self._says = [  # what LeRobot's programs print, and what is done then
+        self._says = [  # what LeRobot's programs print, and the reaction to it
             (r"Rollout strategy: |Replaying episode", self._hand_over),
             (r"Recording episode", self._record),
             (r"Reset the environment", self._renew),
@@ -64,7 +64,7 @@ class Operator:
         station.on_read = self._was_read
 
     def each_step(self) -> bool:
-        """Read what the program says and act; returns False once it has ended, with its exit code in `status`."""
+        """Read the program's output and react; return False once it has ended, with its exit code in `status`."""
         self._listen(0.0)
         while self._happened:
             event = self._happened.popleft()
@@ -78,28 +78,28 @@ class Operator:
         return self.status is None
 
     def _listen(self, patience: float) -> None:
-        """Take what the program has printed. patience: how long to wait for something [s]."""
+        """Collect what the program has printed. patience: how long to wait for output [s]."""
         with self._station.buses["follower"].lock:
             while self.status is None and select.select([self._terminal], [], [], patience)[0]:
                 try:
                     said = os.read(self._terminal, 65_536)
-                except OSError:  # it has closed its terminal
+                except OSError:  # the program has closed its terminal
                     self.status = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
                     return
                 self._happened.append(said.decode(errors="replace"))
 
     def _was_read(self, read: Read) -> None:
-        """Keep order: a program prints that an episode begins before it reads its first frame."""
+        """Keep events in order: a program announces an episode before it reads the first frame."""
         self._listen(_TERMINAL)
         self._happened.append(read)
 
     def kill(self) -> None:
-        """End the program if it still runs."""
+        """Terminate the program if it is still running."""
         if self.status is None:
             os.kill(self._pid, signal.SIGTERM)
 
     def _hear(self, text: str) -> None:
-        """Pass on what it has printed, which a slow disk may hold up, and act."""
+        """Forward printed text, which a slow disk may delay, and react to it."""
         os.write(sys.stdout.fileno(), text.encode())
         self._heard += text
         while found := [(match, act) for pattern, act in self._says if (match := re.search(pattern, self._heard))]:
@@ -110,7 +110,7 @@ class Operator:
         self._heard = self._heard[-_REMEMBERED:]
 
     def press(self, key: bytes) -> None:
-        """Press a key in the program's terminal; on Ctrl-C LeRobot's programs save what is whole and end."""
+        """Press a key in the program's terminal; on Ctrl-C LeRobot's programs save what is complete and exit."""
         os.write(self._terminal, key)
 
     def _wait(self, seconds: float = _SETTLED) -> Iterator[None]:
@@ -121,7 +121,7 @@ class Operator:
         self.press(key)
 
     def _attempt(self, *, supervised: bool = False) -> Iterator[None]:
-        """Wait until the task is solved, or for longer than that may take; supervised: or a policy goes astray."""
+        """Wait until the task is solved or time is up; supervised: or until a policy deviates from the expert."""
         astray, config = 0, self._station.env.config
         for _ in range(_PATIENCE * config.horizon):
             astray = astray + 1 if supervised and self._differs() else 0
@@ -130,7 +130,7 @@ class Operator:
             yield
 
     def _differs(self) -> bool:
-        """Whether the arm is on its way to somewhere else than the expert would go."""
+        """Return whether the arm's targets differ too much from the expert's."""
         told, wanted = self._station.buses["follower"].goals(), self._station.expert()
         return wanted is not None and np.abs(told - wanted)[:-1].max() > self._intervene
 
@@ -139,7 +139,7 @@ class Operator:
         self.solved, self.failed = self.solved + solved, self.failed + (not solved)
 
     def _watch(self) -> Iterator[None]:
-        """Without episodes, let one attempt follow another, each in a new world, as soon as the follower is moved."""
+        """For programs without episodes: once the follower moves, run attempts in a row, each in a new world."""
         while self._station.buses["follower"].commands < _TELEOPERATED:
             yield
         while True:
@@ -149,12 +149,12 @@ class Operator:
             self._episodes.renew()
 
     def _hand_over(self) -> Iterator[None]:
-        """From here on a program drives, not the leader."""
+        """Let the program drive from now on, instead of the leader."""
         self._driver = Actor.LEARNER
         yield from self._watch()
 
     def _record(self) -> Iterator[None]:
-        """Demonstrate; a demonstration that fails is recorded again, a policy's attempt is kept as it is."""
+        """Demonstrate; record a failed demonstration again, but keep a policy's attempt as it is."""
         self._episodes.begin(self._driver)
         yield from self._attempt()
         self._count()
@@ -170,7 +170,7 @@ class Operator:
         yield
 
     def _supervise(self) -> Iterator[None]:
-        """Watch a policy in new worlds until it would do something else than the expert, or gets nowhere."""
+        """Watch a policy in new worlds until it deviates from the expert or fails; then pause it."""
         while True:
             self._episodes.renew()
             self._episodes.begin(Actor.LEARNER)
@@ -211,7 +211,7 @@ class Operator:
         self._station.reset(self._station.seed)
 
     def _explore(self) -> Iterator[None]:
-        """Move the leader, and the follower by it, a joint at a time to both ends of its range."""
+        """Move the leader, and with it the follower, to both ends of each joint's range in turn."""
         for joint, ends in enumerate(self._station.limits):
             for end in ends:
                 q = np.clip(0.0, *self._station.limits.T)
@@ -221,7 +221,7 @@ class Operator:
 
 
 def _start(command: Sequence[str]) -> tuple[int, int]:
-    """Run a program in a new terminal; its process and the terminal's other end."""
+    """Run a program in a new terminal; return its process id and the terminal's other end."""
     pid, terminal = pty.fork()
     if pid == 0:
         weigh_session()
@@ -236,10 +236,10 @@ def _start(command: Sequence[str]) -> tuple[int, int]:
 
 
 def weigh_session() -> None:
-    """Raise the priority of this process's session if permitted; Linux shares its time among sessions first.
+    """Raise the priority of this process's session if permitted; Linux first shares CPU time among sessions.
 
     The program and its servos run in two sessions, and each must answer the other within milliseconds. Real-time
-    priority would stop the kernel's own threads, which carry bytes from one end of a terminal to the other.
+    priority would block the kernel's own threads, which carry bytes from one end of a terminal to the other.
     """
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text("-20")

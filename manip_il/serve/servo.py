@@ -1,4 +1,4 @@
-"""How an STS3215 moves a joint: a position loop with its gain, torque, speed, gear play and delay."""
+"""How an STS3215 moves a joint: a position loop with gain, torque and speed limits, gear play and delay."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from manip_il.serve.bus import STEP, Bus
 from manip_il.serve.config import ServoConfig
 from manip_il.sim.world import World
 
-_FACTORY_GAIN = 32  # P_Coefficient of a new servo, for which `stiffness` is said
+_FACTORY_GAIN = 32  # P_Coefficient of a new servo, at which `stiffness` is specified
 _HAND = 100.0  # stiffness of a hand that holds an arm whose torque is off [N m/rad]
 
 
 class Follower:
-    """The servos of a bus as the motors of a simulated arm, joint by joint, the gripper last.
+    """The servos of a bus as the motors of a simulated arm, in joint order, the gripper last.
 
-    Gravity pulls at the arm. A servo whose torque is off keeps its place, as if a hand held it.
+    Gravity acts on the arm. A servo whose torque is off keeps its position, as if a hand held it.
     """
 
     def __init__(self, world: World, bus: Bus, step: float):
@@ -31,11 +31,11 @@ class Follower:
         self._at, self._on, self._coming = np.zeros(len(self.q)), np.zeros(len(self.q), bool), deque[F64]()
 
     def reset(self, config: ServoConfig) -> None:
-        """Take these servos, standing where the joints are."""
+        """Use servos with these parameters, at the current joint positions."""
         self.config = config
         for model in (self._world.scene.model, self._world.model):
             model.body_gravcomp[model.jnt_bodyid[:]] = 0.0
-            model.dof_damping[self._dof] = config.torque / config.speed  # as the motor's own voltage grows
+            model.dof_damping[self._dof] = config.torque / config.speed  # the motor's back EMF
             model.dof_frictionloss[self._dof] = config.friction
         self._at = self._world.data.qpos[self.q]
         self._coming = deque([self._at] * round(config.delay / self._step))
@@ -43,23 +43,23 @@ class Follower:
 
     @property
     def offset(self) -> float:
-        """Angle by which the encoders read beyond the joints [rad]."""
+        """Angle by which the encoders read more than the joints [rad]."""
         return math.radians(self.config.offset)
 
     def _gain(self) -> F64:
-        """Stiffness of every servo at the gain that it was given [N m/rad], (n,)."""
+        """Return the stiffness of every servo at its current gain [N m/rad], (n,)."""
         return self.config.stiffness * np.maximum(1, self._bus["P_Coefficient"]) / _FACTORY_GAIN
 
     def sag(self) -> F64:
-        """Return how far the joints are from their goals under gravity, at rest [rad], (n,)."""
+        """Return how far the joints are from their goals at rest under gravity [rad], (n,)."""
         return self._world.data.qfrc_bias[self._dof] / self._gain()
 
     def goal(self) -> F64:
-        """Return the joints that the servos were told last to go to [rad], (n,)."""
+        """Return the last joint goals of the servos [rad], (n,)."""
         return self._bus.goals() - self.offset
 
     def command(self) -> None:
-        """Give the motors what the registers say: once every `step` seconds."""
+        """Set the motors from the registers; call it every `step` seconds."""
         data, model, bus = self._world.data, self._world.model, self._bus
         q = data.qpos[self.q]
         with bus.lock:
@@ -70,7 +70,7 @@ class Follower:
         goal = self._coming.popleft()
         play = math.radians(self.config.play) / 2
         led = np.clip(self._at, goal - play, goal + play)
-        self._at = np.where(on, led, np.where(self._on, q, self._at))  # without torque: where it was turned off
+        self._at = np.where(on, led, np.where(self._on, q, self._at))  # torque off: where it was turned off
         self._on = on
         data.ctrl[self._ctrl] = np.where(on & (np.abs(self._at - q) < dead), q, self._at)
         gain = np.where(on, gain, _HAND)

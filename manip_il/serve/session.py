@@ -1,4 +1,4 @@
-"""A session of the virtual arm: everything that `manip-il serve` opens, and in which order."""
+"""A session of the virtual arm: everything that `manip-il serve` opens, in order."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ def serve(
     say: Say,
     warn: Say,
 ) -> None:
-    """Serve a virtual arm until the program of `command` ends, else until Ctrl-C.
+    """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
 
-    cameras: what is shown; None for none. conditions: what worlds differ in. say, warn: called with lines for the user.
+    cameras: those to serve; None for none. conditions: how worlds vary. say, warn: called with lines for the user.
     Raises `UsageError` for a robot without Feetech servos or a port that is taken, `ManipError` if the program failed.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.setswitchinterval(5e-4)  # [s]: the threads of the buses get their turn within it
+    sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
     weigh_session()
     with contextlib.ExitStack() as stack:
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
         episodes = Episodes(station, env, config.log, config.seed)
         gc.collect()
-        gc.freeze()  # a collection of all that LeRobot and torch have imported takes longer than a client waits
+        gc.freeze()  # a full collection of what LeRobot and torch have imported takes longer than a client waits
         stack.callback(gc.unfreeze)
         if cameras is not None:
             shown = Cameras(station, cameras, config.camera_port)
@@ -71,7 +71,7 @@ def serve(
 
 
 def described(station: Station, config: SessionConfig, cameras: CameraConfig | None) -> list[str]:
-    """Return where everything is, and a line to copy."""
+    """Return lines that say where everything is, one of them to copy."""
     root, port = config.output_dir, config.camera_port
     size = f"width: {cameras.width}, height: {cameras.height}, fps: {RATE}" if cameras else ""
     shown = ", ".join(
@@ -90,7 +90,7 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
 
 
 def _stand(station: Station, episodes: Episodes, renews: bool, say: Say) -> None:
-    """Serve whoever connects, until Ctrl-C; a new world on Enter, and if it `renews` also once the task is solved."""
+    """Serve clients until Ctrl-C; draw a new world on Enter and, if it `renews`, once the task is solved."""
     station.on_read = episodes.frame
     episodes.begin(Actor.EXPERT)
 

@@ -1,4 +1,4 @@
-"""A simulated arm, its world and its leader, advanced by the wall clock, whoever reads when."""
+"""A simulated arm, its world and its leader, which advance with the wall clock, whoever reads them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from manip_il.serve.servo import Follower
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import World
 
-FEETECH = "so_follower"  # `robot_type` of the arms whose servos these are, in LeRobot
-HELD = 1.0  # how long the task is solved before it counts [s]
-_SLICES = 4  # times in a control step, at most, that commands reach the motors and registers are written
-_LATE = 0.25  # behind the wall clock by more, time is given up [s]
-_FULL_TURN = "wrist_roll"  # LeRobot's calibration gives it a whole turn
+FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
+HELD = 1.0  # how long the task must stay solved before it counts [s]
+_SLICES = 4  # most updates of motors and registers per control step
+_LATE = 0.25  # largest lag behind the wall clock; beyond it the clock is reset [s]
+_FULL_TURN = "wrist_roll"  # LeRobot's calibration gives it a full turn
 
 
 class Read(NamedTuple):
-    """A client's look at the follower.
+    """A client's read of the follower.
 
-    told: where it was to go then, by so many commands. sag: how far it hangs below where it is told to be. Both joints
+    told: its target at that time, after `commands` commands. sag: how far it hangs below its target. Both are joints
     [rad], (n,).
     """
 
@@ -44,12 +44,12 @@ class Read(NamedTuple):
 
 
 class Station:
-    """Two ports, `follower` and `leader` in a folder, and what is behind them.
+    """Two ports, `follower` and `leader`, in a folder, and the simulation behind them.
 
-    `NAME.json` beside each is a calibration that LeRobot reads, and what the servos keep without power. on_read:
-    called, from another thread, whenever a client reads where the follower is. mover: who moves the leader, which has
-    no weight: returns its joints [rad], (n,), or None to leave them. hand: joints at which a hand holds both arms, and
-    nothing moves. Raises `UsageError` for a robot without Feetech servos.
+    `NAME.json` beside each is its calibration in LeRobot's form, and holds what the servos keep without power. on_read:
+    called, from another thread, whenever a client reads the follower's position. mover: returns target joints for the
+    leader, which has no weight, [rad], (n,), or None to leave it. hand: joints at which a hand holds both arms still.
+    Raises `UsageError` for a robot without Feetech servos.
     """
 
     def __init__(self, env: ManipEnv, config: SessionConfig):
@@ -59,7 +59,7 @@ class Station:
                 f"--robot.type={robot.name} has no Feetech servos; expected so101, or the YAML of an arm with "
                 f"lerobot.robot_type: {FEETECH}"
             )
-        env.world = World(replace(env.scene, model=copy.copy(env.scene.model)))  # whose motors become servos
+        env.world = World(replace(env.scene, model=copy.copy(env.scene.model)))  # a copy, as its motors become servos
         self.env, self._config = env, config
         self._servos = config.servos.ideal() if config.servo == "ideal" else config.servos
         self._expert = Expert(env.scene)
@@ -68,7 +68,7 @@ class Station:
         self._slices = next(count for count in range(_SLICES, 0, -1) if steps % count == 0)
         self.slice = 1 / (env.config.control_hz * self._slices)
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
-        self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])  # of the servos' joints [rad], (n, 2)
+        self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])  # the servos' joint limits [rad], (n, 2)
         self.buses = {name: self._open(name) for name in ("follower", "leader")}
         self.follower = Follower(env.world, self.buses["follower"], self.slice)
         self.mover: Callable[[], F64 | None] = lambda: None
@@ -78,7 +78,7 @@ class Station:
         self.buses["follower"].on_read = lambda: self.on_read(self.look())
 
     def _open(self, name: str) -> Bus:
-        """Open a port: its link and its calibration lie in the folder."""
+        """Open a port, with its link and its calibration in the folder."""
         link = self._config.output_dir / name
         link.parent.mkdir(parents=True, exist_ok=True)
         kept: Calibration = {}
@@ -97,7 +97,7 @@ class Station:
         write_file(self._config.output_dir / f"{name}.json", content.encode())
 
     def look(self) -> Read:
-        """Return what a client sees now."""
+        """Return what a client reads now."""
         with self.buses["follower"].lock:
             return Read(self._shown, self.follower.goal(), self._sag, self.buses["follower"].commands)
 
@@ -107,15 +107,15 @@ class Station:
         return self._solved >= HELD * self.env.config.control_hz
 
     def expert(self) -> F64 | None:
-        """Return where the expert would have the leader [rad], (n,); None without a label.
+        """Return the leader's joints [rad], (n,), as the expert would move it; None without a label.
 
-        It is beyond the label by what the follower sags, and by how much its servos are off.
+        They exceed the label by the follower's sag and by the offset of its servos.
         """
         label = self._expert.label(self.env.get_state(), self.env.world)
         return self.to_joints(label.action) + self.follower.sag() + self.follower.offset if label.valid else None
 
     def reset(self, seed: int) -> None:
-        """Draw the world of a seed, the arm at its start, the leader with it."""
+        """Draw the world of a seed, with the arm and the leader at its start posture."""
         self.env.start(seed)
         self.seed, self._solved = seed, 0
         self.follower.reset(self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos)
@@ -123,7 +123,7 @@ class Station:
         self._show()
 
     def run(self, each_step: Callable[[], bool]) -> None:
-        """Let time pass until `each_step`, called every control step, returns False."""
+        """Run the simulation until `each_step`, called every control step, returns False."""
         begun, slices = time.perf_counter(), 0
         while True:
             begun = self._wait(begun, slices)
@@ -136,13 +136,13 @@ class Station:
             slices += 1
 
     def _wait(self, begun: float, slices: int) -> float:
-        """Wait for the time of a slice; returns the beginning of time, later where the machine is too slow."""
+        """Wait until a slice is due; return the start time, moved later if the machine is too slow."""
         behind = time.perf_counter() - begun - slices * self.slice
         time.sleep(max(0.0, -behind))
         return begun + behind if behind > _LATE else begun
 
     def _advance(self, ends_step: bool) -> None:
-        """One slice of time."""
+        """Advance the simulation by one slice."""
         env = self.env
         if self.hand is not None:
             env.data.qpos[self.follower.q] = self.hand
@@ -164,14 +164,14 @@ class Station:
         self.buses["leader"].show(q, settled=True)
 
     def _move_leader(self, q: F64 | None) -> None:
-        """Move its joints towards `q` as fast as servos turn; those with torque on, to where they are told to go."""
+        """Move joints towards `q` at up to the servos' speed; those with torque on move to their goals instead."""
         bus, most = self.buses["leader"], self._servos.speed * self.slice
         wanted = np.where(bus["Torque_Enable"] > 0, bus.goals(), self._leader if q is None else q)
         self._leader = self._leader + np.clip(wanted - self._leader, -most, most)
         bus.show(self._leader)
 
     def _show(self) -> None:
-        """Let clients and cameras see the world as it is."""
+        """Update what clients and cameras see."""
         data, state = self.env.data, self.env.get_state()
         self.seen = data.qpos.copy(), data.mocap_pos.copy()
         with self.buses["follower"].lock:
@@ -179,17 +179,17 @@ class Station:
             self._shown, self._sag = state, self.follower.sag()
 
     def to_joints(self, action: F64) -> F64:
-        """Return the joints [rad] that an action (n,) asks for, (n,)."""
+        """Return the joints [rad], (n,), that an action (n,) commands."""
         arm, opening = self.env.scene.actions.split(action)
         return np.array([*arm, *self.env.scene.gripper.command(opening)])
 
     def to_action(self, joints: F64) -> F64:
-        """Return the action (n,) that asks for these joints [rad], (n,)."""
+        """Return the action (n,) that commands these joints [rad], (n,)."""
         scene, arm = self.env.scene, len(self.env.scene.arm_q)
         return scene.actions.join(joints[:arm], scene.gripper.commanded(joints[arm:], joints[arm:]))
 
     def close(self) -> None:
-        """Keep what the servos keep, end the ports, and remove their links."""
+        """Save what the servos keep without power, close the ports, and remove their links."""
         for name, bus in self.buses.items():
             self._keep(name, bus)
             (self._config.output_dir / name).unlink(missing_ok=True)
