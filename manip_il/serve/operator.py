@@ -235,11 +235,16 @@ def _start(command: Sequence[str]) -> tuple[int, int]:
     return pid, terminal
 
 
-def weigh_session() -> None:
-    """Raise the priority of this process's session if permitted; Linux first shares CPU time among sessions.
+def weigh_session(weight: str = "-20") -> str:
+    """Raise the priority of this process's session if permitted, and return the former one; "" if not.
 
-    The program and its servos run in two sessions, and each must answer the other within milliseconds. Real-time
-    priority would block the kernel's own threads, which carry bytes from one end of a terminal to the other.
+    Linux first shares CPU time among sessions. The program and its servos run in two, and each must answer the other
+    within milliseconds. Real-time priority would block the kernel's own threads, which carry bytes from one end of a
+    terminal to the other.
     """
     with contextlib.suppress(OSError):
-        Path("/proc/self/autogroup").write_text("-20")
+        group = Path("/proc/self/autogroup")
+        before = group.read_text().split()[-1]  # "/autogroup-12 nice 0"
+        group.write_text(weight)
+        return before
+    return ""

@@ -40,8 +40,8 @@ def serve(
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
-    weigh_session()
     with contextlib.ExitStack() as stack:
+        stack.callback(weigh_session, weigh_session() or "0")
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
         episodes = Episodes(station, env, config.log, config.seed)
