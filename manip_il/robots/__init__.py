@@ -1,4 +1,4 @@
-"""Robots: a YAML beside an MJCF each."""
+"""Robots, each a YAML beside an MJCF."""
 
 from pathlib import Path
 

@@ -16,21 +16,21 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ServoUnits:
-    """The way from [rad] and [m] to degrees and 0 to 100, and back.
+    """Conversion from [rad] and [m] to degrees and 0 to 100, and back.
 
-    openings: of the gripper [m], rising, (c,). percents: its servo's numbers there, 0 to 100, (c,).
+    openings: the gripper's [m], rising, (c,). percents: its servo's numbers there, 0 to 100, (c,).
     """
 
     openings: F64
     percents: F64
 
     def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Return degrees (n - 1,) and the gripper's number, 0 to 100, of joints (n - 1,) [rad] and an opening [m]."""
+        """Return degrees (n - 1,) and the gripper's number, 0 to 100, for joints (n - 1,) [rad] and an opening [m]."""
         return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
 
     def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Return joints (n - 1,) [rad] and opening [m] of degrees (n - 1,) and the gripper's number, 0 to 100."""
-        order = slice(None, None, 1 if self.percents[0] < self.percents[-1] else -1)  # as `interp` takes them
+        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and the gripper's number, 0 to 100."""
+        order = slice(None, None, 1 if self.percents[0] < self.percents[-1] else -1)  # rising, as `interp` needs them
         return np.radians(arm), float(np.interp(percent, self.percents[order], self.openings[order]))
 
 
@@ -38,10 +38,10 @@ class ServoUnits:
 class ActionSpace:
     """Names and bounds of an action (n,): joint targets [rad] and, last in `names`, the gripper's opening [m].
 
-    low, high: what commands are clipped to, infinite where a joint turns freely. scale: the longest step of a joint
+    low, high: what commands are clipped to, infinite for a joint that turns freely. scale: the longest step of a joint
     target from the measured joint [rad], the whole opening of the gripper [m]. relative: whether a learner's target is
-    measured from where the joint is; the gripper's is not. units: of a robot with servos: all of these, every action
-    and measured state are then in degrees and, the gripper's, from 0 to 100.
+    relative to the measured joint; the gripper's is not. units: for a robot with servos; all of these, actions and
+    measured states are then in degrees, the gripper's from 0 to 100.
     """
 
     names: tuple[str, ...]
@@ -65,7 +65,7 @@ class ActionSpace:
         return int(np.flatnonzero(~self.relative)[0])
 
     def join(self, arm: F64, opening: float) -> F64:
-        """Return the action, or measured state, (n,) of joint values (n - 1,) [rad] and an opening [m]."""
+        """Return the action, or measured state, (n,) for joint values (n - 1,) [rad] and an opening [m]."""
         return self._together(arm, opening) if self.units is None else self._together(*self.units.of(arm, opening))
 
     def split(self, action: F64) -> tuple[F64, float]:
@@ -84,7 +84,7 @@ class ActionSpace:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.low.shape:
             raise MismatchError("action shape", "the policy", action.shape, "the robot", self.low.shape)
-        if not (math.isfinite(action.dot(action)) or np.isfinite(action).all()):  # the first may overflow, no more
+        if not (math.isfinite(action.dot(action)) or np.isfinite(action).all()):  # the first, fast test may overflow
             raise NotFiniteError(f"action at step {step} is not finite: {action}")
         return np.minimum(np.maximum(action, self.low), self.high)
 

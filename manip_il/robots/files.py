@@ -1,4 +1,4 @@
-"""Pieces of a robot's YAML as what they are, and files of a MuJoCo model, mended where the YAML says so."""
+"""Parts of a robot's YAML as typed values, and files of a MuJoCo model, mended as the YAML says."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
-KEYS = ("model", "includes", "meshes", "mend")  # of a YAML
-_LARGEST = 16 * 1024**2  # of an MJCF [bytes]
+KEYS = ("model", "includes", "meshes", "mend")  # keys of a YAML
+_LARGEST = 16 * 1024**2  # largest MJCF [bytes]
 
 
 @dataclass(frozen=True)
 class ModelFiles:
     """An MJCF and what it needs; paths are absolute.
 
-    includes: the folder that the model is read as if it lay in: that of what it includes. meshes: the folder of its
-    meshes. mend: text of the file, and what MuJoCo reads in its place: for a file of somebody else's that does not
-    compile.
+    includes: the folder of the files that the model includes; it is read as if it lay there. meshes: the folder of its
+    meshes. mend: text of the file, and what MuJoCo reads in its place, for third-party files that do not compile.
     """
 
     model: Path
@@ -34,12 +33,12 @@ class ModelFiles:
 
     @classmethod
     def read(cls, what: str, tree: Mapping[str, Any], folder: Path) -> Self:
-        """Make it of what YAML holds in a folder; `ManipError` names what is wrong."""
+        """Return the files of a YAML in a folder. Raises `ManipError` naming what is wrong."""
         places = {key: place(what + key, tree[key], folder) for key in KEYS if key in tree and key != "mend"}
         return cls(**places, mend=read(f"{what}mend", dict[str, str], tree.get("mend", {})))
 
     def load(self, robot: str) -> mujoco.MjSpec:
-        """Read the model; MuJoCo finds what it includes and its meshes. Raises `UsageError` if it cannot be read.
+        """Read the model with its included files and its meshes. Raises `UsageError` if it cannot be read.
 
         robot: its name.
         """
@@ -49,7 +48,7 @@ class ModelFiles:
             name = str(home / f"mended {self.model.name}")
             spec = mujoco.MjSpec.from_file(name, include={name: model})
             if self.meshes is not None:
-                # MuJoCo puts an included file's folder before what that names
+                # MuJoCo prefixes names in an included file with its folder
                 meshes = [mesh.file.removeprefix(spec.modelfiledir) for mesh in spec.meshes if mesh.file]
                 assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh", _LARGEST) for mesh in sorted(meshes)}
                 included = {path: (home / path).read_bytes() for path in _included(model, home)}
@@ -75,17 +74,17 @@ class ModelFiles:
 
 
 def _included(model: bytes, home: Path) -> set[str]:
-    """The files that a model includes, and that those do."""
+    """The files that a model includes, directly or not."""
     found = {name.decode() for name in re.findall(rb"<include\s+file=\"([^\"]+)\"", model)}
     return found.union(*(_included((home / name).read_bytes(), home) for name in found))
 
 
 def read(what: str, kind: Any, value: Any) -> Any:
-    """Return what YAML holds as a type: a dataclass, whose fields are the keys, a tuple, a mapping, a number, text.
+    """Return a YAML's value as a type: a dataclass, whose fields are the keys, a tuple, a mapping, a number, text.
 
-    Raises `UnknownName` for another key, `ManipError` for what is missing, of another type, or refused by the class.
+    Raises `UnknownName` for another key, `ManipError` for a value that is missing, mistyped or refused by the class.
     """
-    import draccus  # here, as names of robots need none
+    import draccus  # imported here: names of robots do not need it
 
     if is_dataclass(kind):
         known = [one.name for one in fields(kind)]
@@ -97,20 +96,20 @@ def read(what: str, kind: Any, value: Any) -> Any:
         return decode(kind, value)
     except ManipError as error:
         raise ManipError(f"{what}.{error}") from None
-    except Exception as error:  # draccus raises bare ones, too
+    except Exception as error:  # draccus also raises bare ones
         line = checks.one_line(error)
         raise ManipError(f"{what} is {checks.shorten(value)}: {line}") from None
 
 
 def require_lengths(one: Any, **counts: int) -> None:
-    """Raise `ManipError` for a field that has not so many numbers."""
+    """Raise `ManipError` for a field with a wrong count of numbers."""
     for name, count in counts.items():
         if len(getattr(one, name)) != count:
             raise ManipError(f"{name} has {len(getattr(one, name))} numbers; expected {count}")
 
 
 def place(what: str, value: Any, folder: Path) -> Path:
-    """Return the path of `PATH`, from the YAML's folder, or of `PACKAGE:PATH`, in an installed package."""
+    """Return the path of `PATH`, relative to the YAML's folder, or of `PACKAGE:PATH`, in an installed package."""
     package, colon, path = checks.text(what, value).partition(":")
     if not colon:
         return folder / package

@@ -1,4 +1,4 @@
-"""Finds on a robot's model what its YAML need not say: joints, motors, the hand's frame, a posture to start from."""
+"""Find on a robot's model what its YAML may omit: joints, motors, the hand's frame, a posture to start from."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from manip_il.robots.rotations import hand_down, rotation_vector
 from manip_il.robots.spec import arm_spec, bare_spec, require
 
 F64 = NDArray[np.float64]
-FORCE = 200.0  # of an arm joint whose model sets no limit [N m]
-ARMATURE = 0.1  # of an arm joint whose model has none [kg m^2]
-FREQUENCY = 2 * math.pi * 6.0  # of a joint with its motor as a spring [rad/s]
-_AT_OBJECT = 0.7  # of the way from closed to open: fingers that turn then stand as they do at an object
+FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
+ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
+FREQUENCY = 2 * math.pi * 6.0  # natural frequency of a joint with its motor as a spring [rad/s]
+_AT_OBJECT = 0.7  # share of the way from closed to open at which turning fingers stand as at an object
 _SETTLE, _STEP = 1000, 0.002  # physics steps, and their length [s]
-FROM_TIP = 0.012  # of the frame, from the fingertips [m]
-_CLEAR = 0.006  # of the fingertips over the table at the frame's lowest [m]
-_SQUARE = 0.95  # cosine of how far the fingers' way may be off an axis of the hand's body to count as along it
-_LEAST_GAP = 1e-4  # between fingers half closed [m]
+FROM_TIP = 0.012  # distance of the frame from the fingertips [m]
+_CLEAR = 0.006  # clearance of the fingertips over the table at the frame's lowest [m]
+_SQUARE = 0.95  # cosine of the largest angle at which the fingers' motion counts as along an axis of the hand's body
+_LEAST_GAP = 1e-4  # least gap between half-closed fingers [m]
 _METRES, _TURN = 4, 6  # digits
-_STARTS, _STEPS = 40, 150  # of inverse kinematics: random postures, and steps from each
-_LONGEST = 0.2  # of a joint in a step [rad]
-_HIGHEST = 0.2  # of the hand over the table, or half the workspace's height where that is less [m]
-_LOWER = (1.0, 0.7, 0.4)  # shares of that, tried one after the other
-_ARRIVED = 0.01  # off the place [m], an angle counting as 5 cm a radian
+_STARTS, _STEPS = 40, 150  # inverse kinematics: random postures, and steps from each
+_LONGEST = 0.2  # longest step of a joint [rad]
+_HIGHEST = 0.2  # height of the hand over the table, or half the workspace's height if that is less [m]
+_LOWER = (1.0, 0.7, 0.4)  # shares of that height, tried in order
+_ARRIVED = 0.01  # tolerated pose error [m], a radian counting as 5 cm
 _ANGLE_AS_LENGTH = 0.05
-_ENOUGH = (0.5, 0.15, 0.25)  # of margin to a limit [rad], of the smallest singular value, of height of the links [m]
+_ENOUGH = (0.5, 0.15, 0.25)  # sufficient margin to a limit [rad], smallest singular value, height of the links [m]
 _DIGITS = 4
 
 
 def complete(said: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a YAML says and, for the rest, what its model shows. Raises `UsageError` where it shows nothing."""
+    """Return a YAML's fields, missing ones found on the model. Raises `UsageError` if one cannot be found."""
     said = dict(said)
     spec = bare_spec(said["name"], said["files"], said["hand"], said["gripper"])
     joints = said.setdefault("joints", arm_joints(said["name"], spec, said["hand"], said["gripper"].joints))
@@ -69,7 +69,7 @@ def complete(said: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def arm_joints(robot: str, spec: mujoco.MjSpec, hand: str, gripper: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the joints that turn between the base and the hand. Raises `UsageError` where there are none.
+    """Return the names of the hinges between the base and the hand. Raises `UsageError` if there are none.
 
     robot: its name, for messages. gripper: joints that are not the arm's.
     """
@@ -93,7 +93,7 @@ def motor_limits(
     robot: str, files: ModelFiles, spec: mujoco.MjSpec, joints: Sequence[str]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the greatest torques [N m] and the armatures [kg m^2] of joints, as the model has them."""
-    whole = files.load(robot)  # held: what MuJoCo gives of a model does not keep it
+    whole = files.load(robot)  # kept: MuJoCo's views of a spec do not keep it alive
     motors = {one.target: one for one in whole.actuators}
     forces = [_greatest_torque(motors.get(name), spec.joint(name)) for name in joints]
     armature = [float(spec.joint(name).armature) or ARMATURE for name in joints]
@@ -113,7 +113,7 @@ def _greatest_torque(motor: mujoco._specs.MjsActuator | None, joint: mujoco._spe
 
 
 def find_gains(robot: Robot) -> tuple[float, ...]:
-    """Return kp of each joint [N m/rad]: the joint answers at 6 Hz with what hangs on it at home."""
+    """Return kp of each joint [N m/rad]: its natural frequency is 6 Hz with the inertia on it at home."""
     model = arm_spec(robot).compile()
     data = mujoco.MjData(model)
     for name, value in zip(robot.joints, robot.home, strict=True):
@@ -126,9 +126,9 @@ def find_gains(robot: Robot) -> tuple[float, ...]:
 
 
 def find_ee(robot: Robot) -> EndEffector:
-    """Return the frame between the fingertips: z from the hand to them, y along the way that the fingers come together.
+    """Return the frame between the fingertips: z from the hand to them, y along the fingers' motion.
 
-    Along axes of the hand's body, where that is nearly so. Raises `UsageError` where the fingers do not come apart.
+    Axes of the hand's body that nearly agree are used instead. Raises `UsageError` if the fingers do not come apart.
     """
     model, data = _settled(robot, _AT_OBJECT)
     hand = model.body(robot.hand).id
@@ -172,7 +172,7 @@ def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]
 
 
 def _tip(robot: Robot, z: F64) -> float:
-    """Measure how far the closed fingers go from the hand along its axis (3,) [m]."""
+    """Measure how far the closed fingers extend from the hand along its axis (3,) [m]."""
     model, data = _settled(robot, 0.0)
     hand = model.body(robot.hand).id
     along = data.xmat[hand].reshape(3, 3) @ z
@@ -181,7 +181,7 @@ def _tip(robot: Robot, z: F64) -> float:
 
 
 def _along_axis(vector: F64, least: float = 0.0) -> F64:
-    """The unit vector along the axis that a vector is most along, (3,); the vector where its share is below `least`."""
+    """The unit vector of the axis nearest to a vector, (3,); the vector itself if its share is below `least`."""
     axis = int(np.argmax(np.abs(vector)))
     if abs(float(vector[axis])) < least:
         return vector
@@ -193,7 +193,7 @@ def _along_axis(vector: F64, least: float = 0.0) -> F64:
 def find_home(robot: Robot, turns: bool) -> Robot:
     """Return the robot with its best posture for a hand that points down over the workspace's middle.
 
-    turns: the frame `ee` may be turned by half about z, where that suits the arm better. Raises `UsageError` where the
+    turns: the frame `ee` may be turned by half a turn about z if that suits the arm better. Raises `UsageError` if the
     hand gets there from none of forty postures.
     """
     halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
@@ -217,7 +217,7 @@ def _half_turned(ee: EndEffector) -> EndEffector:
 
 
 def _best(robot: Robot, height: float) -> tuple[float, Robot]:
-    """The best posture of one way round of the hand, and how good it is; minus infinity for none."""
+    """Rating of the best posture for the hand's frame, minus infinity for none, and the robot with it."""
     soft = robot.leans
     middle = replace(robot, home=tuple(_counted(ArmIK(robot).limits).mean(axis=1)))
     ik, body = ArmIK(middle), Body(middle)
@@ -236,13 +236,13 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
 
 
 def _counted(limits: F64) -> F64:
-    """Limits of joints, those of a whole turn or without any as half a turn to either side, (arm, 2) [rad]."""
+    """Limits of joints, (arm, 2) [rad]; a whole turn, or none, counts as half a turn to either side."""
     free = ~np.isfinite(limits).all(axis=1) | (limits[:, 1] - limits[:, 0] >= 2 * np.pi - 1e-3)
     return np.where(free[:, None], np.array([-np.pi, np.pi]), limits)
 
 
 def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple[F64, float]:
-    """Joints to which inverse kinematics comes from some, and what it misses the pose by [m]."""
+    """Joints that inverse kinematics reaches from `q`, and the pose error left [m]."""
     counted, miss = _counted(ik.limits), math.inf
     for _ in range(_STEPS):
         position, turned = ik.ee_pose(q)

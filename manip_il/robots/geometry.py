@@ -1,4 +1,4 @@
-"""Outlines of geoms, distances between them, and whether a robot meets itself or what stands around it."""
+"""Outlines of geoms, distances between them, and collisions of a robot with itself and what is around it."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from manip_il.robots.robot import GRIPPER, Robot
 from manip_il.robots.spec import arm_spec
 
 F64 = NDArray[np.float64]
-_AT_TIP = 0.025  # of a fingertip: what is farther from it is no pad [m]
+_AT_TIP = 0.025  # distance from a fingertip beyond which a geom is no pad [m]
 _FAR = 1.0  # longest distance that is measured [m]
 _NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # [m]
-_DEEP = 1e-3  # parts that overlap by less touch at most [m]
-_BEYOND = 1e-6  # a limit, in rounding [rad]
-CLEARANCE = 0.02  # parts that are nearer than that meet [m]
+_DEEP = 1e-3  # parts that overlap by less merely touch [m]
+_BEYOND = 1e-6  # tolerated rounding error at a limit [rad]
+CLEARANCE = 0.02  # parts nearer than this collide [m]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 Pair = tuple[str, str]
 
 
 def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
-    """Return points around a geom in the world, (n, 3) [m]: of its mesh, or the corners of its box."""
+    """Return points around a geom in the world, (n, 3) [m]: its mesh's vertices, or its box's corners."""
     mesh, middle, half = int(model.geom_dataid[geom]), model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
     points = middle + half * _CORNERS
-    if mesh >= 0:  # turned as a mesh is in its geom, its box reaches farther than it does
+    if mesh >= 0:  # the box of a mesh that is rotated in its geom is too large
         start = model.mesh_vertadr[mesh]
         points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
     return data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T
@@ -41,9 +41,9 @@ def at_tip(model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], al
 
 
 def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, ends: F64 | None = None) -> float:
-    """Return how far two geoms are apart, at most 1 m, and put their nearest points (6,) into `ends`; [m].
+    """Return the distance of two geoms, at most 1 m, and put their nearest points (6,) into `ends`; [m].
 
-    For two that are apart MuJoCo now and then returns exactly 0; not from a hair's breadth beside.
+    For two separate geoms MuJoCo sometimes returns exactly 0, but not once one is moved slightly.
     """
     place = data.geom_xpos[one].copy()
     apart = 0.0
@@ -68,7 +68,7 @@ def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequenc
 
 
 class Body:
-    """The whole robot, to see whether parts of it meet that are apart at home."""
+    """The whole robot, to detect collisions of its parts that it does not have at home."""
 
     def __init__(self, robot: Robot):
         self._model = arm_spec(robot).compile()
@@ -80,11 +80,11 @@ class Body:
         self._at_home = self.meeting(np.asarray(robot.home))
 
     def meets_itself(self, q: F64) -> bool:
-        """Return whether parts meet at joints (arm,) [rad] that are apart at home."""
+        """Return whether parts collide at joints (arm,) [rad] that do not at home."""
         return not self.meeting(q) <= self._at_home
 
     def meeting(self, q: F64) -> frozenset[frozenset[int]]:
-        """Return the pairs of parts, as bodies, that meet at joints (arm,) [rad]."""
+        """Return the pairs of parts, as bodies, that collide at joints (arm,) [rad]."""
         self._data.qpos[self._q] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)
@@ -95,7 +95,7 @@ class Body:
 def meeting_at(robot: Robot, model: mujoco.MjModel, prefix: str, posture: F64) -> dict[Pair, float]:
     """Return the pairs of bodies that overlap in a posture of the arm (arm,) [rad], the gripper open, and how deep [m].
 
-    Pairs of the robot's own, and of it and what stands fixed in the world, which goes by the name of its geom.
+    Pairs are within the robot, or of the robot and what is fixed in the world, which is named by its geom.
     prefix: of the robot's names in a scene's model.
     """
     data, gripper = mujoco.MjData(model), robot.gripper
@@ -119,7 +119,7 @@ def meeting_at(robot: Robot, model: mujoco.MjModel, prefix: str, posture: F64) -
 def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
     """Raise `UsageError` for a `home` beyond a joint's limits, or in which parts overlap.
 
-    Two of the robot's own may overlap where they do so at zero, too: many models have such neighbours.
+    Two of the robot's own may overlap if they also do so at zero, as neighbours do in many models.
     """
     for name, value in zip(robot.joints, robot.home, strict=True):
         joint = model.joint(prefix + name)

@@ -1,7 +1,7 @@
 """A gripper as its opening [m] between the pads, whatever drives the fingers and however they move.
 
-Command and opening are related by a sweep: when a robot is first used, its actuators are moved from closed to open and
-the distance is measured at which the fingers come to rest. So parallel, hinged and linked fingers are alike.
+A sweep relates command and opening: when a robot is first used, its actuators are moved from closed to open and the
+gap is measured at which the fingers come to rest. Parallel, hinged and linked fingers are thus treated alike.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 
 F64 = NDArray[np.float64]
-Geoms = Sequence[Sequence[int]]  # of each finger
+Geoms = Sequence[Sequence[int]]  # geom ids of each finger
 TOUCH = 0.0015  # a finger this near to an object touches it [m]
-_COMMANDS = 15  # of the sweep from closed to open
+_COMMANDS = 15  # commands of the sweep from closed to open
 _SETTLE = 250  # physics steps at each
 _STEP = 0.002  # [s]
-_PAD = 0.004  # what is this much farther from the other finger than the nearest at the tip is no pad [m]
-_LOPSIDED = 0.004  # the middle of the pads moves by more where only one of two fingers moves [m]
+_PAD = 0.004  # a geom this much farther from the other finger than the nearest at the tip is no pad [m]
+_LOPSIDED = 0.004  # the middle of the pads moves by more if only one of two fingers moves [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
@@ -35,9 +35,9 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 class Sweep:
     """Measured relation of command and opening.
 
-    shares: of the way from closed to open, commanded and measured, rising, (c,). openings: between the pads at rest
-    [m], rising, (c,). middles: of the pads along the hand's y [m], (c,); all 0 where both sides move alike. pads: for
-    each finger its geoms' places among the finger's, the nearest to the other one first; holding: those that may hold.
+    shares: of the way from closed to open, commanded and measured, rising, (c,). openings: gaps between the pads at
+    rest [m], rising, (c,). middles: of the pads along the hand's y [m], (c,); all 0 if both sides move alike. pads: for
+    each finger the indices of its pads, nearest to the other finger first; holding: of those that may hold.
     """
 
     shares: F64
@@ -56,7 +56,7 @@ class Gripper:
         self.ctrl = np.array([model.actuator(prefix + name).id for name in config.joints], dtype=np.int64)
         self._closed, self._open = np.asarray(config.closed), np.asarray(config.open)
         self._travel = self._open - self._closed
-        weights = 1 / (self._travel * len(self._travel))  # of the joints in the share of the way that is gone
+        weights = 1 / (self._travel * len(self._travel))  # joints' weights in the share of the way
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
         self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()
@@ -86,25 +86,25 @@ class Gripper:
 
     @property
     def driven(self) -> tuple[F64, F64]:
-        """Openings [m], rising, and where the first of the driven joints is then [rad or m]; (c,) both."""
+        """Openings [m], rising, and the first driven joint's positions at these [rad or m]; (c,) both."""
         return self._sweep.openings, self._closed[0] + self._sweep.shares * self._travel[0]
 
     def middle(self, opening: float) -> float:
-        """Return where the middle between the pads is along the hand's y, at an opening [m]; 0 where all fingers move.
+        """Return the middle between the pads along the hand's y, at an opening [m]; 0 if all fingers move.
 
-        Where one jaw stands and the other turns or slides, what is held ends beside the standing one.
+        If one jaw is fixed and the other turns or slides, a held object ends up beside the fixed one.
         """
         return float(np.interp(opening, self._sweep.openings, self._sweep.middles)) if self.lopsided else 0.0
 
     def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] that commands (g,) ask for: of the actuator that they move farthest from `before`."""
+        """Return the opening [m] that commands (g,) ask for, by the actuator that they move farthest from `before`."""
         shares = (commands - self._closed) / self._travel
         moved = np.abs(shares - (before - self._closed) / self._travel)
         return float(np.interp(shares[moved.argmax()], self._sweep.shares, self._sweep.openings))
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> bool:
         """Return whether every finger touches a geom. Needs kinematics to be up to date in `data`."""
-        # For two boxes that are apart `mj_geomDistance` now and then returns 0, but only within its greatest distance.
+        # For two separate boxes `mj_geomDistance` sometimes returns 0, but only within its greatest distance.
         return all(
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads)
             for pads in self._holding
@@ -115,7 +115,7 @@ class Gripper:
 def sweep(robot: Robot) -> Sweep:
     """Move a robot's gripper from closed to open and measure where the fingers come to rest.
 
-    Raises `UsageError` where they do not come apart.
+    Raises `UsageError` if they do not come apart.
     """
     model, data, fingers, shares, poses = _at_rest(robot)
     jaws = _apart(*_at(model, data, poses[-1]), fingers)
@@ -126,7 +126,7 @@ def sweep(robot: Robot) -> Sweep:
     tips = _tips(*_at(model, data, poses[-1]), jaws)
     gaps = [_gaps(*_at(model, data, pose), tips) for pose in poses]
     least = [min(float(gap.min()) for gap in one) for one in gaps]
-    shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # a linkage's links pass another
+    shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # links may pass each other
     pads = [_near(gap, tip, float(gap.min())) for gap, tip in zip(gaps[shut], tips, strict=True)]
     measured = [_opening(*_at(model, data, pose), pads) for pose in poses[shut:]]
     openings, shares = [opening for opening, _ in measured], shares[shut:]
@@ -138,7 +138,7 @@ def sweep(robot: Robot) -> Sweep:
         )
     if np.ptp(middles) < _LOPSIDED:
         middles = np.zeros(len(middles))
-    holding = jaws  # one that turns holds wide things farther from its tip
+    holding = jaws  # a turning jaw holds wide objects farther from its tip
     if not middles.any():
         of_all = _gaps(*_at(model, data, poses[shut]), jaws)
         most = [float(gap.min()) for gap in gaps[shut]]
@@ -151,7 +151,7 @@ def sweep(robot: Robot) -> Sweep:
 
 
 def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[float], list[F64]]:
-    """The model, each finger's geoms, and what each command comes to: its share of the way, and all joints."""
+    """The model, each finger's geoms, and for each command the share of the way reached and all joints."""
     spec = arm_spec(robot)
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model = spec.compile()
@@ -179,13 +179,13 @@ def _at(model: mujoco.MjModel, data: mujoco.MjData, pose: F64) -> tuple[mujoco.M
 
 
 def _apart(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[list[int]]:
-    """The geoms of each finger that touch no other one when all are open: not those around a jaw's hinge."""
+    """The geoms of each finger that touch no other finger when open, so none around a jaw's hinge."""
     gaps = _gaps(model, data, fingers)
     return [[geom for geom, gap in zip(*one, strict=True) if gap > 0] for one in zip(fingers, gaps, strict=True)]
 
 
 def _tips(model: mujoco.MjModel, data: mujoco.MjData, jaws: Geoms) -> list[list[int]]:
-    """The geoms of each finger that reach near its tip: what carries it may pass beside the other's."""
+    """The geoms of each finger near its tip; the links behind may pass beside the other finger's."""
     along = data.site("ee").xmat.reshape(3, 3)[:, 2]
     return [at_tip(model, data, jaw, along) for jaw in jaws]
 
@@ -209,14 +209,14 @@ def _opening(model: mujoco.MjModel, data: mujoco.MjData, pads: Geoms) -> tuple[f
 
 
 def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
-    """The geoms whose gap is hardly more than the least at the tip, the nearest first."""
+    """The geoms whose gap is hardly more than the least at the tip, nearest first."""
     return [geoms[i] for i in np.argsort(gaps, kind="stable") if gaps[i] <= least + _PAD]
 
 
 def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = "") -> list[tuple[int, ...]]:
-    """Return for each finger the ids of its geoms that can touch things, and of what hangs on it but another finger.
+    """Return for each finger the ids of the solid geoms of it and of its child bodies except other fingers.
 
-    prefix: of the bodies' names. Raises `UsageError` for a finger without one.
+    prefix: of the bodies' names. Raises `UsageError` for a finger without such a geom.
     """
     roots = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
     owners, touching = dict(roots), (model.geom_contype != 0) | (model.geom_conaffinity != 0)

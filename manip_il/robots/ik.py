@@ -1,4 +1,4 @@
-"""Differential inverse kinematics of one arm on mink."""
+"""Differential inverse kinematics of one arm, with mink."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _POSITION_COST = 1.0  # [1/m]
 _LM_DAMPING = 1e-3
 _DAMPING = 1e-5
 _UNBOUNDED = 1e30  # DAQP's infinity
-_CONVERGED = 1e-4  # weighted pose error that is none [m]
-_CORRECTIONS = 3  # Gauss-Newton steps of `moved`; the error is squared by each
-_EXACT = 1e-9  # pose error that is none to `moved` [m] or [rad]
+_CONVERGED = 1e-4  # weighted pose error that counts as zero [m]
+_CORRECTIONS = 3  # Gauss-Newton steps of `moved`; each squares the error
+_EXACT = 1e-9  # pose error that counts as zero in `moved` [m] or [rad]
 _LEVENBERG = 1e-8  # added to J J^T, so that a singular posture gives a short step
-_LARGEST = 0.5  # of a joint in one step of `moved` [rad]
+_LARGEST = 0.5  # largest step of a joint in `moved` [rad]
 
 
 class PoseProgram:
-    """mink's quadratic program of a site's pose [m] and [rad] and of a posture, within the joints' limits.
+    """mink's quadratic program for a site's pose [m] and [rad] and a posture, within the joints' limits.
 
     Stateless: every solution starts from the posture in `data`, after `update`, and from a fixed `home` (n,). costs: of
-    the rotation [1/rad], where the position has 1 [1/m], and of joints off `home` [1/rad].
+    the rotation [1/rad], relative to 1 [1/m] for the position, and of joints away from `home` [1/rad].
     """
 
     def __init__(self, model: mujoco.MjModel, site: str, home: F64, costs: tuple[float, float]):
@@ -41,7 +41,7 @@ class PoseProgram:
         orientation, posture = costs
         self.frame = mink.FrameTask(site, "site", _POSITION_COST, orientation, lm_damping=_LM_DAMPING)
         self._target = self.frame.transform_target_to_world = mink.SE3.identity()
-        self.posture = mink.PostureTask(model, posture)  # else a label depends on the path that led to the posture
+        self.posture = mink.PostureTask(model, posture)  # else a label would depend on the path to the posture
         self.posture.set_target(home)
         limit = mink.ConfigurationLimit(model)
         self._bounded, self._gain = limit.indices.astype(int), limit.gain
@@ -51,7 +51,7 @@ class PoseProgram:
         self._sense = np.zeros(2 * len(rows), np.intc)
 
     def update(self) -> None:
-        """Compute what `data.qpos` changes, Jacobians included."""
+        """Compute what depends on `data.qpos`, Jacobians included."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
 
@@ -62,7 +62,7 @@ class PoseProgram:
         program: Any = mink.build_ik(self._configuration, [self.frame, self.posture], 1.0, _DAMPING, [])
         q = self.data.qpos[self._bounded]
         upper = self._gain * np.concatenate([self._high - q, q - self._low])
-        # DAQP itself: through qpsolvers, and with mink's limits, a label takes a half longer.
+        # DAQP directly: with qpsolvers and mink's limits a label takes half as long again.
         x, _, exit_flag, _ = daqp.solve(program.P, program.q, self._rows, upper, self._lower, self._sense)
         return x if exit_flag > 0 else None
 
@@ -80,7 +80,7 @@ class ArmIK:
         self._program = PoseProgram(model, "ee", home, (robot.costs.orientation, robot.costs.posture))
         joints = [model.joint(name) for name in robot.joints]
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
-        self._data = data = self._program.data  # views of which each says what the posture is now
+        self._data = data = self._program.data  # views that follow the posture
         self._ee, self._ee_flat = data.site_xpos[self._site], data.site_xmat[self._site]
         self._ee_rotation, self._qpos = self._ee_flat.reshape(3, 3), data.qpos
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
@@ -89,11 +89,11 @@ class ArmIK:
         self._links = [int(model.jnt_bodyid[joint.id]) for joint in joints[2:]]
 
     def ahead(self, position: F64) -> float:
-        """Return the yaw that counts as none for a hand at a position (3,) [m]; [rad]."""
+        """Return the yaw that counts as zero for a hand at a position (3,) [m]; [rad]."""
         return yaw_ahead(self._robot, self._data.xanchor[self._shoulder], position)
 
     def smallest_singular_value(self, q: F64) -> float:
-        """Return how far a posture (arm,) [rad] is from one in which the hand cannot be moved some way."""
+        """Return the Jacobian's smallest singular value in a posture (arm,) [rad]: 0 in a singular one."""
         self.ee_pose(q)
         return float(np.linalg.svd(self._site_jacobian(), compute_uv=False)[-1])
 
@@ -114,7 +114,7 @@ class ArmIK:
         return self._ee, self._ee_rotation
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
-        """Return the displacement of `step` alone, (arm,) [rad]; weight: of the rotation, by default as upright."""
+        """Return only the displacement of `step`, (arm,) [rad]; weight: of the rotation, by default as upright."""
         self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(position, rotation)
         if x is None:
@@ -124,11 +124,11 @@ class ArmIK:
         return dq * (largest / longest) if longest > largest else dq
 
     def step(self, position: F64, rotation: F64, largest: float, lean: float = 0.0) -> tuple[F64, float] | None:
-        """Return one step from the posture last given to `ee_pose` towards a pose of `ee`; `largest`: of a joint [rad].
+        """Return one step from the last `ee_pose` posture towards a pose of `ee`; `largest`: longest joint step [rad].
 
-        lean: how far the hand may lean off the rotation for the sake of its position, 0 to 1.
-        Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
-        of the weighted pose error it leaves, as a share; None where the quadratic program has no solution.
+        lean: how far the hand may lean from the rotation to reach the position, 0 to 1.
+        Returns the joint displacement [rad] (arm,), scaled down as a whole if a joint's is too long, and the share of
+        the weighted pose error that it leaves; None if the quadratic program has no solution.
         """
         costs = self._costs
         weight = costs.orientation + lean * (costs.leaning - costs.orientation)
@@ -143,12 +143,12 @@ class ArmIK:
         return dq, self._pose_error(position, rotation, weight) / before
 
     def moved(self, q: F64, motions: F64) -> F64:
-        """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), with which `ee` has moved.
+        """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), that move `ee` by `motions`.
 
         motions: of its position [m] and rotation vectors [rad] in the world's axes, (B, 6). The first step is
-        `displacement`, which resolves what a pose leaves open (the elbow of an arm of seven joints) as for the expert;
-        the corrections after it are the shortest that the linearised kinematics has (damped least squares). A pose that
-        is out of reach is approached.
+        `displacement`, which resolves redundancy (the elbow of an arm with seven joints) as for the expert; the
+        corrections after it are the shortest of the linearised kinematics (damped least squares). A pose out of reach
+        is approached.
         """
         return np.array([self._moved(*row) for row in zip(q, motions, strict=True)]).reshape(q.shape)
 
@@ -171,7 +171,7 @@ class ArmIK:
         return np.minimum(np.maximum(q, self.limits[:, 0]), self.limits[:, 1])
 
     def _site_jacobian(self) -> F64:
-        """Position over rotation of `ee` by the arm's joints at the posture last given to `ee_pose`, (6, arm)."""
+        """Jacobian of `ee`, position over rotation, by the arm's joints at the last `ee_pose`, (6, arm)."""
         jacobian = self._jacobian
         mujoco.mj_jacSite(self._program.model, self._data, jacobian[:3], jacobian[3:], self._site)
         return jacobian[:, self._dofs]

@@ -1,7 +1,7 @@
-"""A map of the points that a robot's hand, pointing down, gets to by inverse kinematics.
+"""A map of the points that a robot's downward hand reaches by inverse kinematics.
 
-It is computed once a robot and kept: beside the YAML of a robot that ships, else in the user's cache, under the hash
-of what it follows from: the compiled model and what the YAML says beyond that.
+It is computed once per robot and stored: beside the YAML of a robot that ships, else in the user's cache, under a hash
+of what it depends on: the compiled model and the rest of the YAML.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ if TYPE_CHECKING:
     from manip_il.robots.ik import ArmIK
 
 F64 = NDArray[np.float64]
-_CELL = 0.05  # of the grid [m]
-_BEYOND = 0.3  # the map goes on around the workspace by this much [m]
+_CELL = 0.05  # grid spacing [m]
+_BEYOND = 0.3  # how far the map extends around the workspace [m]
 _ABOVE = 0.05  # and above it [m]
-_VERSION = 2  # of how the map is computed
-_STEPS = 80  # of inverse kinematics, at most
-_NEAR, _ANGLE = 1e-3, 0.05  # where it has arrived [m], and what a radian counts for beside that [m/rad]
-ARRIVES = 0.004  # what the hand may miss a pose by and still be there [m]
-STRETCH = 0.02  # it still gets there less exactly [m]
-_LEAN = 0.13  # how much farther a hand that leans gets, sideways [m]
-_MOST_LEAN = 1.0  # of the hand of an arm that cannot hold it upright [rad]
-_BLOCKED = 0.1  # what a posture in which the robot meets itself counts for [m]
+_VERSION = 2  # version of the map's computation
+_STEPS = 80  # most steps of inverse kinematics
+_NEAR, _ANGLE = 1e-3, 0.05  # error at which it has converged [m], and what a radian adds to that [m/rad]
+ARRIVES = 0.004  # pose error up to which the hand arrives [m]
+STRETCH = 0.02  # pose error up to which it gets near [m]
+_LEAN = 0.13  # how much farther sideways a leaning hand reaches [m]
+_MOST_LEAN = 1.0  # largest lean of a hand that the arm cannot hold upright [rad]
+_BLOCKED = 0.1  # error added for a posture in which the robot collides with itself [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Errors on a grid: how far the hand, pointing down, ends from each point [m], (x, y, z).
+    """Errors on a grid: how far from each point the downward hand ends [m], (x, y, z).
 
-    origin: of the grid [m], (3,).
+    origin: the grid's [m], (3,).
     """
 
     origin: F64
@@ -57,12 +57,12 @@ class Reach:
 
     @property
     def cell(self) -> float:
-        """Distance of the grid's points along each axis [m]."""
+        """Grid spacing along each axis [m]."""
         return _CELL
 
     @cached_property
     def arrives(self) -> NDArray[np.bool_]:
-        """Whether the hand gets to all corners of each cell of the grid, (x - 1, y - 1, z - 1)."""
+        """Whether the hand reaches all corners of each cell of the grid, (x - 1, y - 1, z - 1)."""
         there = self.errors < ARRIVES
         for axis in range(3):
             there = np.delete(there, -1, axis) & np.delete(there, 0, axis)
@@ -82,7 +82,7 @@ class Reach:
         return x, y
 
     def error(self, position: Sequence[float] | F64) -> float:
-        """Return how far from `position` [m], (3,), the hand ends; beyond the map also how far that is from it [m]."""
+        """Return how far from `position` [m], (3,), the hand ends; plus its distance from the map if beyond it [m]."""
         place = (np.asarray(position) - self.origin) / _CELL
         last = np.array(self.errors.shape) - 1
         inside = np.minimum(np.maximum(place, 0.0), last)
@@ -94,7 +94,7 @@ class Reach:
         return float(block[0] + fz * (block[1] - block[0])) + _CELL * float(np.abs(place - inside).max())
 
     def has(self, position: Sequence[float] | F64) -> bool:
-        """Return whether the hand gets to `position` [m], (3,), and all around it within a cell of the map."""
+        """Return whether the hand reaches `position` [m], (3,), and the rest of its cell of the map."""
         cells, (x, y, z), (first_x, first_y, first_z) = self._arrives, position, self._corner
         x, y, z = (math.floor(at / _CELL) for at in (x - first_x, y - first_y, z - first_z))
         if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
@@ -106,13 +106,13 @@ class Reach:
         return self.has(position) or self.error(position) < STRETCH
 
     def lean(self, position: Sequence[float] | F64) -> float:
-        """Return how much the hand has to lean to get to `position` [m], (3,): 0 for upright, to 1."""
+        """Return how much the hand must lean to reach `position` [m], (3,), from 0 (upright) to 1."""
         if self.has(position):
             return 0.0
         return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
 
     def leaning(self, position: Sequence[float] | F64) -> bool:
-        """Return whether a hand that may lean gets near `position` [m], (3,): it does upright, a little farther in."""
+        """Return whether a hand that may lean gets near `position` [m], (3,): an upright one does farther in."""
         if self.nearly(position):
             return True
         (x, y, z), (in_x, in_y) = position, self._middle
@@ -122,7 +122,7 @@ class Reach:
 
 @cache
 def reach_of(robot: Robot) -> Reach:
-    """Return a robot's map: read where it is kept, else computed (some seconds) and kept, where that can be."""
+    """Return a robot's map: read from its file, else computed (some seconds) and stored if possible."""
     path = _place(robot)
     with contextlib.suppress(Exception), np.load(path) as kept:  # numpy raises many kinds for a file that is no map
         return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
@@ -136,7 +136,7 @@ def reach_of(robot: Robot) -> Reach:
 
 
 def _place(robot: Robot) -> Path:
-    """Where a map lies: beside the YAML of a robot that ships, else in the cache."""
+    """Path of a map: beside the YAML of a robot that ships, else in the cache."""
     if robot.name in ROBOTS and robot == get_robot(robot.name):
         return HERE / f"{robot.name}.reach.npz"
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -144,7 +144,7 @@ def _place(robot: Robot) -> Path:
 
 
 def _key(robot: Robot) -> str:
-    """Hash what a map follows from: the constants of this file, the YAML, and the robot's model as it is compiled."""
+    """Hash what a map depends on: the constants of this file, the YAML, and the robot's model as it is compiled."""
     constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, CLEARANCE)
     compiled = model_bytes(arm_spec(robot).compile())
     said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))  # paths do not count
@@ -152,21 +152,21 @@ def _key(robot: Robot) -> str:
 
 
 def _solve(robot: Robot) -> Reach:
-    """Compute the map: how far the hand ends from every point of the grid."""
-    from manip_il.robots.ik import ArmIK  # mink takes long to import, and a kept map needs none
+    """Compute the map: how far from every point of the grid the hand ends."""
+    from manip_il.robots.ik import ArmIK  # mink is slow to import, and a stored map does not need it
 
     (origin, shape), ik, body = _grid(robot), ArmIK(robot), Body(robot)
     errors = np.empty(shape, np.float32)
     for index in np.ndindex(*shape):
         point = origin + _CELL * np.array(index)
-        point[2] = max(point[2], robot.ee.lowest)  # no hand gets to the table itself
+        point[2] = max(point[2], robot.ee.lowest)  # no hand reaches the table itself
         miss, q = _miss(robot, ik, point)
         errors[index] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
     return Reach(origin, errors.astype(np.float64))
 
 
 def _grid(robot: Robot) -> tuple[F64, tuple[int, ...]]:
-    """The map's origin (3,) [m], and its points along x, y and z."""
+    """The map's origin (3,) [m], and its number of points along x, y and z."""
     space = robot.workspace
     half = space.half_width + _BEYOND
     origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
@@ -174,9 +174,9 @@ def _grid(robot: Robot) -> tuple[F64, tuple[int, ...]]:
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
-    """Return how far from hand-down inverse kinematics ends, from home [m], and the joints there, (arm,) [rad].
+    """Return the pose error at which inverse kinematics ends from home [m], and the joints there, (arm,) [rad].
 
-    An angle counts as a length.
+    The error includes the angle as a length.
     """
     yaw, q, (low, high) = ik.ahead(position), np.asarray(robot.home, dtype=np.float64), ik.limits.T
     down, miss = hand_down(yaw), np.inf
@@ -193,7 +193,7 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
 
 
 def _angle_off(robot: Robot, hand: F64, yaw: float, down: F64) -> float:
-    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; one that leans anyway may lean a good deal."""
+    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; if the arm leans, up to `_MOST_LEAN` is free."""
     if robot.leans:
         return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
     return float(np.arccos(min(1.0, max(-1.0, ((down.T @ hand).trace() - 1) / 2))))

@@ -1,4 +1,4 @@
-"""A robot: an arm with a gripper, by the names in its MJCF, in the parts that its YAML has."""
+"""A robot: an arm with a gripper, by the names in its MJCF, in the sections of its YAML."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from manip_il.errors import ManipError, UnknownName
 from manip_il.robots.files import ModelFiles, require_lengths
 
 F64 = NDArray[np.float64]
-TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
-RATE = 20  # control steps a second of a robot that says no other
+TABLE_BEYOND = 0.08  # offset of the table's middle from the workspace's, away from the robot [m]
+RATE = 20  # default control steps per second
 _MOST_HZ = 500
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
-FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # on the model, where the YAML does not say them
+FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # found on the model if the YAML does not give them
 UPRIGHT_JOINTS = 6  # with fewer, a hand cannot point down everywhere
 YAWS = ("world", "shoulder")
 WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, in the frame `ee` [m]
@@ -30,7 +30,7 @@ class EndEffector:
     """Frame `ee`: between the fingertips, z out of the hand, y along the fingers' motion.
 
     With the hand straight down at zero yaw its axes are world x, -y, -z. position [m] and quaternion (wxyz) in `body`.
-    lowest: of the frame over the table [m]: the fingertips just clear it.
+    lowest: least height of the frame over the table, at which the fingertips just clear it [m].
     """
 
     body: str
@@ -46,9 +46,9 @@ class EndEffector:
 class GripperConfig:
     """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch things.
 
-    finger_mass: of every finger in place of the model's [kg]. force: the most of a driven joint, by default 40 N of one
-    that slides and 10 N m of one that turns [N or N m]. files: of a gripper that has a model of its own, whose
-    names begin with `gripper/`; position [m] and quaternion (wxyz): of that model in the hand's body.
+    finger_mass: replaces that of every finger [kg]. force: limit of a driven joint, by default 40 N if it slides and
+    10 N m if it turns [N or N m]. files: those of a gripper with a model of its own, whose names begin with `gripper/`;
+    position [m] and quaternion (wxyz): of that model in the hand's body.
     """
 
     joints: tuple[str, ...]
@@ -97,7 +97,7 @@ class TableTop:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Place of a camera and of what it looks at in the world, (3,) [m], and its view up and down [deg].
+    """Position of a camera and its target in the world, (3,) [m], and its vertical field of view [deg].
 
     z = 0 is the table's top, x points away from the robot. Looking straight down, x is up in the picture.
     """
@@ -123,10 +123,10 @@ class CameraPose:
 
 @dataclass(frozen=True)
 class Costs:
-    """Costs of inverse kinematics, beside 1 for a metre off the hand's position.
+    """Costs of inverse kinematics, relative to 1 per metre of position error.
 
-    orientation: of a radian off its rotation; leaning: the same of a hand that leans to get farther; posture: of a
-    radian of a joint off home.
+    orientation: per radian of rotation error; leaning: the same for a hand that leans to reach farther; posture: per
+    radian of a joint from home.
     """
 
     orientation: float = 0.2
@@ -138,8 +138,8 @@ class Costs:
 class LeRobotConfig:
     """A robot as LeRobot's recorder knows it.
 
-    robot_type: in `meta/info.json`. names: of its servos, the arm's from base to hand, then the gripper's. gripper:
-    where the gripper's driven joint stands at 0 and at 100 [rad]. fps: frames a second.
+    robot_type: in `meta/info.json`. names: its servos', the arm's from base to hand, then the gripper's. gripper:
+    positions of the gripper's driven joint at 0 and at 100 [rad]. fps: frames per second.
     """
 
     robot_type: str
@@ -154,13 +154,13 @@ class LeRobotConfig:
             raise ManipError(f"gripper is {list(self.gripper)}; expected two places, at 0 and at 100 [rad]")
 
     def percent(self, joint: F64) -> F64:
-        """Return the gripper's numbers, 0 to 100, where its driven joint stands at `joint` [rad]."""
+        """Return the gripper's numbers, 0 to 100, for positions `joint` of its driven joint [rad]."""
         at_0, at_100 = self.gripper
         return 100 * (joint - at_0) / (at_100 - at_0)
 
 
 UPRIGHT = Costs()
-SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # of an arm that cannot
+SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # for an arm that cannot hold its hand upright
 TABLE = TableTop()
 
 
@@ -168,15 +168,15 @@ TABLE = TableTop()
 class Robot:
     """A joint-position-controlled arm with a gripper.
 
-    hand: body that carries the gripper. joints: of the arm, base to hand. home: a posture over the workspace with
-    the hand down [rad]. gains, forces, armature: kp of each joint [N m/rad], its greatest torque [N m], and what is
-    added to its inertia [kg m^2]. base: of the root body [m]. fixed: where joints stand that are neither the arm's
-    nor the gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
-    yaw: where a hand's yaw is zero, along the world's x or straight ahead of the shoulder. wrist_camera: the
-    model's own, on its hand, or where one is in the frame `ee` [m]. cameras: of the scene, where they do not stand as
-    for every robot: front, side. table: of the scene.
-    colours: red, green and blue of meshes without contacts, by patterns of names, later ones first. lerobot: how
-    LeRobot's recorder writes it, where its servos' numbers are wanted in place of [rad] and [m].
+    hand: body that carries the gripper. joints: the arm's, base to hand. home: a posture over the workspace with
+    the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest torque [N m] and added inertia
+    [kg m^2]. base: position of the root body [m]. fixed: positions of the joints that are neither the arm's nor the
+    gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
+    yaw: direction of zero yaw, along the world's x or straight ahead of the shoulder. wrist_camera: name of the
+    model's own, on its hand, or position of an added one in the frame `ee` [m]. cameras: of the scene, if not in the
+    default places: front, side. table: the scene's.
+    colours: red, green and blue of meshes without contacts, by patterns of names, of which later ones win. lerobot:
+    how LeRobot's recorder writes it, if its servos' units are wanted in place of [rad] and [m].
     """
 
     name: str
@@ -220,25 +220,25 @@ class Robot:
 
     @property
     def fps(self) -> int:
-        """Control steps a second, where nothing else is said."""
+        """Default control steps per second."""
         return self.lerobot.fps if self.lerobot is not None else RATE
 
     @property
     def faces_ahead(self) -> bool:
-        """Whether the hand's yaw counts from straight ahead of the shoulder, and not along the world's x."""
+        """Whether the hand's yaw counts from straight ahead of the shoulder, not from the world's x."""
         return self.yaw != "world"
 
     @property
     def leans(self) -> bool:
-        """Whether the hand leans wherever it is, as an arm of too few joints cannot hold it upright."""
+        """Whether the hand leans everywhere, as the arm has too few joints to hold it upright."""
         return self.costs.orientation == self.costs.leaning
 
 
 def costs_of(joints: int) -> Costs:
-    """Return the costs that suit an arm of so many joints."""
+    """Return the costs that suit an arm with that many joints."""
     return UPRIGHT if joints >= UPRIGHT_JOINTS else SOFT
 
 
 def yaw_of(joints: int) -> str:
-    """Return where the yaw of a hand is zero, of an arm of so many joints."""
+    """Return the direction of zero yaw for an arm with that many joints."""
     return YAWS[0] if joints >= UPRIGHT_JOINTS else YAWS[1]

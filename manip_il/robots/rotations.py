@@ -30,13 +30,13 @@ def rotation_matrix(vector: F64) -> F64:
 
 
 def hand_down(yaw: float) -> F64:
-    """Return rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
+    """Return the rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
 
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
-    """Return the yaw that counts as none for a robot's hand at a position (3,), its shoulder at (3,) [m]; [rad]."""
+    """Return the yaw that counts as zero for a robot's hand at a position (3,), its shoulder at (3,) [m]; [rad]."""
     return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.faces_ahead else 0.0
 
 
@@ -46,7 +46,7 @@ def angle_ahead(rotation: F64) -> float:
 
 
 def angle_across(rotation: F64) -> float:
-    """Return the yaw of a hand (3, 3) by the way that its fingers move, however it leans [rad]."""
+    """Return the yaw of a hand (3, 3) by its fingers' motion, however it leans [rad]."""
     return math.atan2(rotation[0, 1], -rotation[1, 1])
 
 
@@ -68,7 +68,7 @@ def angle_from_down(rotation: F64, yaw: float) -> float:
 
 
 def angle_between(a: F64, b: F64) -> float:
-    """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
+    """Return the angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
     return math.acos(min(1.0, max(-1.0, (float(a.ravel().dot(b.ravel())) - 1) / 2)))
 
 
@@ -79,7 +79,7 @@ def turned_towards(rotation: F64, target: F64, largest: float) -> F64:
     (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation.T.dot(target).tolist()
     axis = zy - yz, xz - zx, yx - xy
     length = math.hypot(*axis)
-    if length < 1e-6:  # half a turn: every axis is as near
+    if length < 1e-6:  # half a turn: every axis is equally near
         axis, length = (0.0, 0.0, 1.0), 1.0
     x, y, z = axis
     turn = largest / length

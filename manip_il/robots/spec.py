@@ -15,22 +15,22 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
 
-PLAIN = mujoco.MjSpec()  # its defaults are for what we add to a model, whose own may name a material or a range
+PLAIN = mujoco.MjSpec()  # defaults for what we add to a model, as its own may set a material or a range
 _KV_PER_KP = 1 / 20  # [s]: a time constant of one control step at 20 Hz
-_DAMPING = 1.0  # of an arm joint [N m s/rad]
+_DAMPING = 1.0  # damping of an arm joint [N m s/rad]
 _FINGER_GAINS = (800.0, 20.0, 40.0)  # kp [N/m], kv [N s/m], force [N] of a sliding finger
 _HINGE_GAINS = (20.0, 0.5, 10.0)  # kp [N m/rad], kv [N m s/rad], torque [N m] of a turning one
 _FINGER_ARMATURE, _FINGER_DAMPING = 0.2, 10.0  # [kg], [N s/m]
-_LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # of a linkage's joint [kg m^2], [N m s/rad]
+_LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # for a linkage's joint [kg m^2], [N m s/rad]
 _HINGE_ARMATURE, _HINGE_DAMPING = 0.005, 0.1  # [kg m^2], [N m s/rad]
 WRIST = "wrist"  # the camera on the hand
-_TILT, _FOVY = 0.45, 70.0  # of one that we put there: towards the fingertips [rad]; what it sees up and down [deg]
-_OF_A_SCENE = ("fusestatic", "discardvisual", "settotalmass", "alignfree", "saveinertial")  # of a compiler's options
+_TILT, _FOVY = 0.45, 70.0  # added wrist camera: tilt to the fingertips [rad], vertical field of view [deg]
+_OF_A_SCENE = ("fusestatic", "discardvisual", "settotalmass", "alignfree", "saveinertial")  # compiler options
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
-    """Read a model: its angles in radians, and nothing that its file would have the compiler do to the whole scene.
+    """Read a model, with angles in radians and without compiler options that would affect the whole scene.
 
     robot: its name. Raises `UsageError` if MuJoCo cannot read the model.
     """
@@ -43,7 +43,7 @@ def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
 
 
 def _to_radians(spec: mujoco.MjSpec) -> None:
-    """Convert every angle of a model that has them in degrees."""
+    """Convert every angle of a model from degrees."""
     for joint in spec.joints:
         if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
             joint.range = np.radians(joint.range)
@@ -57,10 +57,10 @@ def _to_radians(spec: mujoco.MjSpec) -> None:
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
-    """Return a robot's model, its gripper's on its hand, without what a model brings for a world of its own.
+    """Return a robot's model with its gripper's attached to its hand, without what belongs to a world.
 
     robot: its name. camera: the one on the hand, kept as `wrist`.
-    Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is not there.
+    Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is missing.
     """
     spec = load(files, robot)
     require(robot, "body", (hand,), spec.bodies)
@@ -81,7 +81,7 @@ def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
     """Return the arm as a spec: position-controlled, with the site `ee`, and nothing that is not the robot's.
 
-    Raises `UsageError` naming a joint, body or file that is not there, and what is.
+    Raises `UsageError` naming a joint, body or file that is missing, and those that exist.
     """
     camera = robot.wrist_camera if isinstance(robot.wrist_camera, str) else ""
     spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, camera)
@@ -109,7 +109,7 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
 def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence[float]) -> None:
     """Add the camera `wrist` to an arm, at a place (3,) [m] in the frame `ee`, tilted to the fingertips.
 
-    model: the arm compiled. The camera looks along its -z, and its x is the hand's y.
+    model: the compiled arm. The camera looks along its -z, and its x is the hand's y.
     """
     rotation, quat, side, site = np.zeros(9), np.zeros(4), np.sign(place[0]), model.site("ee")
     mujoco.mju_quat2Mat(rotation, site.quat)
@@ -123,7 +123,7 @@ def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence
 
 
 def arm_model(robot: Robot) -> mujoco.MjModel:
-    """Compile the arm alone, fingers fixed: what inverse kinematics works on."""
+    """Compile the arm alone, with fixed fingers, for inverse kinematics."""
     spec = arm_spec(robot)
     for actuator in list(spec.actuators):
         spec.delete(actuator)
@@ -137,14 +137,14 @@ def arm_model(robot: Robot) -> mujoco.MjModel:
 
 
 def model_bytes(model: mujoco.MjModel) -> bytes:
-    """Return a compiled model, byte for byte: what a fingerprint hashes."""
+    """Return the bytes of a compiled model, for fingerprints."""
     buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
 def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
-    """Raise `UnknownName` for a name that a model has not; kind: of what it names."""
+    """Raise `UnknownName` for a name that a model does not have; kind: what it names."""
     known = [one.name for one in there if one.name and one.name != "world"]
     for name in names:
         if name not in known:
@@ -177,14 +177,14 @@ def _above(body: Any) -> list[str]:
 
 
 def linkage(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
-    """Return the names of the gripper's joints that nothing drives: those of a linkage, below the hand."""
+    """Return the names of the gripper's undriven joints: those of a linkage, below the hand."""
     apart = {*robot.joints, *robot.gripper.joints, *robot.fixed}
     below = spec.body(robot.hand).find_all("joint")
     return [joint.name for joint in below if joint.parent.name != robot.hand and joint.name not in apart]
 
 
 def _keep_links_apart(spec: mujoco.MjSpec, hand: str) -> None:
-    """Let no part of a linkage touch another: they overlap in most models, and would jam."""
+    """Exclude contacts between parts of a linkage, which overlap in most models and would jam."""
     below = spec.body(hand).find_all("body")
     for number, body in enumerate(below):
         body.name = body.name or f"{hand} part {number}"
@@ -196,7 +196,7 @@ def _keep_links_apart(spec: mujoco.MjSpec, hand: str) -> None:
 
 
 def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
-    """Delete joints that are neither the arm's nor the gripper's, their bodies left where the YAML says."""
+    """Delete joints that are neither the arm's nor the gripper's, leaving their bodies where the YAML says."""
     kept = {*robot.joints, *robot.gripper.joints, *linked}
     loose = [joint for joint in spec.joints if joint.name not in kept]
     known = {joint.name for joint in loose if joint.type in _SCALAR} | set(linked)
@@ -215,19 +215,19 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
-    """Put the bodies of joints where MuJoCo has them with the joints at `fixed` [rad or m]."""
+    """Put the bodies of joints where they are with the joints at `fixed` [rad or m]."""
     twin = spec.copy()
     model = twin.compile()
     data = mujoco.MjData(model)
     for name, value in fixed.items():
         data.joint(name).qpos[0] = value
-    model.body_parentid[:] = 0  # then a pose in the world is one in the parent
+    model.body_parentid[:] = 0  # so that a pose in the world is one in the parent
     mujoco.mj_kinematics(model, data)
     for body, there in zip(spec.bodies, twin.bodies, strict=True):
         if not fixed.keys() & {joint.name for joint in body.joints}:
             continue
         place, turn = data.xpos[there.id], data.xmat[there.id].reshape(3, 3)
-        for joint, own in zip(body.joints, there.joints, strict=True):  # those kept turn about where they are now
+        for joint, own in zip(body.joints, there.joints, strict=True):  # kept joints turn about their present place
             joint.axis, joint.pos = data.xaxis[own.id] @ turn, (data.xanchor[own.id] - place) @ turn
         body.set_frame(body.parent.add_frame())
         body.pos, body.quat = place, data.xquat[there.id]
@@ -235,9 +235,9 @@ def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
 
 
 def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
-    """Delete what a model brings for a world of its own: motors, mocap bodies, sky, views, gravity and time.
+    """Delete what belongs to a world: motors, mocap bodies, sky, cameras, gravity and time step.
 
-    hand: what is not in one tree with that body is of the world, too: a floor, a table, what lies on it.
+    hand: what is not in that body's tree also belongs to the world: a floor, a table, what lies on it.
     """
     for one in _foreign(spec, hand, kept):
         spec.delete(one)
@@ -247,13 +247,13 @@ def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
 
 
 def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
-    """Give a spec another one's options of physics; MuJoCo warns where those of two that it joins differ."""
+    """Copy physics options from one spec to another; MuJoCo warns if those of two that it joins differ."""
     for name in [name for name in dir(origin.option) if not name.startswith("_")]:
         setattr(spec.option, name, getattr(origin.option, name))
 
 
 def _foreign(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
-    """Yield what is to be deleted, looked up again after every kind: MuJoCo deletes what hangs on the deleted too."""
+    """Yield what to delete, looked up again after every kind, as MuJoCo also deletes what depends on it."""
     yield from list(spec.keys)
     mocaps = {body.name for body in spec.bodies if body.mocap}
     yield from [equality for equality in spec.equalities if {equality.name1, equality.name2} & mocaps]
@@ -303,7 +303,7 @@ def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
 
 
 def _calm(spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
-    """Give the joints of a linkage that nothing drives the little inertia and damping that keep them from ringing."""
+    """Give a linkage's undriven joints a little inertia and damping, which keep them from ringing."""
     for name in linked:
         joint = spec.joint(name)
         joint.armature = max(joint.armature, _LINK_ARMATURE)
@@ -311,7 +311,7 @@ def _calm(spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
 
 
 def _position_actuator(spec: mujoco.MjSpec, joint: Any, gains: tuple[float, float, float]) -> None:
-    """PD position control of one joint: force = kp (ctrl - q) - kv v, within +-force [N or N m]."""
+    """Add PD position control of one joint: force = kp (ctrl - q) - kv v, within +-force [N or N m]."""
     kp, kv, force = gains
     actuator = spec.add_actuator(PLAIN.default, name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.set_to_position(kp=kp, kv=kv)

@@ -1,4 +1,4 @@
-"""A first YAML for an MJCF: which body is the hand, what drives the fingers, and where there is room to work."""
+"""A first YAML for an MJCF: the hand's body, the joints that drive the fingers, and a workspace."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from manip_il.robots.geometry import nearest
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.spec import load
 
-_ARM_GOES_ON = 3  # joints one after another that are more than a finger has
-_JAWS = ("jaw", "finger", "grip", "claw")  # in the name of a single one's body or joint
-_HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # in the name of a body that carries one
-_REACHES, _HALF = 0.5, 0.18  # of the workspace's centre and half width, in lengths of the arm
-_WIDEST, _HIGHEST = 0.15, 0.45  # of a workspace: half its width, its height [m]
+_ARM_GOES_ON = 3  # joints in series, more than a finger has
+_JAWS = ("jaw", "finger", "grip", "claw")  # words in the name of a single jaw's body or joint
+_HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # words in the name of a gripper's mount
+_REACHES, _HALF = 0.5, 0.18  # the workspace's centre and half width, in lengths of the arm
+_WIDEST, _HIGHEST = 0.15, 0.45  # largest half width and height of a workspace [m]
 _ROUND = 0.01  # what lengths are rounded to [m]
 _FIRST_LINE = (
     "# A first YAML, from what the model shows. Look it over: manip-il view --robot.type=THIS_FILE (docs/robots.md)"
@@ -38,9 +38,9 @@ _NOTES = {
 
 
 def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
-    """Look at an MJCF, and at its gripper's where that has one of its own; return a YAML's words but for the paths.
+    """Inspect an MJCF, and its gripper's if that has one of its own; return a YAML's content without the paths.
 
-    Raises `UsageError` where MuJoCo cannot read or compile them, or no hand or no fingers are found.
+    Raises `UsageError` if MuJoCo cannot read or compile them, or no hand or no fingers are found.
     """
     files = [ModelFiles(path.absolute()) for path in (model, gripper) if path is not None]
     spec, with_jaws = load(files[0], model.stem), load(files[-1], model.stem)
@@ -70,12 +70,12 @@ def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
 
 
 def _depth(body: Any) -> int:
-    """Joints one after another, at most, from a body on."""
+    """Largest number of joints in series from a body on."""
     return len(body.joints) + max((_depth(child) for child in body.bodies), default=0)
 
 
 def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
-    """The body at which the chain of joints parts into fingers, and the first body of each; one jaw alone may be."""
+    """The body at which the chain of joints branches into fingers, and the first body of each; one jaw is enough."""
     body = spec.worldbody
     while True:
         moving = [child for child in body.bodies if _depth(child)]
@@ -94,7 +94,7 @@ def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
 
 
 def _flange(body: Any) -> Any:
-    """The body that a gripper is put on: the last of the chain, or what is fixed to it and named so."""
+    """The body that a gripper is mounted on: the last of the chain, or one fixed to it with a name in `_HANDS`."""
     while True:
         moving = [child for child in body.bodies if _depth(child)]
         if not moving:
@@ -126,7 +126,7 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
 def _ends(
     spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
 ) -> tuple[list[float], list[float], Sequence[str]]:
-    """Find where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet."""
+    """Find each driven joint's closed and open positions, by the fingers' distance, and the bodies that meet."""
     moving = [
         jaw.name
         for jaw in jaws
@@ -178,7 +178,7 @@ def _rounded(length: float) -> float:
 
 
 def yaml_of(found: Mapping[str, Any], model: str, gripper: str = "") -> str:
-    """Return the YAML of a suggestion, each line with what it means. model, gripper: paths as the YAML has them."""
+    """Return the YAML of a suggestion, with explanatory comments. model, gripper: paths as the YAML has them."""
     own = {"model": gripper} if gripper else {}
     tree = {"model": model, **found, "gripper": own | found["gripper"]}
     text = yaml.safe_dump(tree, default_flow_style=None, width=math.inf, sort_keys=False)

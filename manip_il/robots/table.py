@@ -1,4 +1,4 @@
-"""Robots by name, and their YAML, checked; what the YAML does not say is found on the model."""
+"""Robots by name, from their checked YAML; what the YAML does not give is found on the model."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from manip_il.robots.files import KEYS, ModelFiles, read
 from manip_il.robots.robot import FOUND, GRIPPER, UPRIGHT, CameraPose, Costs, GripperConfig, Robot, costs_of, yaw_of
 
 SUFFIXES = (".yaml", ".yml")
-SCENE_CAMERAS = ("front", "side")  # that a YAML may place
-GROUP = "manip_il.robots"  # of entry points: a name, and the path of a YAML
+SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
+GROUP = "manip_il.robots"  # entry points: a name, and the path of a YAML
 
 
 def get_robot(name: str) -> Robot:
-    """Return a robot by its name, of a YAML file, or that a package brings. Raises `UnknownName`, `UsageError`."""
+    """Return a robot by its name, its YAML file, or a package's name for it. Raises `UnknownName`, `UsageError`."""
     if name in ROBOTS:
         return _read(ROBOTS[name])
     if name.endswith(SUFFIXES):
@@ -39,7 +39,7 @@ def get_robot(name: str) -> Robot:
 
 
 def is_robot(name: str) -> bool:
-    """Return whether a robot ships, or an installed package brings it."""
+    """Return whether a robot ships or an installed package provides it."""
     return name in ROBOTS or bool(entry_points(group=GROUP, name=name))
 
 
@@ -50,11 +50,11 @@ def read_robot(path: Path) -> Robot:
         said = _said(path, read_yaml(path, "a robot's YAML"))
         lacking = [name for name in FOUND if name not in said]
         if lacking:
-            from manip_il.robots.found import complete  # here, as what ships says it all, and mink takes long
+            from manip_il.robots.found import complete  # here: shipped YAMLs are complete, and mink is slow to import
 
             said = complete(said)
         return Robot(**said)
-    except ValueError as error:  # MuJoCo's, of a model that it reads and does not compile
+    except ValueError as error:  # MuJoCo's, for a model that it reads but cannot compile
         raise UsageError(f"{path}: MuJoCo cannot compile {said['files'].model}: {checks.one_line(error)}") from None
     except ManipError as error:
         named = str(path) in str(error) or f"robot {path.stem}" in str(error)
@@ -62,7 +62,7 @@ def read_robot(path: Path) -> Robot:
 
 
 def _said(path: Path, tree: Any) -> dict[str, Any]:
-    """The fields that a YAML says, and the defaults of those that are not found on the model."""
+    """The fields that a YAML gives, and the defaults of those that are not found on the model."""
     tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
     known = (*KEYS, *(name for name in kinds if name not in ("name", "files")))
     for key in tree:
@@ -92,7 +92,7 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
 
 
 def _gripper(tree: Mapping[str, Any], folder: Path) -> GripperConfig:
-    """Read a gripper; the names of one that has a model of its own get that one's prefix."""
+    """Read a gripper; if it has a model of its own, its names get that one's prefix."""
     own = {key: value for key, value in tree.items() if key not in KEYS}
     gripper: GripperConfig = read("gripper", GripperConfig, own)
     if "model" not in tree:

@@ -1,6 +1,6 @@
 """Conditions: ranges by name from which each episode draws how it differs from the nominal world, by its seed alone.
 
-Whose values are applied where: to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
+Their values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
 `env.py`, and during the episode by `events.py`.
 """
 
@@ -21,7 +21,7 @@ from manip_il.sim.shape import KINDS, draws_shape
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]
-# Least and greatest value; a range beyond is a mistake and not an experiment.
+# Least and greatest values; a range beyond these is a mistake.
 _BOUNDS: dict[str, Range] = {
     "action_noise": (0, 1),
     "random_actions": (0, 1),
@@ -48,33 +48,33 @@ _BOUNDS: dict[str, Range] = {
 _NAMES = {"shape": KINDS}  # ranges that are lists of these names
 _KNOWN = (*_NAMES, *_BOUNDS)
 _WHOLE = ("knock_step", "delay", "picture_delay")
-_SEEDS = 2**31  # of clutter: a state holds one exactly
-_KNOCK_STEP = (5, 24)  # where a condition has a knock and does not say
-_BODY = ("mass", "size", "friction")  # of the object, in physics
+_SEEDS = 2**31  # seeds of clutter, which a state holds exactly
+_KNOCK_STEP = (5, 24)  # default for a condition with a knock
+_BODY = ("mass", "size", "friction")  # the object's physics
 _MODEL = ("shape", *_BODY, "joint_damping", "actuator_gain")
 _OBJECT = ("knock", "colour", "shape", *_BODY)
-PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # and nothing else
+PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # pictures only
 _SEEN = (*PICTURED, "picture_delay")
 
 
 @dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high), both ends included, or one number; without one the world is nominal in that.
+    """Ranges (low, high), both ends included, or single numbers; what has no range is nominal.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
-    knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
-    [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
-    policy's observations. delay: control steps by which those are late. shape: names of shapes, where the task has an
-    object of any; mass [kg], size (edge or width [m]) and sliding friction of the object; colour: each of its red,
-    green and blue; table: of the table's. joint_damping: factor on that of every joint of the arm; actuator_gain: on kp
-    of its actuators, and by its root on kv. posture: how far every joint begins from home, at most [rad]. camera_shift
-    [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp; light_turn: of the
-    lamps about the vertical [deg]. clutter: things that lie around the workspace and touch nothing. picture_delay:
-    control steps by which pictures, and they alone, are late.
+    knock: distance by which the object is moved once [m], at a control step from knock_step, by default 5 to 24.
+    joint_noise [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position
+    in a policy's observations. delay: control steps by which those are late. shape: names of shapes, if the task's
+    object may have any; mass [kg], size (edge or width [m]) and sliding friction of the object; colour: each of its
+    red, green and blue; table: of the table's. joint_damping: factor on the damping of every arm joint; actuator_gain:
+    factor on its actuators' kp, its root on kv. posture: largest offset of every joint from home at the start [rad].
+    camera_shift [m], camera_turn [deg]: of every camera, in a random direction. brightness: factor on every lamp;
+    light_turn: of the lamps about the vertical [deg]. clutter: number of things around the workspace that touch
+    nothing. picture_delay: control steps by which pictures alone are late.
 
     Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds, `ManipError` for a name
-    that is no file's.
+    that cannot name a file.
     """
 
     name: str
@@ -89,11 +89,11 @@ class Condition:
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None, shape: str = "") -> Condition | None:
-        """Return the condition without what has no effect on a task without an object, or a policy without cameras.
+        """Return the condition without the ranges that have no effect; None if none is left.
 
-        sizes: of its objects, that the task can take [m]; None: their own alone. shape: of the object, as
-        `EnvConfig.object`. None where nothing of it is left.
-        Raises `UsageError` where the condition's sizes are all others.
+        has_object, sees: whether the task has an object, the policy cameras. sizes: object sizes that the task can
+        take [m]; None: only its own. shape: the object's, as in `EnvConfig.object`.
+        Raises `UsageError` if none of the condition's sizes is among them.
         """
         dropped = {*(() if has_object else _OBJECT), *(() if sees else _SEEN), *(() if sizes else ("size",))}
         dropped |= set() if draws_shape(shape) else {"shape"}
@@ -105,14 +105,14 @@ class Condition:
         return Condition(self.name, **kept)
 
     def changes_model(self) -> bool:
-        """Return whether the object or the arm is another one than the compiled model's."""
+        """Return whether the object or the arm differs from the compiled model's."""
         return not self.ranges.keys().isdisjoint(_MODEL)
 
     def draw(self, seed: int) -> dict[str, Any]:
         """Return what the episode of a seed draws, by the names of the ranges and in their units.
 
-        Each value has a random stream of its own, so that another range leaves the other values as they were.
-        camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own frame.
+        Each value has a random stream of its own, so that another range leaves the other values unchanged.
+        camera_shift and camera_turn have one vector (3,) per camera, in the camera's own frame.
         """
         return {name: _draw(name, range_, rng_for(seed, f"condition {name}")) for name, range_ in self.ranges.items()}
 
@@ -126,7 +126,7 @@ class Condition:
 
 
 def merged(conditions: Sequence[Condition]) -> Condition:
-    """Return the condition that has the ranges of all, named after them; a later one's count where two have one."""
+    """Return the condition that has the ranges of all, named after them; later ranges override earlier ones."""
     ranges = {name: range_ for condition in conditions for name, range_ in condition.ranges.items()}
     return Condition("_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges)
 
@@ -139,8 +139,8 @@ def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
 def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> dict[str, Any]:
     """Return what the episode of a seed draws from the condition whose turn it is.
 
-    shape: of the object, as `EnvConfig.object`; where it is any, all shapes are drawn from unless the condition says
-    which, and else none is.
+    shape: the object's, as in `EnvConfig.object`; if it is `any`, a shape is drawn, from all unless the condition
+    limits them, and otherwise none.
     """
     drawn = turn_of(conditions, seed).draw(seed)
     if draws_shape(shape):
@@ -171,13 +171,13 @@ def _draw(name: str, range_: Any, rng: np.random.Generator) -> Any:
 
 
 def _vector(rng: np.random.Generator, lengths: Range) -> list[float]:
-    """A vector of a drawn length in a direction drawn evenly."""
+    """A vector of random length in a uniformly random direction."""
     direction = rng.normal(size=3)
     return [float(value) for value in rng.uniform(*lengths) * direction / np.linalg.norm(direction)]
 
 
 def _range(condition: str, name: str, given: Any) -> Any:
-    """A range as a tuple, of what Python or YAML has: a pair or a number, names or one name."""
+    """A range as a tuple, from what Python or YAML gives: a pair or a number, names or one name."""
     if name not in _KNOWN:
         raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], _KNOWN)
     what, several = f"{condition}: {name}", list(given) if isinstance(given, list | tuple) else [given]
@@ -201,7 +201,7 @@ def _range(condition: str, name: str, given: Any) -> Any:
 
 
 def _overlap(name: str, asked: Range, sizes: Range) -> Range:
-    """The sizes that are asked for and that a task can take."""
+    """The sizes that are both asked for and possible in a task."""
     low, high = max(asked[0], sizes[0]), min(asked[1], sizes[1])
     if low > high:
         takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"

@@ -1,4 +1,4 @@
-"""Settings of episodes and of its pictures, without the simulator."""
+"""Settings of episodes and their pictures, without the simulator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_HZ = round(1 / DT_SIM)
 
 @dataclass(frozen=True)
 class Episodes:
-    """Timing, solving and ending of an environment's episodes. 0: as its robot or task has it, until it is made."""
+    """Timing, solving and ending of an environment's episodes. 0 means the robot's or task's own value."""
 
     control_hz: int = option(0, "control steps a second; 0: the robot's own, 30 of so101, 20 of others")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
@@ -29,13 +29,13 @@ class Episodes:
 
     @property
     def physics_step(self) -> float:
-        """Time of one of them: `DT_SIM`, or a little less where that does not divide a control step [s]."""
+        """Physics time step: `DT_SIM`, or a little less if that does not divide a control step [s]."""
         return 1 / (self.control_hz * self.physics_steps)
 
 
 CAMERAS = ("front", "side", "wrist")
-OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # of stock robots
-MIN_SIDE, MAX_SIDE = 16, 2048  # of a picture [pixels]
+OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # stock robots'
+MIN_SIDE, MAX_SIDE = 16, 2048  # sides of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 
 
@@ -43,8 +43,8 @@ _BRIGHTNESS = (0.1, 2.0)
 class Look:
     """Light of a scene; part of a dataset's fingerprint, and what re-rendering may vary.
 
-    shadows: of the main lamp; two to six times the price of a picture. brightness: factor on every lamp.
-    light_turn: of the lamps about the vertical through the world's origin, -180 to 180 [deg].
+    shadows: of the main lamp; a picture then takes two to six times as long. brightness: factor on every lamp.
+    light_turn: turn of the lamps about the vertical through the world's origin, -180 to 180 [deg].
     Raises `UsageError` for a value out of range.
     """
 
@@ -60,7 +60,7 @@ class Look:
             raise UsageError(f"light_turn is {self.light_turn}; expected -180 to 180 degrees")
 
 
-FILM = Look(shadows=True)  # for people: a shadow says how high a thing is
+FILM = Look(shadows=True)  # for people: shadows show how high things are
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class CameraConfig:
     """Cameras that see every step, and the height, width [pixels] and look of their pictures.
 
     Raises `UnknownName` for a camera, `UsageError` for none, for one named twice, and for a height or width that
-    is odd (which video's 4:2:0 has not) or out of range.
+    is odd (which 4:2:0 video does not allow) or out of range.
     """
 
     names: tuple[str, ...]
@@ -95,7 +95,7 @@ class CameraConfig:
 
 
 def require_cameras(cameras: CameraConfig | None, known: tuple[str, ...]) -> None:
-    """Raise `UnknownName` for cameras that an environment has not."""
+    """Raise `UnknownName` for cameras that an environment does not have."""
     for name in cameras.names if cameras else ():
         if name not in known:
             raise UnknownName("camera", name, known)

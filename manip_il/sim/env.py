@@ -1,4 +1,4 @@
-"""One gymnasium environment for every robot and task, with exact save and restore, and under conditions."""
+"""One gymnasium environment for every robot and task, with exact save and restore, and with conditions."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from manip_il.sim.window import Window, require_display
 from manip_il.sim.world import Scene, World
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
-_JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
+_JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 
 
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
-    """Joint-position control of one arm on one task. By their names: `manip_il.tasks.envs.make_env`.
+    """Joint-position control of one arm on one task. `manip_il.tasks.envs.make_env` makes it by names.
 
     Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32. Observation: a dict
     of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
-    "solved once" and "solved at the end" can both be read. conditions: what episodes differ in from the nominal world,
-    in turn by their seeds; `drawn` has the present one's values. The state is the true one, whatever is observed.
+    "solved once" and "solved at the end" can both be read. conditions: how episodes differ from the nominal world, in
+    turn by their seeds; `drawn` has the current values. The state is the true one, whatever is observed.
     render_mode: `rgb_array`, or `human`: MuJoCo's viewer in real time, from `reset` and `step`.
     Raises `UnknownName` for a camera or render_mode, `UsageError` for a size of pictures that
     `CameraConfig` refuses, `RenderError` for `human` without a display.
@@ -84,7 +84,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Draw a start. The same seed gives the same start, bit for bit.
 
-        options: `instruction` in place of the drawn one. Raises `UsageError` for one that the task has not.
+        options: `instruction` in place of the drawn one. Raises `UsageError` for one that the task does not have.
         """
         super().reset(seed=seed)
         self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
@@ -107,7 +107,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def data(self) -> mujoco.MjData:
-        """MuJoCo's data, as they are now."""
+        """MuJoCo's current data."""
         return self.world.data
 
     def start(self, seed: int) -> None:
@@ -129,7 +129,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         mujoco.mj_forward(world.model, data)
 
     def _begin(self, seed: int, drawn: dict[str, Any]) -> None:
-        """Make ready for an episode with these values."""
+        """Prepare an episode with these values."""
         self.drawn, self._step, self._streak, self._ever = drawn, 0, 0, False
         self._events = Events(self.world, drawn, seed)
         self._noise = rng_for(seed, "observation noise")
@@ -149,7 +149,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def begin_step(self) -> None:
         """Apply the events of the control step that begins: a knock, a perturbation.
 
-        After a perturbation the steps within the tolerance count from the beginning.
+        A perturbation resets the count of steps within the tolerance.
         """
         if self._events.before(self._step):
             self._streak = 0
@@ -166,7 +166,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.ctrl[scene.arm_ctrl], opening = scene.actions.split(action)
         data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
         mujoco.mj_step(world.model, data, self.config.physics_steps)
-        world.update()  # positions as of now, not of the last physics step's start
+        world.update()  # else poses are as of the last physics step's start
         self.count_step()
         return executed
 
@@ -178,12 +178,12 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def solved(self) -> bool:
-        """State of the task: within the tolerance for the required steps in a row, now."""
+        """Whether the task is solved: it has been within the tolerance for the required steps in a row."""
         return self._streak >= self.config.success_steps
 
     @property
     def reward(self) -> float:
-        """Reward of the last control step: 1 where the task is solved, else 0."""
+        """Reward of the last control step: 1 if the task is solved, else 0."""
         return float(self.solved)
 
     def distance(self) -> float:
@@ -205,9 +205,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
 
     def observe(self) -> Observation:
-        """Return what a policy observes now, late and noisy where the episode has it so; call it once a control step.
+        """Return what a policy observes now, late and noisy if the episode is; call it once per control step.
 
-        It has pictures only where the environment has cameras.
+        It has pictures only if the environment has cameras.
         """
         world = self._measured()
         self._pictured.append((self._pictures(self._view), self._keypoints(self._view)) if self._view else ({}, {}))
@@ -216,7 +216,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._observed[0]
 
     def _measured(self) -> World:
-        """The world with noise on joints and object positions, and on all that follows from them."""
+        """The world with noise on joints and object positions, and on all that depends on them."""
         joints, position = (self.drawn.get(name, 0.0) for name in ("joint_noise", "position_noise"))
         if not joints and not position:
             return self.world
@@ -233,7 +233,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return World(self.scene)
 
     def render(self) -> Picture | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return a picture from the front camera, uint8 (480, 640, 3); None where a window shows the world."""
+        """Return a picture from the front camera, uint8 (480, 640, 3); None unless render_mode is `rgb_array`."""
         if self.render_mode == "human":
             if self._window is None:
                 self._window = Window(self.scene, self.config.control_hz)
@@ -243,7 +243,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
     def close(self) -> None:
-        """Close the window, where there is one."""
+        """Close the window, if there is one."""
         if self._window is not None:
             self._window.close()
             self._window = None
@@ -285,7 +285,7 @@ def joint_state(world: World) -> F32:
 
 def environment_state(world: World) -> F32:
     """Return the numbers that the task observes, float32 (k,). Raises `ManipError` if their names have changed."""
-    numbers: list[float] = []  # of few entries a list is faster than numpy
+    numbers: list[float] = []  # for few entries a list is faster than numpy
     observed = world.scene.task.observe(world)
     if tuple(observed) != tuple(_observed(world.scene)):
         names = ", ".join(_observed(world.scene))
@@ -305,7 +305,7 @@ def _observed(scene: Scene) -> dict[str, F64 | float]:
 
 @lru_cache(SCENES_KEPT)
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
-    """Return names of the vector's k entries; lengths in [m]."""
+    """Return the names of the k entries of `environment_state`; lengths in [m]."""
     names: list[str] = []
     for name, value in _observed(scene).items():
         names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]

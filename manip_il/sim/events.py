@@ -22,12 +22,12 @@ F64 = NDArray[np.float64]
 Change = Callable[[World, np.random.Generator], object]
 WrongAction = Callable[[F64, World, np.random.Generator], F64]
 
-JOLT = 0.2  # of every arm joint at most [rad]
-SHIFT = (0.0, 0.1)  # of the object, sideways [m]
-DROP = 0.1  # of the object, upwards [m]
+JOLT = 0.2  # largest jolt of every arm joint [rad]
+SHIFT = (0.0, 0.1)  # range of the object's sideways shift [m]
+DROP = 0.1  # height to drop the object from [m]
 NOTICEABLE = 1e-3  # a perturbation that moves nothing by this much is undone [rad or m]
 _MAX_DRAWS = 100
-_OVERLAP = -0.004  # contact distance at which a moved object stands inside something [m]
+_OVERLAP = -0.004  # contact distance below which a moved object overlaps something [m]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Kind:
 def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> F64:
     """Return `action` (n,) with Gaussian noise: `share` of its full range, as in Meta-World's tests of its experts.
 
-    The range of a joint is twice its longest step, that of the gripper its whole opening.
+    The range of a joint is twice its longest step, the gripper's its whole opening.
     """
     actions = world.scene.actions
     spread = np.where(actions.relative, 2, 1) * actions.scale
@@ -67,10 +67,10 @@ def wrong_gripper(action: F64, world: World, rng: np.random.Generator) -> F64:
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
-    """Move the first of the task's objects sideways by a drawn distance [m], at rest, to where the arm reaches it.
+    """Move the task's first object sideways by a random distance [m], at rest, to a place within reach.
 
-    height: how far up it is moved [m]; above 0 it is turned at random, too, and falls. Draws in which it would stand
-    inside something else are drawn again; without an object, or such a place, nothing is moved.
+    height: how far up it is moved [m]; above 0 it is also turned at random, and falls. Draws in which it overlaps
+    something are drawn again; without an object, or a free place, nothing is moved.
     """
     if not world.scene.task.objects:
         return
@@ -91,7 +91,7 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
 
 
 def jolt_joints(world: World, rng: np.random.Generator, largest: float) -> None:
-    """Turn every arm joint by up to `largest` [rad], so that nothing stands inside something else.
+    """Turn every arm joint at random by up to `largest` [rad] such that nothing overlaps.
 
     An object between the fingers moves with the hand.
     """
@@ -106,9 +106,9 @@ def jolt_joints(world: World, rng: np.random.Generator, largest: float) -> None:
 
 
 def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None:
-    """Turn every arm joint, and what it is commanded, by up to `largest` [rad] from where it stands.
+    """Turn every arm joint and its command at random by up to `largest` [rad].
 
-    The arm then touches nothing that it did not touch before, and the hand is where it gets to pointing down.
+    The arm then touches nothing that it did not touch before, and the hand is where it can point down.
     """
     scene, data = world.scene, world.data
 
@@ -156,7 +156,7 @@ KINDS: dict[str, Kind] = {
 
 
 def kinds_for(task: Task) -> dict[str, Kind]:
-    """Return the entries of `KINDS` that mean something in a task: without an object, nor does the gripper matter."""
+    """Return the entries of `KINDS` that apply to a task: without an object, those of the gripper do not."""
     return {name: kind for name, kind in KINDS.items() if task.objects or not kind.needs_object}
 
 
@@ -175,14 +175,14 @@ class Perturbation(Condition):
 
 
 class _Training(Condition):
-    """A condition whose knock is drawn when it happens, as in all rollouts that were recorded so far."""
+    """A condition whose knock is drawn when it happens, as in all rollouts recorded so far."""
 
     def draw(self, seed: int) -> dict[str, Any]:
         return super().draw(seed) | {name: self.ranges[name] for name in ("knock", "knock_step")}
 
 
 def standard_in(varied: Sequence[Condition]) -> Condition:
-    """Return `STANDARD` in worlds that vary besides; itself where they do not."""
+    """Return `STANDARD` with the ranges of other conditions; itself if they have none."""
     ranges = {name: range_ for condition in varied for name, range_ in condition.ranges.items()}
     return _Training(STANDARD.name, **{**ranges, **STANDARD.ranges}) if ranges else STANDARD
 
@@ -191,7 +191,7 @@ STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), kn
 
 
 class Events:
-    """Events of one episode: which, how much and when is in `drawn`, the rest is drawn from the seed."""
+    """Events of one episode: `drawn` says which, how much and when; the rest is drawn from the seed."""
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
         self._world = world
@@ -208,7 +208,7 @@ class Events:
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; returns whether a perturbation changed it.
 
-        A perturbation that finds no place, or changes nothing (fingers that are open already), leaves the world as it
+        A perturbation that finds no place, or changes nothing (fingers already open), leaves the world as it
         was, bit for bit.
         """
         world = self._world
@@ -242,14 +242,14 @@ def _measured(world: World) -> F64:
 
 
 def _opposite_end(action: F64, world: World) -> float:
-    """The end of the gripper's range that the command in `action` is farther from, in the units of actions."""
+    """The end of the gripper's range farther from the command in `action`, in the units of actions."""
     actions = world.scene.actions
     low, high = actions.low[actions.gripper], actions.high[actions.gripper]
     return high if action[actions.gripper] < (low + high) / 2 else low
 
 
 def _settle(world: World) -> None:
-    """Compute everything that follows from positions, contacts too."""
+    """Compute everything that depends on positions, contacts included."""
     world.update()
     mujoco.mj_forward(world.model, world.data)
 
@@ -261,7 +261,7 @@ def _turn_arm(
     put: Callable[[F64], None],
     is_free: Callable[[], bool],
 ) -> None:
-    """Put the arm's joints up to `largest` [rad] from where they are, drawn until it is free; else where they were."""
+    """Turn the arm's joints at random by up to `largest` [rad], drawing until it is free; else restore them."""
     scene = world.scene
     low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
     before = world.data.qpos[scene.arm_q].copy()
@@ -273,7 +273,7 @@ def _turn_arm(
 
 
 def _move_arm(world: World, before: F64, q: F64) -> None:
-    """Put the arm at `q` [rad], and what was between the fingers at `before` (qpos) with it."""
+    """Put the arm at `q` [rad], and move what was between the fingers at `before` (qpos) with it."""
     scene, data = world.scene, world.data
     data.qpos[:] = before
     world.update()
@@ -301,7 +301,7 @@ def _is_on_table(world: World, pose: F64) -> bool:
 
 
 def _place(world: World, name: str, pose: F64) -> bool:
-    """Put an object at rest at `pose` (7,); false where it would stand inside something."""
+    """Put an object at rest at `pose` (7,); False if it overlaps something."""
     world.place(name, pose[:3], pose[3:])
     _settle(world)
     geom = world.scene.objects[name].geom

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import UsageError, shorten
 
-MOST_FACES = 200_000  # MuJoCo's
-_LARGEST = 256 * 1024**2  # of a file [bytes]
+MOST_FACES = 200_000  # MuJoCo's limit
+_LARGEST = 256 * 1024**2  # largest file [bytes]
 _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P<length>:\d*\.?\d+)?", re.DOTALL)
 
 
@@ -25,8 +25,8 @@ _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P
 class Mesh:
     """A closed mesh about its centre of mass: vertices (n, 3) [m], faces (m, 3), volume [m^3].
 
-    sha256: of the file. text: what means it, with its path; stored: the same with its name and hash, as datasets have
-    it.
+    sha256: the file's. text: the option's value, with the file's path; stored: the same with its name and hash, as in
+    datasets.
     """
 
     text: str
@@ -46,7 +46,7 @@ class Mesh:
 def parse_mesh(text: str) -> Mesh:
     """Return the mesh that `mesh:PATH` or `mesh:PATH:LENGTH` means, read once.
 
-    LENGTH: of its longest side [m]; without one the file is in metres. Raises `UsageError`.
+    LENGTH: its longest side [m]; without one the file is in metres. Raises `UsageError`.
     """
     if (found := _TEXT.fullmatch(text)) is None:
         raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
@@ -62,13 +62,13 @@ def mesh_path(text: str) -> str | None:
 
 
 def is_stored(text: str) -> bool:
-    """Return whether a text has the name and hash of a mesh, as data have it, and not its file."""
+    """Return whether a text has a mesh's name and hash, as in datasets, and not its file's path."""
     found = _TEXT.fullmatch(text)
     return bool(found and found["hash"])
 
 
 def nameable(text: str) -> str:
-    """Return a mesh's text as an option takes it, where data have the name alone: of a file in PATH."""
+    """Return a stored mesh's text as an option takes it, with PATH for the file's folder."""
     return re.sub(r"^mesh:(.*)#[0-9a-f]{12}", r"mesh:PATH/\1", text)
 
 
@@ -91,8 +91,8 @@ def _read(name: str, length: float) -> Mesh:
 
 
 def _solid(name: str, content: bytes, suffix: str) -> Any:
-    """The closed surface in a file, whose faces look outwards; raises `UsageError`."""
-    import trimesh  # here, as it takes a third of a second
+    """The closed surface in a file, with its faces outwards; raises `UsageError`."""
+    import trimesh  # imported here, as it takes a third of a second
 
     try:
         found = trimesh.load_mesh(

@@ -1,4 +1,4 @@
-"""Named points of a scene for pictures to show: the places that its task observes, and corners of its boxes."""
+"""Named keypoints of a scene: the positions that its task observes, and corners of its boxes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import Scene, World
 
 F64 = NDArray[np.float64]
-_SIGNS = np.array(list(product((-1, 1), repeat=3)))  # of a box's corners
-_CORNERS = 4  # of a box: the upper ones, which cameras see
+_SIGNS = np.array(list(product((-1, 1), repeat=3)))  # signs of a box's corners
+_CORNERS = 4  # a box's upper corners, which cameras see
 
 
 def points_in(world: World) -> dict[str, F64]:
-    """Return name -> place (3,) [m].
+    """Return name -> position (3,) [m].
 
-    What a task observes is a place where it has the name of something in the scene. Corners of a box are counted by the
-    direction in which they lie from its centre.
+    What a task observes is a position if it has the name of something in the scene. Corners of a box are numbered by
+    their direction from its centre.
     """
     observed, named = world.scene.task.observe(world), _named(world.scene)
     found = {name: np.asarray(value) for name, value in observed.items() if name in named}
@@ -51,7 +51,7 @@ def _named(scene: Scene) -> frozenset[str]:
 
 
 def _upper_corners(world: World, name: str) -> F64:
-    """The corners (4, 3) [m] of a box."""
+    """The upper corners (4, 3) [m] of a box."""
     pose, half = world.pose(name), np.asarray(world.extents(name)) / 2
     around = (_SIGNS * half) @ pose.rotation.T
     upper = around[np.argsort(around[:, 2], kind="stable")[-_CORNERS:]]

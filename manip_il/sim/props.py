@@ -1,4 +1,4 @@
-"""Things that are only seen, and touch nothing: the stand of a goal, and clutter around the workspace."""
+"""Visual things that touch nothing: the stand of a goal, and clutter around the workspace."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
 F64 = NDArray[np.float64]
-VERSION = 3  # of what is drawn of a state beside its model: policies on pictures know no other
+VERSION = 3  # version of what is drawn in addition to the model, on which image policies are trained
 _POLE, _SHORTEST = 0.003, 0.03  # radius of a goal's pole, and its least height [m]
 _FOOT, _ARM = 1.2, 1.6  # radius of a goal's foot, half the length of its cross, in radii of the largest object
 _THIN, _GOAL = 0.001, 0.02  # height of a foot, radius of a goal [m]
@@ -23,13 +23,13 @@ _ACROSS = (
     np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
     np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 )  # z along x, y
-_STAND = (0.10, 0.55, 0.28, 1.0)  # its colour
+_STAND = (0.10, 0.55, 0.28, 1.0)  # the stand's colour
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
-_HALF = (0.012, 0.04)  # of a thing's lengths [m], where the workspace is as large as Panda's
-_USUAL = 0.15  # half the width of that [m]
-_BESIDE, _WITHIN = 0.06, 0.24  # of clutter from the workspace's edge, least and most [m]
-_FROM_BASE = 0.18  # of clutter from the robot's first joint, sideways [m]
-_DRAWS = 50  # of a place for one thing, before it is left out
+_HALF = (0.012, 0.04)  # half a thing's lengths, for a workspace as large as Panda's [m]
+_USUAL = 0.15  # half width of Panda's workspace [m]
+_BESIDE, _WITHIN = 0.06, 0.24  # least and greatest distance of clutter from the workspace's edge [m]
+_FROM_BASE = 0.18  # least horizontal distance of clutter from the robot's first joint [m]
+_DRAWS = 50  # draws of a thing's place before it is left out
 
 
 class Prop(NamedTuple):
@@ -50,9 +50,9 @@ class Prop(NamedTuple):
 
 
 def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
-    """Return what is only seen of a scene's world.
+    """Return the visual things of a scene's world.
 
-    clutter: (2,) how many things, and the seed of what they are and where.
+    clutter: (2,) number of things, and the seed of their kinds and places.
 
     Poses of mocap bodies and joints in `data` must be up to date.
     """
@@ -60,7 +60,7 @@ def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0
 
 
 def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
-    """What shows around an object that hides a goal: on the table a foot, in the air a pole and a cross on it."""
+    """The stand of a goal, visible around an object there: on the table a foot, in the air a pole with a cross."""
     body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
     if body < 0:
         return []
@@ -113,7 +113,7 @@ def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
 
 
 def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple[float, float] | None:
-    """A place on the table around the workspace, apart from the robot's base; None for one that is not."""
+    """A random place on the table around the workspace, away from the robot's base; None for one elsewhere."""
     space = scene.robot.workspace
     outer = space.half_width + _WITHIN
     x, y = rng.uniform(-outer, outer, 2).tolist()
@@ -125,7 +125,7 @@ def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple
 
 
 def _furniture(scene: Scene, data: mujoco.MjData) -> list[tuple[float, float, float]]:
-    """Middle and radius [m] of everything of the task that stands fixed, from above."""
+    """Middle and radius [m], from above, of every fixed part of the task."""
     model = scene.model
     fixed = [geom for geom in range(model.ngeom) if model.body_mocapid[model.body_rootid[model.geom_bodyid[geom]]] >= 0]
     return [(*data.geom_xpos[geom][:2].tolist(), float(model.geom_rbound[geom])) for geom in fixed]

@@ -1,4 +1,4 @@
-"""Off-screen pictures of a simulator state: one OpenGL context a process, whatever its number of environments."""
+"""Off-screen pictures of a simulator state: one OpenGL context per process, for any number of environments."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from manip_il.sim.world import Scene
 
 F64 = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-_FINER = 2  # drawn so much finer each way, then averaged: cheaper than OpenGL's antialiasing, which repeats the meshes
+_FINER = 2  # supersampling each way: cheaper than OpenGL's antialiasing, which redraws the meshes
 _MAX_GEOMS = 1_000
 _EE = 4  # group of the site `ee`, the robot's only one
 _AXES = 0.06, 0.006  # length and thickness of its axes [m]
 
 
 class Overview(NamedTuple):
-    """A look from outside: at a point (3,) [m] from a distance [m], the way that it looks about z and up [deg]."""
+    """A free camera: the point that it looks at (3,) [m], its distance [m], azimuth and elevation [deg]."""
 
     at: NDArray[np.float64]
     distance: float
@@ -43,9 +43,9 @@ def pictures(
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    variation: of the world (v,), else the scene's own. A picture depends on `qpos`, mocap bodies and that alone: it has
-    the same bytes in any order.
-    Raises `RenderError`, which says what to unset or install, where there is no off-screen OpenGL.
+    variation: the world's (v,), by default the scene's own. A picture depends only on that, `qpos` and mocap bodies: it
+    has the same bytes in any order.
+    Raises `RenderError`, which says what to unset or install, if there is no off-screen OpenGL.
     """
     renderer = _renderer(scene, cameras.look)
     renderer.pose(data, scene.nominal if variation is None else variation)
@@ -53,10 +53,10 @@ def pictures(
 
 
 def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
-    """Return where points (K, 3) of the world [m] are in what `pictures` drew last in this process: name -> (K, 3).
+    """Return where points (K, 3) of the world [m] are in this process's last `pictures`: name -> (K, 3).
 
-    Across and down from 0 to 1, and 1 for a point within the picture; zeros for any other. A point may be hidden by
-    something before it. Raises what `pictures` raises.
+    Columns: across and down from 0 to 1, and 1 for a point within the picture; zeros for any other. A point may be
+    occluded. Raises what `pictures` raises.
     """
     renderer = _renderer(scene, cameras.look)
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
@@ -65,7 +65,7 @@ def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]
 def framed_picture(
     scene: Scene, data: mujoco.MjData, camera: str | Overview, size: tuple[int, int], look: Look
 ) -> Picture:
-    """Return what a camera, or somebody outside, sees of the physics in `data`, with the axes of `ee` drawn in.
+    """Return what a fixed or free camera sees of the physics in `data`, with the axes of `ee` drawn in.
 
     x is red, y green, z blue. size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures`
     raises.
@@ -86,7 +86,7 @@ def close() -> None:
 
 
 def _renderer(scene: Scene, look: Look) -> _Renderer:
-    """The renderer that was used last, else another in its place, in this process's OpenGL context."""
+    """The renderer that was used last, or a new one in its place, in this process's OpenGL context."""
     try:
         process, gl = _context()
         if process == os.getpid():
@@ -100,9 +100,9 @@ def _renderer(scene: Scene, look: Look) -> _Renderer:
 @cache
 def _context() -> tuple[int, Any]:
     """The process that made an OpenGL context, and the context."""
-    made_by = context_class()  # without OpenGL not even this can be imported
-    setattr(made_by, "_context", None)  # noqa: B010 - its destructor wants it even where its constructor failed
-    gl = made_by(1, 1)  # its size does not matter, pictures have a buffer of their own
+    made_by = context_class()  # without OpenGL even this import fails
+    setattr(made_by, "_context", None)  # noqa: B010 - its destructor needs it even if its constructor failed
+    gl = made_by(1, 1)  # any size will do, as pictures have a buffer of their own
     atexit.register(close)
     return os.getpid(), gl
 
@@ -132,7 +132,7 @@ class _Renderer:
             raise RuntimeError("it has no off-screen buffers")
 
     def pose(self, data: mujoco.MjData, variation: F64) -> None:
-        """Put everything where `data` has it, and apply how a world of a variation (v,) looks."""
+        """Take the poses from `data`, and apply the look of a variation (v,)."""
         self._view.apply(variation)
         self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
         mujoco.mj_kinematics(self._model, self._data)
@@ -166,7 +166,7 @@ class _Renderer:
         return np.where(inside[:, None], found, 0.0).astype(np.float32)
 
     def _make_room(self, height: int, width: int) -> None:
-        """Pictures of all sizes share one buffer, which only grows: they may alternate at no cost."""
+        """Grow the buffer that pictures of all sizes share, so that these may alternate at no cost."""
         have_height, have_width = self._context.offHeight, self._context.offWidth
         if height > have_height or width > have_width:
             mujoco.mjr_resizeOffscreen(max(width, have_width), max(height, have_height), self._context)

@@ -1,6 +1,6 @@
-"""How an object of any shape rests on the table, and where a hand that points down gets its fingers around it.
+"""How an object of any shape rests on the table, and where a downward hand can grasp it.
 
-All of it is about the object's convex hull, in the object's own frame, and computed once a process.
+Everything is about the object's convex hull, in the object's own frame, and computed once per process.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from scipy.spatial import ConvexHull
 from manip_il.sim.shape import ROLLING_MESH
 
 F64 = NDArray[np.float64]
-DEEPEST = 0.035  # of the ee site under an object's top: the palm just clears it [m]
-LEAST_HEIGHT = 0.012  # of what lies on the table: fingers slip over less [m]
-LEAST_ROOM = 0.002  # of an open gripper around an object [m]
-_DIRECTIONS = 500  # in which the points of a fine hull are looked for
-_ALIKE, _COPLANAR = 0.2, 0.01  # between sides that count as one, and of one side [rad]
-_FINGER = 0.012  # half a finger's width, and how far it may be off [m]
-_LEVEL = 0.004  # between the heights at which widths are measured [m]
-_TIP = 0.001  # of the fingertips over the table [m]
-_APART = math.radians(25)  # of two ways to grasp it
-_SLOPE = 0.1  # of sides at the fingertips, in height, from which on the object is grasped as low as can be
-_STEEP = 0.2  # more of slope under the fingertips than the best way has, in height, at which a way is none
-_WIDER = 0.02  # than the narrowest way, at which a way is none [m]
-_ROUND = 0.03  # share of the width by which something round may differ
+DEEPEST = 0.035  # depth of the ee site below an object's top at which the palm just clears it [m]
+LEAST_HEIGHT = 0.012  # least height of an object on the table: fingers slip over lower ones [m]
+LEAST_ROOM = 0.002  # least clearance of an open gripper around an object [m]
+_DIRECTIONS = 500  # directions in which the points of a fine hull are looked for
+_ALIKE, _COPLANAR = 0.2, 0.01  # angles between sides that count as one, and between faces of one side [rad]
+_FINGER = 0.012  # half a finger's width plus its sideways error [m]
+_LEVEL = 0.004  # spacing of the heights at which widths are measured [m]
+_TIP = 0.001  # height of the lowest of these over the fingertips [m]
+_APART = math.radians(25)  # least angle between two grasps [rad]
+_SLOPE = 0.1  # slope of the sides at the fingertips above which the object is grasped as low as possible
+_STEEP = 0.2  # slope at the fingertips in excess of the best grasp's at which a grasp is dropped
+_WIDER = 0.02  # width in excess of the narrowest grasp's at which a grasp is dropped [m]
+_ROUND = 0.03  # share of the width by which a round object's may vary
 
 
 class Rest(NamedTuple):
     """A side on which an object rests.
 
-    down: unit vector, (3,). height: of the body's origin, tall: of the object, above: of its top over where it is
-    grasped [m]. For each way to grasp it: across (w, 3), unit vector along the fingers' motion; centre (w, 3), between
-    the fingers; width between them and length across them [m]. fits: they go around it, and it is not too
-    low for them. round: any yaw will do.
+    down: unit vector, (3,). height: of the body's origin; tall: of the object; above: of its top over the grasp [m].
+    For each of w grasps: across (w, 3), unit vector along the fingers' motion; centre (w, 3), between the fingers;
+    sizes: width between them and length across them [m]. fits: the fingers go around it, and it is not too low for
+    them. round: any yaw will do.
     """
 
     down: F64
@@ -56,7 +56,7 @@ class Hull:
     """An object's convex hull, and the sides on which it rests, for one gripper.
 
     extents: lengths of the box about the body's origin that holds it [m]. downs: directions (n, 3) that point down
-    where it rests; the first is that in which it lies as it was made, or the nearest to that.
+    when it rests; the first is that of its modelled orientation, or the nearest to that.
     """
 
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
@@ -69,7 +69,7 @@ class Hull:
         self.extents: tuple[float, float, float] = x, y, z
 
     def rest(self, number: int) -> Rest:
-        """Return how it lies on one of its sides, computed when that is first asked for."""
+        """Return how it lies on one of its sides, computed on first use."""
         if number not in self._rests:
             self._rests[number] = _rest(self._hull, self._centre, self.downs[number], *self._gripper)
         return self._rests[number]
@@ -85,19 +85,19 @@ def _vertices(model: mujoco.MjModel, geom: int) -> F64:
 
 
 def _few(points: F64) -> F64:
-    """The outermost of points in many directions, where there are more."""
+    """The outermost points in many directions, if there are more points than directions."""
     if len(points) <= _DIRECTIONS:
         return points
     number = np.arange(_DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * number / _DIRECTIONS, number * math.pi * (1 + math.sqrt(5))  # evenly on a ball, by Fibonacci
+    z, turn = 1 - 2 * number / _DIRECTIONS, number * math.pi * (1 + math.sqrt(5))  # Fibonacci sphere
     ways = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
     return points[np.unique((points @ ways).argmax(axis=0))]
 
 
 def _resting(hull: ConvexHull, centre: F64) -> F64:
-    """Outward normals (n, 3) of the sides on which the hull does not topple, most stable first, but for the first.
+    """Outward normals (n, 3) of the stable sides: the one facing most downwards, then the most stable first.
 
-    It rests on a side if the centre of mass is over it, and rolling friction lets it rest where that is nearly so.
+    A side is stable if the centre of mass is over it or, owing to rolling friction, nearly so.
     """
     normals = hull.equations[:, :3]
     heights = -(hull.equations[:, 3] + normals @ centre)
@@ -120,10 +120,10 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
     axes = np.array([first, np.cross(-down, first)])  # horizontal
     heights = -(hull.points - centre) @ down
     height, tall = float(-heights.min()), float(np.ptp(heights))
-    at = max(lowest, tall - DEEPEST, min(height, tall / 2))  # of the hand over the table
+    at = max(lowest, tall - DEEPEST, min(height, tall / 2))  # height of the hand over the table
     flat, turns = (hull.points - centre) @ axes.T, _turns(hull, axes)
     ways, any_yaw = _ways(_all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM)
-    if min(way.slope for way in ways) > _SLOPE and at > max(lowest, tall - DEEPEST):  # it narrows: lower down
+    if min(way.slope for way in ways) > _SLOPE and at > max(lowest, tall - DEEPEST):  # it narrows upwards: grasp lower
         at = max(lowest, tall - DEEPEST)
         ways, any_yaw = _ways(_all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM)
     turned = np.array([[math.cos(way.turn), math.sin(way.turn)] for way in ways])
@@ -143,7 +143,7 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
 
 
 def _all_ways(hull: ConvexHull, heights: F64, flat: F64, tips: float, turns: F64) -> list[_Way]:
-    """Every way by its turn, with the fingertips at a height over the table [m]."""
+    """The grasp at each turn, with the fingertips at a height over the table [m]."""
     levels = np.arange(tips + _TIP, heights.max() - _TIP / 2, _LEVEL).tolist()
     cuts = [_cut(hull, heights, flat, level) for level in levels]
     return [_way(cuts, turn) for turn in turns]
@@ -159,7 +159,7 @@ def _cut(hull: ConvexHull, heights: F64, flat: F64, level: float) -> F64:
 
 
 def _turns(hull: ConvexHull, axes: F64) -> F64:
-    """Directions of the fingers' motion to look at [rad]: flush with upright sides, or all around where it has many."""
+    """Candidate directions of the fingers' motion [rad]: all around, and flush with upright sides if these are few."""
     sides = hull.equations[:, :3] @ axes.T
     upright = sides[np.hypot(*sides.T) > 0.7]
     flush = np.unique(np.degrees(np.arctan2(upright[:, 1], upright[:, 0])).round(1) % 180)
@@ -168,7 +168,7 @@ def _turns(hull: ConvexHull, axes: F64) -> F64:
 
 
 class _Way(NamedTuple):
-    """turn: of the fingers' motion [rad]; middle: between the fingers along it, off the centre of mass [m]."""
+    """turn: direction of the fingers' motion [rad]; middle: their middle along it, from the centre of mass [m]."""
 
     turn: float
     width: float
@@ -178,7 +178,7 @@ class _Way(NamedTuple):
 
 
 def _ways(ways: Sequence[_Way], widest: float) -> tuple[list[_Way], bool]:
-    """The narrowest ways, each narrower than those beside it, or one that does not fit; and whether all will do."""
+    """The locally narrowest grasps that fit, or the narrowest if none does; and whether any yaw will do."""
     narrowest = min(ways, key=lambda way: way.width)
     fitting = [way for way in ways if way.width <= min(widest, narrowest.width + _WIDER)]
     if max(way.width for way in ways) - narrowest.width < _ROUND * narrowest.width:
@@ -218,5 +218,5 @@ def _way(cuts: Sequence[F64], turn: float) -> _Way:
 
 
 def _between(one: float, other: float) -> float:
-    """Between two lines [rad]."""
+    """Angle between two lines [rad]."""
     return abs(math.remainder(one - other, math.pi))

@@ -1,4 +1,4 @@
-"""Robot and task to one compiled scene: the world is a spec of its own, and the robot is attached to it."""
+"""Build one compiled scene of robot and task: the robot is attached to the world's spec."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
 
-PREFIX = "robot/"  # of everything of the robot's in a scene
-TABLE = "table"  # the name of its geom
-_THICK = 0.04  # of the table's top [m]
-SCENES_KEPT = 8  # compiled, a process: the finest meshes take 64 MB
-_TURN, _SPARE_TURN = 0.1, 0.1  # of the last joint, to see which way it turns the hand; kept from its limits [rad]
-SEEN, SEEN_HEIGHT = 0.15, 0.45  # half the width, and the height, of a workspace that cameras see from these places [m]
-# From the workspace's middle on the table; they look at a point over that, and see so many degrees up and down.
+PREFIX = "robot/"  # prefix of the robot's names in a scene
+TABLE = "table"  # name of the table's geom
+_THICK = 0.04  # thickness of the table's top [m]
+SCENES_KEPT = 8  # compiled scenes cached per process: the finest meshes take 64 MB
+_TURN, _SPARE_TURN = 0.1, 0.1  # test turn of the last joint, to see its sense; margin to its limits [rad]
+SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of a workspace that cameras see from these places [m]
+# From the workspace's middle on the table; cameras look at a point over that, with a vertical field of view.
 _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
 _LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
-_ON_TABLE = 0.02  # of a robot's lowest point from the table's top: it stands there [m]
+_ON_TABLE = 0.02  # distance of a robot's lowest point from the table's top at which it stands there [m]
 _PEDESTAL = 0.13  # half its width [m]
-_SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
+_SHADOW_SIZE = 1024  # the shadow map is the main cost on a software renderer
 
 
 @lru_cache(SCENES_KEPT)
 def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
-    """Return the scene of a robot and a task, compiled once and kept for a while. Raises `UsageError`.
+    """Return the scene of a robot and a task, compiled once and cached. Raises `UsageError`.
 
-    step: of physics [s].
+    step: physics time step [s].
     """
     try:
         spec = scene_spec(robot, task)
@@ -116,7 +116,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
 
 
 def _yaws(robot: Robot, model: mujoco.MjModel, roll: Any) -> tuple[float, float]:
-    """Least and greatest yaw of the hand, off the one that counts as none, that its last joint turns it to [rad]."""
+    """Least and greatest yaw to which its last joint turns the hand, from the one that counts as zero [rad]."""
     if not robot.faces_ahead or not roll.limited[0]:
         return -np.inf, np.inf
     data, yaws = mujoco.MjData(model), []
@@ -234,7 +234,7 @@ def _table_x(robot: Robot) -> float:
 
 
 def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> None:
-    """From the floor to the robot's lowest point, where that is in the air and does not stand on the table."""
+    """Add one from the floor to the robot's lowest point, if that is in the air and not on the table."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     touching = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]

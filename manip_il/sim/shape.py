@@ -11,11 +11,11 @@ from manip_il.errors import UnknownName, UsageError, shorten
 if TYPE_CHECKING:
     from manip_il.sim.mesh import Mesh
 
-SHORTEST, LONGEST = 0.02, 0.12  # of an object's lengths [m]
-DEFAULT_WIDTH = 0.05  # where none is said [m]
-LIGHTEST = 0.05  # [kg]: a fingertip's contact with less is soft, and what is held creeps out of the hand
+SHORTEST, LONGEST = 0.02, 0.12  # range of an object's lengths [m]
+DEFAULT_WIDTH = 0.05  # if none is given [m]
+LIGHTEST = 0.05  # [kg]: contact with less is soft, and a held object creeps out of the hand
 DENSITY = 800.0  # [kg/m^3]: a cube of 5 cm has 0.1 kg
-_CAPSULE = 1.5  # length of a capsule whose length is not said, in diameters
+_CAPSULE = 1.5  # default length of a capsule, in diameters
 _SIZES = {
     "box": "EDGE or LENGTHxWIDTHxHEIGHT",
     "cylinder": "DIAMETER or DIAMETERxLENGTH",
@@ -23,7 +23,7 @@ _SIZES = {
     "capsule": "DIAMETER or DIAMETERxLENGTH",
 }
 KINDS = tuple(_SIZES)
-ANY = "any"  # of those kinds, one for each episode
+ANY = "any"  # one of those kinds in each episode
 _SIZES[ANY] = "WIDTH"
 MESH = "mesh"
 LONGEST_MESH = 0.2  # [m]
@@ -35,11 +35,11 @@ SHAPE_HELP = (
 
 @dataclass(frozen=True)
 class Shape:
-    """A solid of wood. kind: box, cylinder, sphere, capsule or mesh; lengths: along its own axes x, y and z [m].
+    """A wooden solid. kind: box, cylinder, sphere, capsule or mesh; lengths: along its own axes x, y and z [m].
 
-    any: what a world draws of these, as wide; a cube where nothing is drawn.
+    any: one of these that a world draws, of the same width; a cube if nothing is drawn.
     Cylinders and capsules have their axis along z, and a capsule's length is that between the tips of its round ends.
-    Raises `UsageError` for a length out of `SHORTEST` to `LONGEST`, or a capsule no longer than wide.
+    Raises `UsageError` for a length outside `SHORTEST` to `LONGEST`, or a capsule no longer than wide.
     """
 
     kind: str
@@ -64,10 +64,10 @@ class Shape:
 
     @classmethod
     def parse(cls, text: str) -> Shape:
-        """Return the shape that a text means; raises `UnknownName` or `UsageError`."""
+        """Return the shape that a text describes; raises `UnknownName` or `UsageError`."""
         kind, colon, size = text.partition(":")
         if kind == MESH or kind.lower().endswith((".stl", ".obj")):
-            from manip_il.sim.mesh import parse_mesh  # here, as help needs no numpy
+            from manip_il.sim.mesh import parse_mesh  # imported here: help needs no numpy
 
             mesh = parse_mesh(text)
             return cls(MESH, mesh.lengths, mesh)
@@ -85,7 +85,7 @@ class Shape:
         return cls(kind, _lengths(kind, width))
 
     def __str__(self) -> str:
-        """Text that means it, as short as can be."""
+        """Shortest text that `parse` reads as this shape."""
         if self.mesh is not None:
             return self.mesh.text
         numbers = self.lengths if self.kind == "box" else self.lengths[::2]
@@ -95,7 +95,7 @@ class Shape:
 
     @property
     def size(self) -> tuple[float, ...]:
-        """MuJoCo's `geom_size` of it [m]."""
+        """Its `geom_size` in MuJoCo [m]."""
         width, _, length = self.lengths
         if self.kind in ("box", ANY):
             return tuple(one / 2 for one in self.lengths)
@@ -120,14 +120,14 @@ class Shape:
 
     @property
     def word(self) -> str:
-        """Name of it in an instruction."""
+        """Its name in an instruction."""
         if self.kind in (ANY, MESH):
             return "object"
         return "cube" if self.kind == "box" and len(set(self.lengths)) == 1 else self.kind
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Greatest lengths between which it may be scaled and still be grasped, however it lies [m]; None for none."""
+        """Range of its greatest length in which it can be grasped however it lies [m]; None if there is none."""
         if self.mesh is not None:
             return None
         least, between, most = sorted(self.lengths)
@@ -136,7 +136,7 @@ class Shape:
 
 
 def _lengths(kind: str, first: float, second: float | None = None, *rest: float) -> tuple[float, float, float]:
-    """Lengths along the axes of a shape given by as many numbers as it takes; raises `TypeError` for another count."""
+    """Lengths along the axes of a shape, from the numbers given; raises `TypeError` for a wrong count."""
     if kind == "box" and (second is None) != (len(rest) == 1):
         return first, first if second is None else second, rest[0] if rest else first
     if rest or (second is not None and kind in ("box", "sphere", ANY)):
@@ -146,18 +146,18 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
 
 
 def draws_shape(text: str) -> bool:
-    """Return whether each episode draws the shape of an object that a text means, as `Shape.parse` reads it."""
+    """Return whether each episode draws the shape of the object in a text, as `Shape.parse` reads it."""
     return text.partition(":")[0] == ANY
 
 
 def stored(text: str) -> str:
-    """Return the text of an object as data have it: that of a mesh names its file and hash, and no folder."""
+    """Return the text of an object as datasets have it: a mesh's has its file's name and hash, and no folder."""
     mesh = Shape.parse(text).mesh if text else None
     return text if mesh is None else mesh.stored
 
 
-ROLLING = 0.005  # of what is round, as on a cloth: what falls from the hand stays within reach [m]
-ROLLING_MESH = 0.001  # of a mesh, which with more stays on an edge that it comes to stand on [m]
+ROLLING = 0.005  # rolling friction of round objects, as on a cloth: dropped ones stay within reach [m]
+ROLLING_MESH = 0.001  # rolling friction of a mesh, which with more would balance on an edge [m]
 
 
 def contact(kind: str) -> tuple[int, float]:
@@ -167,5 +167,5 @@ def contact(kind: str) -> tuple[int, float]:
     return (4, 0.0001) if kind in ("box", ANY) else (6, ROLLING)
 
 
-_THINNEST, _WIDEST = 0.02, 0.07  # of a scaled object: its least length, and the one between the fingers at most [m]
+_THINNEST, _WIDEST = 0.02, 0.07  # bounds on a scaled object: least length, and greatest between the fingers [m]
 CUBE = Shape("box", (DEFAULT_WIDTH, DEFAULT_WIDTH, DEFAULT_WIDTH))

@@ -1,4 +1,4 @@
-"""The interface of a task: its objects, its starts, what is observed of it, and how the expert solves it."""
+"""The interface of a task: its objects, starts and observations, and how the expert solves it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Observed = Mapping[str, "F64 | float"]
 class Target(NamedTuple):
     """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
 
-    max_step: how far ahead of the hand its target may run [m]; max_turn: [rad]. exact: do not let the arm's posture,
-    which inverse kinematics keeps near home, pull the hand off its target by a millimetre; for fits tighter than that.
-    lean: how far the hand may lean off its rotation for the sake of its position, 0 to 1.
+    max_step: how far ahead of the hand its target may run [m]; max_turn: [rad]. exact: do not let the posture cost of
+    inverse kinematics pull the hand off its target by a millimetre, for fits tighter than that.
+    lean: how far the hand may lean from its rotation to reach its position, 0 to 1.
     """
 
     position: F64
@@ -64,9 +64,9 @@ class Limits:
 class Task(Protocol):
     """A task, for every arm that can do it.
 
-    objects: what the arm moves and must reach, the first being what events move. grasped: those of them that the
-    gripper must go around. rungs: latest first, the last one holding everywhere; each is a function of the world alone,
-    so that the expert can label any state.
+    objects: what the arm moves and must reach; events move the first. grasped: those that the gripper must go around.
+    rungs: latest first, the last one holding everywhere; each is a function of the world alone, so that the expert can
+    label any state.
     """
 
     @property
@@ -76,12 +76,12 @@ class Task(Protocol):
 
     @property
     def instruction(self) -> str:
-        """Text for policies that read language; a task with another one in each episode is `Instructing`, too."""
+        """Text for language-conditioned policies; a task whose text differs between episodes is also `Instructing`."""
         ...
 
     @property
     def limits(self) -> Limits:
-        """Limits that solve and end an episode, unless an environment's settings say otherwise."""
+        """Limits for solving and ending an episode, unless an environment's settings say otherwise."""
         ...
 
     @property
@@ -96,7 +96,7 @@ class Task(Protocol):
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Least and greatest length of an object, along its longest edge, that the task can take [m]; None: its own."""
+        """Range of an object's longest edge that the task can take [m]; None if only its own."""
         ...
 
     @property
@@ -105,33 +105,33 @@ class Task(Protocol):
         ...
 
     def build(self, spec: mujoco.MjSpec) -> None:
-        """Add its objects (free bodies), and what stands fixed or shows goals (mocap bodies)."""
+        """Add its objects (free bodies), and furniture and goal markers (mocap bodies)."""
         ...
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw a start within the arm's reach. Raises `UsageError` where there is none."""
+        """Draw a start within the arm's reach. Raises `UsageError` if there is none."""
         ...
 
     def observe(self, world: World) -> Observed:
-        """Return `environment_state` by names, in its order: numbers, and vectors of x, y and z."""
+        """Return the entries of `environment_state` by name, in its order: numbers, and vectors of x, y and z."""
         ...
 
     def destination(self, world: World) -> F64:
-        """Return where the object, or the hand where there is none, is to go, (3,) [m]; for reports alone."""
+        """Return the target of the object, or of the hand if there is none, (3,) [m]; for reports only."""
         ...
 
     def error(self, world: World) -> float:
-        """Return how far the task is from being solved [m]; within the tolerance it is."""
+        """Return how far the task is from being solved [m], which it is within the tolerance."""
         ...
 
     def progress(self, world: World) -> float:
-        """Return how much is done, 0 to 1; it never falls while the task is being done right."""
+        """Return how much is done, 0 to 1; it never falls while the task is done correctly."""
         ...
 
 
 @runtime_checkable
 class Instructing(Protocol):
-    """A task whose text differs from episode to episode; what is meant lives in the state, as a mocap body's pose."""
+    """A task whose text differs between episodes; the state holds which one, as a mocap body's pose."""
 
     def objects_in(self, world: World) -> tuple[str, ...]:
         """Return the objects that the text of a world's episode is about, which the arm must reach."""
@@ -147,17 +147,17 @@ class Instructing(Protocol):
         ...
 
     def ask(self, world: World, instruction: str) -> None:
-        """Make a world's episode one of another of the texts."""
+        """Change the text of a world's episode to another of the texts."""
         ...
 
 
 def instruction_in(task: Task, world: World) -> str:
-    """Return the text of a world's episode: the task's own sentence, unless it has another for each."""
+    """Return the text of a world's episode: the task's instruction, unless it differs between episodes."""
     return task.instruction_in(world) if _instructs(task) else task.instruction
 
 
 def ask(task: Task, world: World, instruction: str) -> None:
-    """Make a world's episode one of a text. Raises `UsageError` for a text that the task has not."""
+    """Change the text of a world's episode. Raises `UsageError` for a text that the task does not have."""
     name, known = task.name, list(task.instructions) if _instructs(task) else [task.instruction]
     if instruction not in known:
         others = f" and {len(known) - 1} others" if len(known) > 1 else ""
@@ -173,7 +173,7 @@ def objects_in(task: Task, world: World) -> tuple[str, ...]:
 
 
 def _instructs(task: object) -> TypeGuard[Instructing]:
-    """`isinstance`, which for a protocol reads all of its members anew, in a twentieth of the time."""
+    """Twenty times faster than `isinstance`, which for a protocol checks all members on each call."""
     return hasattr(task, "instruction_in")
 
 
@@ -182,27 +182,27 @@ class TakesShape(Protocol):
     """A task whose object may be of any shape."""
 
     def with_shape(self, shape: Shape) -> Task:
-        """Return the task with such an object."""
+        """Return the task with an object of a shape."""
         ...
 
 
 @runtime_checkable
 class TakesArgument(Protocol):
-    """A task of which there are several, called `NAME:ARGUMENT`; which one an episode is of lives in the state."""
+    """A task with variants, called `NAME:ARGUMENT`; the state holds an episode's variant."""
 
     def with_argument(self, text: str) -> Task:
-        """Return the one that a text means, named by its numbers: `NAME`, or `NAME:A=NUMBER,B=NUMBER`."""
+        """Return the variant that a text describes, named by its numbers: `NAME`, or `NAME:A=NUMBER,B=NUMBER`."""
         ...
 
     @property
     def argument_bodies(self) -> tuple[str, ...]:
-        """Mocap bodies whose places hold which one it is; scenes that are drawn anew keep them."""
+        """Mocap bodies whose places encode the variant; redrawn scenes keep them."""
         ...
 
 
 @runtime_checkable
 class Fitting(Protocol):
-    """A task whose fixed parts are of a size for the arm."""
+    """A task whose fixed parts are scaled to the arm."""
 
     def fitted(self, robot: Robot) -> Task:
         """Return the task for a robot's workspace."""
@@ -214,14 +214,14 @@ class Refusing(Protocol):
     """A task with states that the expert has no sound label for, besides objects out of reach."""
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label; empty where there is one."""
+        """Return why there is no sound label; empty if there is one."""
         ...
 
 
 def phases(task: Task) -> tuple[str, ...]:
-    """Return names of a task's phases by their number in `expert_phase`: none, then the rungs from the first on."""
+    """Return the names of a task's phases by number in `expert_phase`: `none`, then the rungs, earliest first."""
     return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
 
 
-CUBE_SIZES = (0.03, 0.07)  # of a cube that every gripper goes around [m]
-NO_PHASE = "none"  # where there is no sound label
+CUBE_SIZES = (0.03, 0.07)  # edges of a cube that every gripper goes around [m]
+NO_PHASE = "none"  # if there is no sound label

@@ -1,7 +1,7 @@
 """Variation of worlds from episode to episode, as numbers that a state holds.
 
-Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then, for the
-whole world, what `Condition` names so: see `_WORLD`.
+Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then those of
+the world, named as in `Condition`: see `_WORLD`.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _KINDS = {float(geom): kind for kind, geom in GEOMS.items()}
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 PER_OBJECT = 5
 _SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
-_OWN = -1.0  # a shape or colour that is not drawn: everything has its own
-_WORLD: dict[str, tuple[float, ...]] = {  # behind the objects' numbers: what it is where nothing is drawn
+_OWN = -1.0  # no shape or colour is drawn: objects keep their own
+_WORLD: dict[str, tuple[float, ...]] = {  # after the objects' numbers: values if nothing is drawn
     "shape": (_OWN,),  # else MuJoCo's geom type
     "joint_damping": (1.0,),
     "actuator_gain": (1.0,),
@@ -39,23 +39,23 @@ _WORLD: dict[str, tuple[float, ...]] = {  # behind the objects' numbers: what it
     "brightness": (1.0,),
     "light_turn": (0.0,),
     **{f"{moved}.{camera}": (0.0,) * 3 for moved in ("camera_shift", "camera_turn") for camera in ("front", "wrist")},
-    # States that were recorded before there was a side camera end here.
+    # States recorded before the side camera end here.
     "camera_shift.side": (0.0,) * 3,
     "camera_turn.side": (0.0,) * 3,
     "clutter": (0.0, 0.0),  # how many things, and the seed of what they are and where
 }
 _STARTS = np.cumsum([0, *map(len, _WORLD.values())]).tolist()
 _PLACES = {name: slice(*ends) for name, *ends in zip(_WORLD, _STARTS[:-1], _STARTS[1:], strict=True)}
-NOTHING_DRAWN = np.concatenate(list(_WORLD.values()))  # of the world, (w,)
+NOTHING_DRAWN = np.concatenate(list(_WORLD.values()))  # the world's numbers, (w,)
 WORLD_SIZE = len(NOTHING_DRAWN)
-# How many numbers less older states have: before there was a side camera, and before anything but objects was drawn.
+# How many numbers older states lack: from before the side camera, and from when only objects were drawn.
 OLDER = (WORLD_SIZE - _PLACES["camera_shift.side"].start, WORLD_SIZE)
-_NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # how the episode began, and how it looks
+_NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # numbers for how the episode began and how it looks
 
 
 @dataclass(frozen=True)
 class Object:
-    """A free body of a compiled model, and its first geom: what shows its shape.
+    """A free body of a compiled model, and its first geom, which has its shape.
 
     q, v: starts of its free joint in qpos and qvel.
     """
@@ -77,15 +77,15 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
 
 
 def part(variation: F64, name: str) -> F64:
-    """Return the numbers of a variation (v,) that have a name in `_WORLD`, as a view."""
+    """Return the numbers of a variation (v,) under a name in `_WORLD`, as a view."""
     return variation[len(variation) - WORLD_SIZE :][_PLACES[name]]
 
 
 def completed(variation: F64, like: F64) -> F64:
-    """Return a variation (v,) as it is now. like: the scene's own, (v,).
+    """Return a variation (v,) in the current format. like: the scene's own, (v,).
 
-    States that were recorded before lack numbers at the end; nothing of that was drawn, or only the data's
-    provenance says so. Raises `MismatchError` for a variation of another length.
+    Older states lack numbers at the end; these were not drawn, or only the data's provenance records them. Raises
+    `MismatchError` for a variation of another length.
     """
     if (lacks := len(like) - len(variation)) in OLDER:
         return np.concatenate([variation, NOTHING_DRAWN[-lacks:]])
@@ -95,14 +95,14 @@ def completed(variation: F64, like: F64) -> F64:
 
 
 def same_physics(variation: F64, other: F64) -> bool:
-    """Return whether two variations (v,) of a scene differ in nothing that moves."""
+    """Return whether two variations (v,) of a scene have the same physics."""
     return np.array_equal(variation[:-_NOT_PHYSICS], other[:-_NOT_PHYSICS])
 
 
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     """Return a variation (v,) with drawn values by the names of `Condition`, in its units; other names change nothing.
 
-    size is the edge or width [m]; an object of a drawn shape is of wood. camera_shift and camera_turn are there a
+    size is the edge or width [m]; an object of a drawn shape is wooden. camera_shift and camera_turn have a value per
     camera.
     """
     varied = base.copy()
@@ -138,10 +138,10 @@ def apply(
     motors: NDArray[np.int64],
     variation: F64,
 ) -> None:
-    """Give a model that nobody else uses the objects and the arm of `variation` (v,).
+    """Apply `variation` (v,) to the objects and the arm of a model that is not shared.
 
-    plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst` afterwards, for what
-    follows from masses.
+    plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst` afterwards: it
+    updates what depends on masses.
     """
     _apply_dynamics(model, plain, motors, variation)
     shape = float(part(variation, "shape")[0])
@@ -151,7 +151,7 @@ def apply(
 
 
 def _apply_dynamics(changed: Any, plain: mujoco.MjModel, motors: NDArray[np.int64], variation: F64) -> None:
-    """Multiply the arm's damping and gains: kv with the root of kp's factor, which keeps the damping ratio."""
+    """Scale the arm's damping and gains, kv by the root of kp's factor, which keeps the damping ratio."""
     damping, gain = (float(part(variation, name)[0]) for name in ("joint_damping", "actuator_gain"))
     dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
     changed.dof_damping[dofs] = plain.dof_damping[dofs] * damping
@@ -176,14 +176,14 @@ def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, sh
         inertia = _inertia(kind, size, mass)
     changed.geom_type[geom], changed.geom_condim[geom] = kind, condim
     changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
-    # Of two geoms that touch, the larger friction counts unless one has priority: here the drawn one counts.
+    # Of two geoms that touch, the larger friction counts unless one has priority, as the drawn one gets here.
     drawn = friction != plain.geom_friction[geom, 0]
     changed.geom_friction[geom, 0], changed.geom_friction[geom, 2] = friction, rolling
     changed.geom_priority[geom] = 1 if drawn else plain.geom_priority[geom]
 
 
 def extents(kind: int, size: F64) -> F64:
-    """Return the lengths of a geom along its own axes [m], (3,), from MuJoCo's `geom_size`; of a mesh of its box."""
+    """Return the lengths of a geom along its own axes [m], (3,), from MuJoCo's `geom_size`; a mesh's are its box's."""
     geom = mujoco.mjtGeom
     if kind in (int(geom.mjGEOM_BOX), _MESH):
         return 2 * size
@@ -199,7 +199,7 @@ def extents(kind: int, size: F64) -> F64:
 
 
 def widest_grasp(kind: int, size: F64) -> float:
-    """Return how wide a geom is between fingers from above, on whichever side it lies [m]."""
+    """Return a geom's greatest width between fingers from above, on whichever side it lies [m]."""
     lengths = np.sort(extents(kind, size))
     return float(lengths[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else extents(kind, size)[0])
 
@@ -227,8 +227,8 @@ def _inertia(kind: int, size: F64, mass: float) -> F64:
 
 
 def _capsule_inertia(radius: float, height: float, mass: float) -> F64:
-    """Moments of inertia of a cylinder of a radius and height [m] with half a ball on both ends."""
-    round_, balls = height, 4 / 3 * radius  # volumes, in circles
+    """Moments of inertia of a cylinder of a radius and height [m] with a hemisphere on both ends."""
+    round_, balls = height, 4 / 3 * radius  # volumes over the circle's area
     cylinder, ball = mass * round_ / (round_ + balls), mass * balls / (round_ + balls)
     along = cylinder * radius**2 / 2 + ball * 2 * radius**2 / 5
     across = cylinder * (height**2 / 12 + radius**2 / 4)

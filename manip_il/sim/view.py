@@ -1,8 +1,8 @@
-"""The model that pictures are drawn from: the physics model's copy with few faces, lit by a `Look`.
+"""The model that pictures are drawn from: a copy of the physics model with few faces, lit by a `Look`.
 
-It is changed by what one episode draws, and as it was again for the next.
+One episode's drawn values are applied to it and undone for the next.
 
-A software renderer pays for every triangle, and the Panda's meshes have 136,040 for an arm that is 60 pixels tall.
+Software rendering costs time per triangle, and the Panda's meshes have 136,040 for an arm that is 60 pixels tall.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from manip_il.sim.world import Scene
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
-_CELLS = 22  # grid cells along a mesh's diagonal: what still looks right at 480 x 640 pixels
-_LEAST_CELL = 0.008  # what a pixel spans at 128 x 128; less where the cameras stand nearer [m]
-_PLAIN_FACES = 1_600  # meshes up to here stay as they are
-_PULL = 0.01  # of a cell's mean on its vertex, against that of its faces' planes
-_LEAST_PULL = 1e-12  # [m^2] where a cell has no faces
+_CELLS = 22  # grid cells along a mesh's diagonal: enough to look right at 480 x 640 pixels
+_LEAST_CELL = 0.008  # width of a pixel at 128 x 128; less if the cameras are nearer [m]
+_PLAIN_FACES = 1_600  # meshes with up to this many are not simplified
+_PULL = 0.01  # weight of a cell's mean in its vertex, against that of its faces' planes
+_LEAST_PULL = 1e-12  # [m^2] if a cell has no faces
 _LAMPS = ("light_ambient", "light_diffuse", "light_specular")
 _CHANGED = (
     "geom_type",
@@ -61,7 +61,7 @@ class ViewModel:
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
-        """Apply how a world of a variation (v,) looks to the next pictures. None of it lies on the graphics card."""
+        """Apply the look of a variation (v,) to the next pictures; nothing is uploaded to the graphics card."""
         if np.array_equal(variation, self._applied):
             return
         for name, plain in self._plain.items():
@@ -99,7 +99,7 @@ class ViewModel:
             mujoco.mju_mulQuat(self.model.cam_quat[camera], quat, turned)
 
     def _light(self, brightness: float, light_turn: float) -> None:
-        """Multiply every lamp by a factor, and turn those that stand in the world about the vertical [deg]."""
+        """Multiply every lamp by a factor, and turn those fixed in the world about the vertical [deg]."""
         for colour in (*self._headlight_colours(), *(getattr(self.model, name) for name in _LAMPS)):
             colour[:] *= brightness
         turn = np.deg2rad(light_turn)
@@ -119,7 +119,7 @@ def _with_few_faces(scene: Scene) -> mujoco.MjModel:
 
 
 def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
-    """Overwrite the first of a mesh's vertices, normals and faces by fewer of them; what follows is never drawn."""
+    """Overwrite the start of a mesh's vertices, normals and faces with fewer; the rest is never drawn."""
     vertices = _rows(model.mesh_vert, model.mesh_vertadr[mesh], model.mesh_vertnum[mesh])
     normals = _rows(model.mesh_normal, model.mesh_normaladr[mesh], model.mesh_normalnum[mesh])
     faces = _rows(model.mesh_face, model.mesh_faceadr[mesh], model.mesh_facenum[mesh])
@@ -152,7 +152,7 @@ def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple
 
 
 def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
-    """Where the squared distances to the planes of a cell's faces, weighted by area, are least: sharp edges stay.
+    """Points with least squared distances to the planes of a cell's faces, weighted by area: sharp edges stay.
 
     After P. Lindstrom, Out-of-core simplification of large polygonal models (2000).
     """
@@ -171,7 +171,7 @@ def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
 
 
 def _distinct(faces: Indices) -> Indices:
-    """The faces with three different corners, each once, wound as they were."""
+    """The faces with three different corners, each once, in their winding."""
     first, second, third = faces.T
     faces = faces[(first != second) & (second != third) & (third != first)]
     turned = (faces.argmin(axis=1)[:, None] + [0, 1, 2]) % 3

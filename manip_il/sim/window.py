@@ -1,7 +1,7 @@
-"""MuJoCo's own viewer of an environment, in real time, where there is a display.
+"""MuJoCo's own viewer of an environment, in real time, if there is a display.
 
-It shows a copy of the model and of the physics: what is moved or changed in its panels does not reach the episode,
-but for the control sliders (`commands`) and the pull of the mouse (`pull`), for who asks for them.
+It shows a copy of the model and of the physics: changes in its panels do not affect the episode, except that callers
+can use the control sliders (`commands`) and the pull of the mouse (`pull`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from manip_il.sim.world import STATE_KIND, Scene
 
 F64 = NDArray[np.float64]
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
-_LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # height [m], [m], [deg]: the camera at first
+_LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # initial camera: height [m], [m], [deg]
 _CLOSING = 5.0  # longest time that closing takes [s]
 
 
@@ -35,8 +35,8 @@ def has_display() -> bool:
 
 
 def require_display() -> None:
-    """Raise `RenderError` unless a window can be opened: MuJoCo's viewer would wait for ever."""
-    import glfw  # MuJoCo's own; it warns where there is no display
+    """Raise `RenderError` unless a window can be opened: MuJoCo's viewer would wait forever."""
+    import glfw  # MuJoCo's own; it warns if there is no display
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -47,22 +47,22 @@ def require_display() -> None:
 
 
 class Clock:
-    """Real time in control steps."""
+    """Paces control steps in real time."""
 
     def __init__(self, hz: float):
         self._step, self._due = 1 / hz, 0.0
 
     def wait(self) -> None:
-        """Wait until a control step has passed since the last call returned; not at all where it is late."""
+        """Wait until a control step has passed since the last call returned; not at all if it is late."""
         now = time.monotonic()
         self._due = max(self._due + self._step, now)
         time.sleep(self._due - now)
 
 
 class Window:
-    """A window that shows a scene, `control_hz` times a second. sliders: open the panel on the right, which has them.
+    """A window that shows a scene, `control_hz` times a second. sliders: open the right panel, which has them.
 
-    Raises `RenderError` where there is no display.
+    Raises `RenderError` if there is no display.
     """
 
     def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):
@@ -78,7 +78,7 @@ class Window:
             self._model, self._data, show_left_ui=False, show_right_ui=sliders
         )
         self._threads = [one for one in threading.enumerate() if one not in others]
-        atexit.register(self.close)  # before MuJoCo's own, which do not wait for its threads and may crash
+        atexit.register(self.close)  # before MuJoCo's own handlers, which do not wait for its threads and may crash
         with self._handle.lock():
             camera = self._handle.cam
             camera.lookat[:] = [*scene.robot.workspace.centre, _LOOK_AT]
@@ -86,11 +86,11 @@ class Window:
 
     @property
     def is_open(self) -> bool:
-        """False once somebody has closed it."""
+        """False once the user has closed it."""
         return self._handle.is_running()
 
     def show(self, data: mujoco.MjData, variation: F64, text: str = "") -> None:
-        """Show a world of a variation (v,) as `data` has it, then wait for real time. text: in the upper left."""
+        """Show `data` in a world of a variation (v,), then wait for real time. text: in the upper left."""
         if not self.is_open:
             return
         with self._handle.lock():
@@ -110,12 +110,12 @@ class Window:
         return self._data.ctrl.copy()
 
     def pull(self, data: mujoco.MjData) -> None:
-        """Apply to `data` the force with which the mouse pulls at a body [N], until the next call."""
+        """Apply the mouse's pull on a body [N] to `data`, until the next call."""
         data.xfrc_applied[:] = 0.0
         mujoco.mjv_applyPerturbForce(self._model, data, self._handle.perturb)
 
     def close(self) -> None:
-        """Close it, and wait until it is gone; a second call changes nothing."""
+        """Close the window and wait until it is gone; a second call changes nothing."""
         atexit.unregister(self.close)
         self._handle.close()
         for one in self._threads:

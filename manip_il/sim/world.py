@@ -1,6 +1,6 @@
-"""A compiled scene, and its physics in one state, read by name: what tasks, ladders and the expert work with.
+"""A compiled scene and its physics in one state, read by name by tasks, ladders and the expert.
 
-Lengths in [m], angles in [rad], everything in the world's frame: z = 0 is the table's top, x away from the robot.
+Lengths in [m], angles in [rad], all in the world's frame: z = 0 is the table's top, x points away from the robot.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from manip_il.sim.variation import Object
 F64 = NDArray[np.float64]
 T = TypeVar("T")
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_BESIDE, _NEAR = (-0.02, 0.07), 0.08  # of what stands around an object, in height and sideways: a hand may meet it [m]
-_MOST_TURNS = 4  # that look alike, to either side
-_AT_REST = 0.03, 0.5  # of an object that hardly moves [m/s], [rad/s]
-GOAL = "goal"  # the mocap body that shows where things are to go
+_BESIDE, _NEAR = (-0.02, 0.07), 0.08  # heights and distance at which a hand may hit a neighbour of an object [m]
+_MOST_TURNS = 4  # symmetric turns considered, to either side
+_AT_REST = 0.03, 0.5  # speeds below which an object is at rest [m/s], [rad/s]
+GOAL = "goal"  # the mocap body that marks the goal
 
 
 class Pose(NamedTuple):
@@ -45,12 +45,12 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A robot and a task's objects as one compiled model, and the addresses of what is named in it.
+    """A robot and a task's objects as one compiled model, and the addresses of its named parts.
 
     task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies by name.
-    hulls: of those that are meshes.
+    hulls: those of meshes.
     ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest of the hand,
-    off the one that counts as none [rad]. nominal: the variation that the model has as compiled, (v,).
+    from the one that counts as zero [rad]. nominal: the variation of the model as compiled, (v,).
     """
 
     robot: Robot
@@ -87,9 +87,9 @@ class Scene:
 class World:
     """One scene's physics, and what can be read from it by name.
 
-    model and data change their identity with the variation: the shared model as compiled, or one of this world's own.
-    ee: the frame between the fingertips, z out of the hand, y along the fingers' motion. Poses need kinematics to be up
-    to date (`update`).
+    model and data are replaced as the variation changes: the shared model as compiled, or one of this world's own.
+    ee: the frame between the fingertips, z out of the hand, y along the fingers' motion. Poses need up-to-date
+    kinematics (`update`).
     """
 
     def __init__(self, scene: Scene):
@@ -97,13 +97,13 @@ class World:
         self.variation = scene.nominal
         self._plain = scene.model, mujoco.MjData(scene.model)
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
-        self._cache: dict[Any, Any] = {}  # until the world moves
+        self._cache: dict[Any, Any] = {}  # cleared when the world moves
         self._use(*self._plain)
 
     def _use(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self.model, self.data = model, data
         at, self._poses = self.scene.ee_site, dict[str, Pose]()
-        self.ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))  # which follows it as the world moves
+        self.ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))  # a view that follows the world
         self._shapes: dict[str, tuple[int, tuple[float, ...]]] = {}
 
     def __reduce__(self) -> NoReturn:
@@ -112,7 +112,7 @@ class World:
     # Physics
 
     def vary(self, variation: F64) -> None:
-        """Give the model what of `variation` (v,) is physics. Raises `MismatchError` for one of another length."""
+        """Apply the physics of `variation` (v,) to the model. Raises `MismatchError` for one of another length."""
         variation = variations.completed(variation, self.scene.nominal)
         if variation.tobytes() == self.variation.tobytes():
             return
@@ -122,11 +122,11 @@ class World:
             self._use(*self._plain)
             return
         if self._own is None:
-            model = copy.copy(self.scene.model)  # physics reads masses and sizes from there
+            model = copy.copy(self.scene.model)  # with its own masses and sizes
             self._own = model, mujoco.MjData(model)
         self._use(*self._own)
         variations.apply(self.model, self.scene.model, self.scene.objects, self.scene.arm_ctrl, variation)
-        mujoco.mj_setConst(self.model, self.data)  # what follows from masses
+        mujoco.mj_setConst(self.model, self.data)  # updates what depends on masses
 
     def physics(self) -> F64:
         """Return MuJoCo's integration state, (p,)."""
@@ -144,7 +144,7 @@ class World:
         self.update()
 
     def update(self) -> None:
-        """Compute poses from qpos and mocap poses after those changed."""
+        """Compute poses from qpos and mocap poses after these have changed."""
         self._cache.clear()
         mujoco.mj_kinematics(self.model, self.data)
 
@@ -163,13 +163,13 @@ class World:
     # Readings
 
     def remember(self, key: Any, compute: Callable[[], T]) -> T:
-        """Return what `compute` gives, computed once until the world changes."""
+        """Return the result of `compute`, cached until the world changes."""
         if key not in self._cache:
             self._cache[key] = compute()
         return self._cache[key]
 
     def pose(self, name: str) -> Pose:
-        """Return the pose of a body, which follows it as the world moves. Raises `UnknownName`."""
+        """Return the pose of a body, as views that follow the world. Raises `UnknownName`."""
         pose = self._poses.get(name)
         if pose is None:
             one = self.scene.objects.get(name)
@@ -188,13 +188,13 @@ class World:
         return self.remember("opening", lambda: self.gripper.opening(self.data.qpos))
 
     def ahead(self, position: F64) -> float:
-        """Return the yaw that counts as none for a hand at a position (3,) [rad]."""
+        """Return the yaw that counts as zero for a hand at a position (3,) [rad]."""
         return yaw_ahead(self.robot, self.data.xanchor[self.scene.shoulder], position)
 
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
-        """Return the ways round, off straight ahead, to which a hand at a position (3,) [m] can turn for a yaw [rad].
+        """Return the turns from straight ahead by which a hand at a position (3,) [m] can reach a yaw [rad].
 
-        alike: a turn by which it looks the same [rad].
+        alike: a turn after which the grasp looks the same [rad].
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)
@@ -202,7 +202,7 @@ class World:
         return [way for way in ways if low <= way <= high] or [off]
 
     def turned(self, position: F64) -> float:
-        """Return how far the hand is turned off straight ahead at a position (3,) [m]; [rad]."""
+        """Return how far the hand is turned from straight ahead at a position (3,) [m]; [rad]."""
         low, high = self.scene.yaws
         middle = (low + high) / 2 if math.isfinite(low) else 0.0
         return middle + math.remainder(self.hand_yaw - self.ahead(position) - middle, 2 * math.pi)
@@ -214,12 +214,12 @@ class World:
         return angle_across(hand) if self.robot.leans else angle_ahead(hand)
 
     def off_down(self, yaw: float) -> float:
-        """Return how far the hand is from pointing down at a yaw [rad]; only off the yaw, of an arm that leans."""
+        """Return how far the hand is from pointing down at a yaw [rad]; for an arm that leans, only from the yaw."""
         hand = self.ee.rotation
         return off_yaw(hand, yaw) if self.robot.leans else angle_from_down(hand, yaw)
 
     def extents(self, name: str) -> tuple[float, ...]:
-        """Return lengths of an object along its own axes x, y and z; of a mesh those of a box about its origin."""
+        """Return lengths of an object along its own axes x, y and z; a mesh's are those of a box about its origin."""
         return self._shape(name)[1]
 
     def kind(self, name: str) -> int:
@@ -227,7 +227,7 @@ class World:
         return self._shape(name)[0]
 
     def hull(self, name: str) -> Hull | None:
-        """Return the hull of an object that is a mesh, None for another."""
+        """Return the hull of an object that is a mesh; None for any other."""
         return self.scene.hulls.get(name)
 
     def _shape(self, name: str) -> tuple[int, tuple[float, ...]]:
@@ -238,7 +238,7 @@ class World:
         return self._shapes[name]
 
     def at_rest(self, name: str) -> bool:
-        """Return whether an object hardly moves: under 3 cm and half a radian a second."""
+        """Return whether an object is at rest: slower than 3 cm and half a radian per second."""
         at = self.scene.objects[name].v
         velocity = self.data.qvel[at : at + 6].tolist()
         return math.hypot(*velocity[:3]) < _AT_REST[0] and math.hypot(*velocity[3:]) < _AT_REST[1]
@@ -249,9 +249,9 @@ class World:
         return self.remember(("touched", name), lambda: self.gripper.touches(self.model, self.data, geom))
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:
-        """Return the ways from an object's centre to the nearest points of what stands around it, x and y, within 8 cm.
+        """Return the offsets, x and y, of the nearest points of an object's neighbours from its centre, within 8 cm.
 
-        Furniture and other objects count as boxes along x and y, from just under the object's centre to a hand over it.
+        Furniture and other objects count as boxes along x and y, if a hand over the object could hit them.
         """
         others = self._standing[name]
         if not len(others):
@@ -278,7 +278,7 @@ class World:
 
     @cached_property
     def reach(self) -> Reach:
-        """Map of the points that the hand, pointing down, gets to."""
+        """Map of the points that the downward hand reaches."""
         return reach_of(self.robot)
 
     @cached_property

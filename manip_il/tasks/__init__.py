@@ -1,4 +1,4 @@
-"""Tasks: a file each. Names in `table.py`'s order, for help that needs no simulator."""
+"""Tasks, one file each. `NAMES` has the order of `table.py`, for help without the simulator."""
 
 NAMES = (
     "reach",
@@ -14,4 +14,4 @@ NAMES = (
     "sort",
     "carry",
 )
-SEVERAL = ("carry:REWARD",)  # tasks of which there are several, by what stands behind the colon
+SEVERAL = ("carry:REWARD",)  # tasks with an argument after a colon

@@ -17,16 +17,16 @@ from manip_il.tasks.objects import WOOD, add_furniture, add_part
 
 F64 = NDArray[np.float64]
 
-WALL, THIN = 0.05, 0.003  # of a box: its height, half the thickness of walls and floor [m]
-DROP = 0.02  # of an object's bottom over a box's floor where it is let go [m]
-OVER_WALL = Lift(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)  # on the way there
-OVER = 0.11  # of the hand over an object on its way to it [m]
-_AT = (0.035, 0.05)  # of the hand from an object in a box that it is still at: sideways, above [m]
-_RISE = 0.10  # of the hand over an object that it has let go of [m]
+WALL, THIN = 0.05, 0.003  # height of a box, half the thickness of walls and floor [m]
+DROP = 0.02  # height of an object's bottom over a box's floor at release [m]
+OVER_WALL = Lift(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)  # over a box's wall
+OVER = 0.11  # height of the hand over an object on approach [m]
+_AT = (0.035, 0.05)  # the hand is still at an object in a box within this: sideways, above [m]
+_RISE = 0.10  # height of the hand over an object after release [m]
 
 
 def add_bin(spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour: tuple[float, ...] = WOOD) -> None:
-    """Add an open box, placed by a start: half its inner length and width [m]."""
+    """Add an open box that a start places. inside: half its inner length and width [m]."""
     box, high = add_furniture(spec, name), WALL / 2
     length, width = inside
     add_part(box, f"{name} floor", (length, width, THIN), (0, 0, THIN), colour)
@@ -45,10 +45,9 @@ def is_in(world: World, name: str, box: str, inside: tuple[float, float]) -> boo
 def drop_rungs(
     which: Which, to: Place, is_done: Callable[[World, str], bool], names: Sequence[str]
 ) -> tuple[Rung, ...]:
-    """Return the rungs that bring the held object over its place in a box and let it go there.
+    """Return the rungs that carry the held object over its place in a box and release it there.
 
-    which: the object that is held or next; to: where its centre is let go. is_done: whether an object is where it
-    belongs.
+    which: the object that is held or next; to: where its centre is released; is_done: whether an object is in place.
     """
 
     def nearest(world: World) -> str:
@@ -66,11 +65,11 @@ def drop_rungs(
 
 
 def drop_progress(world: World, name: str, to: F64) -> float:
-    """Return progress of carrying a held object to where it is let go, (3,) [m]: 0 to 1."""
+    """Return progress of carrying a held object to its release point, (3,) [m]: 0 to 1."""
     return carry_progress(world, name, to, OVER_WALL)
 
 
 def drop_place(world: World, name: str, box: str, offset: Sequence[float] = (0.0, 0.0)) -> F64:
-    """Return where an object's centre is let go over a box's floor, `offset` (2,) from its middle; (3,) [m]."""
+    """Return an object's release point over a box's floor, `offset` (2,) from its middle; (3,) [m]."""
     height = 2 * THIN + lie_of(world, name).tall / 2 + DROP
     return world.pose(box).position + [offset[0], offset[1], height]

@@ -1,4 +1,4 @@
-"""Clear the table: four objects into a box."""
+"""Clear the table: put four cubes into a box."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ F64 = NDArray[np.float64]
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW, "white": (0.92, 0.92, 0.90)}
 BOX = "box"
 INSIDE = (0.075, 0.075)  # half the box's inner length and width [m]
-HALF = 0.018  # of a cube's edge [m]
-SLOT = 0.032  # of where a cube is let go from the box's middle, along each side [m]
-SIDE = 0.225  # of the box's middle from the workspace's, left or right [m]
-APART = 0.08  # of the cubes at the start [m]
-ROOM = 0.03  # within reach around a cube at the start [m]
-FROM_BOX = 0.15  # of a cube from the box's middle at the start, sideways [m]
+HALF = 0.018  # half a cube's edge length [m]
+SLOT = 0.032  # offset of a cube's release point from the box's middle, along each side [m]
+SIDE = 0.225  # offset of the box's middle from the workspace's, left or right [m]
+APART = 0.08  # least distance between cubes at the start [m]
+ROOM = 0.03  # reachable margin around a cube at the start [m]
+FROM_BOX = 0.15  # least sideways distance of a cube from the box's middle at the start [m]
 
 
 def _left(world: World) -> tuple[str, ...]:
-    """Cubes that are not in the box; computed once a state."""
+    """Cubes that are not in the box; computed once per state."""
     return world.remember("left", lambda: tuple(name for name in COLOURS if not is_in(world, name, BOX, INSIDE)))
 
 
@@ -43,7 +43,7 @@ def _inside(world: World, name: str) -> bool:
 
 
 def current(world: World) -> str:
-    """Return the cube that is in the hand, else the first that is not in the box; the last where all are."""
+    """Return the cube that is in the hand, else the first that is not in the box; the last if all are."""
     return world.remember("current", lambda: _current(world))
 
 
@@ -56,7 +56,7 @@ def _current(world: World) -> str:
 
 
 def _to(world: World) -> F64:
-    """Place over its own quarter of the box where the current cube is let go, (3,) [m]."""
+    """Release point of the current cube over its own quarter of the box, (3,) [m]."""
     name = current(world)
     slot = list(COLOURS).index(name)
     return drop_place(world, name, BOX, (SLOT * (1 if slot % 2 else -1), SLOT * (1 if slot // 2 else -1)))
@@ -67,7 +67,7 @@ def _all_in(world: World) -> bool:
 
 
 def _rise(world: World) -> Target:
-    """Stand over the box."""
+    """Rise to a point over the box."""
     at = world.pose(BOX).position + [0.0, 0.0, 0.2]
     return Target(at, hand_down(world.ahead(at)), world.gripper.most)
 
@@ -100,7 +100,7 @@ class ClearTable:
         add_bin(spec, BOX, INSIDE, WOOD)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw on which side the box stands, and the cubes on the table, apart, at any yaw."""
+        """Draw the box's side, and the cubes on the table, apart and at any yaw."""
         x, y = world.scene.robot.workspace.centre
         box = np.array([x + rng.uniform(-0.03, 0.03), y + rng.choice([-1.0, 1.0]) * SIDE, 0.0])
 
@@ -112,7 +112,7 @@ class ClearTable:
         return Start({BOX: (box, UPRIGHT), **cubes})
 
     def observe(self, world: World) -> Observed:
-        """Return hand and box, the next cube and the way to its place, and where every cube is, in the box or not."""
+        """Return hand, box, the next cube, the vector to its place, and every cube's position and whether it is in."""
         name = current(world)
         return {
             **observe_hand(world),
@@ -128,12 +128,12 @@ class ClearTable:
         return world.pose(BOX).position
 
     def error(self, world: World) -> float:
-        """Return how far the cubes that are not in the box are from its middle, together [m]."""
+        """Return the summed distances of the cubes outside the box from its middle [m]."""
         at = world.pose(BOX).position
         return sum(math.dist(world.pose(name).position, at) for name in _left(world))
 
     def progress(self, world: World) -> float:
-        """Return progress by the cubes in the box, and of the next one."""
+        """Return progress by the number of cubes in the box and the state of the next one."""
         done = len(COLOURS) - len(_left(world))
         if done == len(COLOURS):
             return 1.0

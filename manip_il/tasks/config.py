@@ -1,4 +1,4 @@
-"""An environment by the names of its robot and task, checked and complete."""
+"""Settings of an environment by the names of robot and task, checked and completed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.tasks import NAMES, SEVERAL
 from manip_il.tasks.stock import table as stock
 
-LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
+LIMITS_HZ = 20  # control rate of the tasks' limits; at other rates these last equally long [Hz]
 ROBOT_HELP = (
     f"{', '.join(ROBOTS)}, the path of the YAML of an arm of your own, or {stock.ROBOT} or {stock.ALOHA}: "
     "gymnasium-robotics' own Fetch and gym_aloha's two arms, unmodified"
@@ -38,19 +38,19 @@ class EnvConfig(Episodes):
 
     @property
     def name(self) -> str:
-        """Robot and task as one word, those of a file by its name."""
+        """Robot and task as one word, files by their stems."""
         return scene_name(self.robot, self.task)
 
 
 def scene_name(robot: str, task: str) -> str:
-    """Return robot and task as one word, those of a file by its name, a task without its argument."""
+    """Return robot and task as one word, files by their stems, a task without its argument."""
     return f"{Path(robot).stem}_{Path(task).stem.partition(':')[0]}"
 
 
 def make_config(
     robot: str = EnvConfig.robot, task: str = EnvConfig.task, control_hz: int = 0, **settings: Any
 ) -> EnvConfig:
-    """Return the settings of an environment, with what is not given as its robot and task have it.
+    """Return the settings of an environment; what is not given comes from its robot and task.
 
     settings: the other fields of `EnvConfig`. Raises `UnknownName` for a robot or task, `UsageError` for a wrong value.
     """
@@ -58,8 +58,8 @@ def make_config(
 
 
 def complete(config: EnvConfig) -> EnvConfig:
-    """Return settings with what is 0 or empty as robot and task have it; raises what `make_config` raises."""
-    from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy
+    """Return settings with 0 and empty values filled in from robot and task; raises what `make_config` raises."""
+    from manip_il.mdp import LONGEST_EPISODE  # imported here: help needs no numpy
 
     config = _of_stock(config) if config.robot in stock.ROBOTS else _with_task(config)
     if not 1 <= config.control_hz <= MOST_HZ:
@@ -76,8 +76,8 @@ def complete(config: EnvConfig) -> EnvConfig:
 
 
 def _with_task(config: EnvConfig) -> EnvConfig:
-    """The object as short as can be, the default not at all; a task's argument as numbers; the robot's rate."""
-    from manip_il.robots.table import get_robot  # here, as help needs no robot and no simulator
+    """Canonicalise the object (the default becomes "") and the task's argument; fill in the robot's rate."""
+    from manip_il.robots.table import get_robot  # imported here: help needs no robot and no simulator
     from manip_il.sim.task import TakesArgument
     from manip_il.tasks.table import get_task
 
@@ -92,7 +92,7 @@ def _with_task(config: EnvConfig) -> EnvConfig:
 
 
 def _with_limits(config: EnvConfig) -> EnvConfig:
-    from manip_il.tasks.table import get_task  # here, as help needs no simulator
+    from manip_il.tasks.table import get_task  # imported here: help needs no simulator
 
     limits, rate = get_task(config.task, config.object).limits, config.control_hz / LIMITS_HZ
     return replace(
@@ -104,7 +104,7 @@ def _with_limits(config: EnvConfig) -> EnvConfig:
 
 
 def _of_stock(config: EnvConfig) -> EnvConfig:
-    """Return settings with those of the stock environments; `UsageError` where there are others, but for 0."""
+    """Return settings with those of the stock environments; raises `UsageError` for other nonzero values."""
     robot = stock.ROBOTS[config.robot]
     stock.get_stock(config.task, config.robot)
     if config.object:

@@ -34,29 +34,29 @@ F64 = NDArray[np.float64]
 
 CABINET, TRAY, BAR = "cabinet", "drawer", "handle"
 # The cabinet's frame lies on the table under the handle of the closed drawer, x into the cabinet.
-GAP = 0.056  # of the handle's middle from the drawer's front [m]
+GAP = 0.056  # distance of the handle's middle from the drawer's front [m]
 INSIDE = (0.05, 0.06)  # half the drawer's inner length and width [m]
-WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # of the drawer: height of walls, floor, front; half a wall [m]
-ROOF = 0.080  # of the cabinet, over the table, on the inside [m]
-MIDDLE = GAP + 2 * THIN + INSIDE[0]  # of the drawer's inside from its handle [m]
-BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # of the handle: height, half its thickness, half its length [m]
+WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # drawer: heights of walls, floor, front; half wall thickness [m]
+ROOF = 0.080  # inner height of the cabinet over the table [m]
+MIDDLE = GAP + 2 * THIN + INSIDE[0]  # distance of the drawer's inner middle from its handle [m]
+BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # handle: height, half its thickness, half its length [m]
 OPEN = 0.12  # how far the drawer is pulled [m]
-HAND_Z = BAR_Z - 0.005  # of the hand at the handle [m]
-HALF = 0.02  # of the cube's edge [m]
-OPEN_ENOUGH, SHUT = 0.09, 0.008  # how far the drawer is pulled for the object to go in, and is shut at most [m]
+HAND_Z = BAR_Z - 0.005  # height of the hand at the handle [m]
+HALF = 0.02  # half the cube's edge length [m]
+OPEN_ENOUGH, SHUT = 0.09, 0.008  # opening for the object to go in; largest that counts as shut [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
-SLACK = FINGERS / 2 - BAR_HALF  # of the hand along the pull before a finger meets the handle [m]
-AROUND = (0.024, 0.03, 0.018, 0.25)  # of the hand off the handle while it moves it: x, y, z [m], angle [rad]
-HOVER, SLOPE = 0.08, 2.0  # of the hand over the handle on its way there [m]; height gained per distance from it
-BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # of the object from the closed drawer's handle at the start [m]
-DROP = 0.018  # of the object over the drawer's floor where it is let go [m]
-OVER = 0.13  # of the hand over the object on its way to it [m]
+SLACK = FINGERS / 2 - BAR_HALF  # play of the hand along the pull before a finger meets the handle [m]
+AROUND = (0.024, 0.03, 0.018, 0.25)  # largest offset of the hand while it moves the handle: x, y, z [m], angle [rad]
+HOVER, SLOPE = 0.08, 2.0  # height of the hand over the handle on its way there [m]; height per distance from it
+BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # bounds on the object's offset from the closed handle at the start [m]
+DROP = 0.018  # height of the object over the drawer's floor at release [m]
+OVER = 0.13  # height of the hand over the object on approach [m]
 OVER_FRONT = Lift(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # on the way into the drawer
-OVER_TABLE = Lift(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # on the way to beside it
-MUCH_NEARER = 2.3  # how much nearer a hand must be to the other yaw at the handle to take that [rad]
-LEFT = (0.03, 0.06, 0.03)  # of the hand off the handle where it need not rise from it any more: x, y, z [m]
-# In the cabinet's frame: where an object is in the handle's way, x and y; where it lies before the handle of the shut
-# drawer, x; and where it is put aside [m].
+OVER_TABLE = Lift(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # on the way to a place beside it
+MUCH_NEARER = 2.3  # how much nearer the second yaw at the handle must be to be chosen [rad]
+LEFT = (0.03, 0.06, 0.03)  # offset from the handle beyond which the hand need not rise first: x, y, z [m]
+# In the cabinet's frame [m]: where an object is in the handle's way, x and y; x below which it lies in front of the
+# closed handle; and where it is put aside.
 WAY_X, WAY_Y, BEFORE, ASIDE = (-0.20, 0.07), 0.12, -0.06, (-0.04, 0.17)
 _STEP = 0.04  # how far ahead of the hand its target runs while it moves the drawer [m]
 
@@ -66,7 +66,7 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     cabinet = add_furniture(spec, CABINET)
     front = GAP + 2 * THIN  # where the drawer's inside begins
     length, width = INSIDE
-    deep, wide = length + 2 * THIN, width + 3 * THIN  # of the cabinet, half
+    deep, wide = length + 2 * THIN, width + 3 * THIN  # half the cabinet's depth and width
     back = front + 2 * deep
     for side, sign in (("left", 1), ("right", -1)):
         add_part(
@@ -103,7 +103,7 @@ def middle_of_drawer(world: World) -> F64:
 
 
 def hand_at_handle(world: World) -> F64:
-    """Return where the hand has the handle between its fingers, (3,) [m]."""
+    """Return the hand's position with the handle between its fingers, (3,) [m]."""
     return world.pose(TRAY).position + [0.0, 0.0, HAND_Z]
 
 
@@ -114,9 +114,9 @@ def is_inside(world: World) -> bool:
 
 
 def _yaw(world: World) -> float:
-    """Yaw of a hand whose fingers close along the drawer's way: the first of two, or one that is much nearer [rad].
+    """Yaw at which the fingers close along the drawer's motion [rad]: the first of two, or one that is much nearer.
 
-    Two that were chosen by nearness alone would be as near from most starts, and a learner would stand between them.
+    By distance alone the two would be equally near from most starts, and a learner would stop between them.
     """
     at, quarter = angle_ahead(world.ee.rotation), math.pi / 2
     return quarter if abs(quarter - at) < abs(-quarter - at) + MUCH_NEARER else -quarter
@@ -135,7 +135,7 @@ def _at_bar(world: World) -> bool:
 
 
 def _to_bar(world: World) -> Target:
-    """Over the handle and down around it; straight up if too low beside it."""
+    """Move over the handle and down around it; straight up if too low beside it."""
     ee, bar, yaw = world.ee, hand_at_handle(world), _yaw(world)
     off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(0.0, angle_from_down(ee.rotation, yaw) - 0.1)
     height = min(HOVER, SLOPE * max(0.0, off - 0.006))
@@ -145,7 +145,7 @@ def _to_bar(world: World) -> Target:
 
 
 def _move_drawer(world: World, to: float) -> Target:
-    """Move the drawer by its handle until it is open so far [m]."""
+    """Move the drawer by its handle until it is open by `to` [m]."""
     way = pulled(world) - to
     step = way + math.copysign(SLACK, way)
     return Target(hand_at_handle(world) + [step, 0.0, 0.0], hand_down(_yaw(world)), FINGERS, max_step=_STEP)
@@ -168,12 +168,12 @@ def _let_go(world: World) -> Target:
 
 
 def _place(world: World) -> F64:
-    """Place in the drawer where the object's centre is let go, (3,) [m]."""
+    """Release point of the object's centre in the drawer, (3,) [m]."""
     return middle_of_drawer(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP]
 
 
 def _leave(world: World) -> Target:
-    """Straight up from the handle; the fingers open as they rise over it."""
+    """Rise straight up from the handle, opening the fingers above it."""
     ee = world.ee.position
     over = min(1.0, max(0.0, (ee[2] - BAR_Z) / LEFT[2]))
     opening = FINGERS + over * (world.gripper.most - FINGERS)
@@ -188,19 +188,19 @@ def _is_around_bar(world: World) -> bool:
 def _is_in_way(world: World, farthest: float = WAY_X[1]) -> bool:
     """Whether the object lies where the handle passes over it, so that the hand cannot grasp it there.
 
-    farthest: of the object along the cabinet's x [m].
+    farthest: upper bound along the cabinet's x [m].
     """
     x, y = (world.pose(OBJECT).position - world.pose(CABINET).position)[:2].tolist()
     return WAY_X[0] < x < farthest and abs(y) < WAY_Y
 
 
 def _must_shut(world: World) -> bool:
-    """Whether the object lies in the way of a drawer that is out, and before the handle of one that is shut."""
+    """Whether to shut the drawer first: the object lies in its way, in front of the closed handle."""
     return _is_in_way(world, BEFORE) and not _is_shut(world)
 
 
 def _must_open(world: World) -> bool:
-    """Whether the drawer is to be opened: always, unless the object lies before it and must be moved first."""
+    """Whether to open the drawer: it is not open, and no object in front of it must be moved first."""
     return not _is_open(world) and not _is_in_way(world, BEFORE)
 
 
@@ -210,7 +210,7 @@ def _is_set_down(world: World) -> bool:
 
 
 def _put_aside(world: World) -> Target:
-    """Carry the object to the table beside the drawer, on the side where there is more of it."""
+    """Carry the object to the table beside the drawer, on the side with more table."""
     cabinet = world.pose(CABINET).position
     side = math.copysign(ASIDE[1], world.scene.robot.workspace.centre[1] - cabinet[1])
     to = np.array([cabinet[0] + ASIDE[0], cabinet[1] + side, lie_of(world, OBJECT).tall / 2])
@@ -264,7 +264,7 @@ class Drawer:
         return Start({OBJECT: (at, draw_yaw(rng)), CABINET: (cabinet, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, cube and handle, how far the drawer is open, and the ways between them."""
+        """Return hand, cube and handle, how far the drawer is open, and the vectors between them."""
         ee, bar, cube = world.ee.position, hand_at_handle(world), world.pose(OBJECT).position
         return {
             **observe_hand(world),
@@ -280,7 +280,7 @@ class Drawer:
         return middle_of_drawer(world)
 
     def error(self, world: World) -> float:
-        """Return how far the drawer is open [m], and as much more as the object is from its inside."""
+        """Return how far the drawer is open [m], plus the object's distance if it is not inside."""
         missing = 0.0 if is_inside(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))
         return max(0.0, pulled(world)) + missing
 

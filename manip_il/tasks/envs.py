@@ -17,9 +17,9 @@ from manip_il.tasks.table import get_task
 
 
 def scene_of(robot: str, task: str, shape: str = "", step: float = DT_SIM) -> Scene:
-    """Return the compiled scene of a robot and a task by their names, or those of their files.
+    """Return the compiled scene of a robot and a task, given by name or file.
 
-    shape: of its object, as `EnvConfig.object`. step: of physics [s]. Raises `UnknownName`, `UsageError`.
+    shape: the object's, as in `EnvConfig.object`. step: physics time step [s]. Raises `UnknownName`, `UsageError`.
     """
     return build_scene(get_robot(robot), get_task(task, shape), step)
 
@@ -30,7 +30,7 @@ def config_scene(config: EnvConfig) -> Scene:
 
 
 def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> ManipEnv:
-    """Make an environment of configurations."""
+    """Return the environment that configurations describe."""
     return ManipEnv(*_parts(config), config, cameras=cameras, conditions=conditions)
 
 
@@ -48,7 +48,7 @@ def make_env(
     """Return the environment of a robot, by its name or its YAML's path, and a task, by its name or its file's path.
 
     cameras: names; image_size: height and width of their pictures [pixels]. settings: fields of `EnvConfig`; the rest
-    as of `ManipEnv`. Raises what `make_config`, `CameraConfig` and `ManipEnv` raise.
+    is as in `ManipEnv`. Raises what `make_config`, `CameraConfig` and `ManipEnv` raise.
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None

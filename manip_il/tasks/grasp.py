@@ -1,4 +1,4 @@
-"""Grasps of an object as it lies, by a hand that points down, from the symmetry of its shape."""
+"""Grasps of an object as it lies, by a downward hand, from the symmetry of its shape."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]
 
-HOVER = 0.055  # of the hand over the object's top while it is not above it [m]
-FUNNEL_RADIUS = 0.010  # misalignment at which the hand may be all the way down [m]
-FUNNEL_SLOPE = 2.0  # height the hand gains per misalignment beyond it
-ANGLE_AS_LENGTH = 0.05  # how much misalignment a radian of wrong orientation counts for [m/rad]
+HOVER = 0.055  # clearance above the object's top before the hand is over it [m]
+FUNNEL_RADIUS = 0.010  # misalignment up to which the hand may be all the way down [m]
+FUNNEL_SLOPE = 2.0  # height of the hand per misalignment beyond that
+ANGLE_AS_LENGTH = 0.05  # misalignment that a radian of orientation error counts as [m/rad]
 ANGLE_FREE = 0.1  # orientation error that counts for nothing [rad]
-TIGHT = 0.35  # share of the room beside an object that fills the hand which misalignment may take
-OPEN_SLACK = 0.016  # opening beyond the object's width at which the hand may descend, where there is so much [m]
-OPEN_SHARE = 0.6  # of what the gripper opens beyond the object's width
-PREFER_ZERO = 0.3  # weight of a grasp's own yaw against its distance from the hand's
-WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a metre narrower [rad/m]
-FUNNEL_STEEP = 4.0  # the same where something stands around the object
-FINGER = (0.014, 0.010, 0.016)  # of a finger: its thickness, half its width, and where a neighbour is beside it [m]
-SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any [m]
-BESIDE_JAW, NEARER = 0.008, 0.002  # of an object from a jaw that stands as the hand comes down; less is as good [m]
-BY_JAW = 0.004  # the same as `FUNNEL_RADIUS`, of a hand of which one jaw alone moves [m]
-NARROW = 0.024  # opening beyond the object's width where a neighbour is in the way of a hand that is wide open [m]
-CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
-MAX_TILT = 0.3  # of the object off a face: wait over it until it rests [rad]
-CLOSING = (0.022, 0.015, 0.022)  # object's centre in the ee frame, x y z, once the fingers have begun to close [m]
-LEAN = 0.5  # of a hand that reaches as far as it can [rad]
+TIGHT = 0.35  # share of the open hand's clearance that misalignment may take up
+OPEN_SLACK = 0.016  # opening beyond the object's width at which the hand may descend, if it opens so far [m]
+OPEN_SHARE = 0.6  # the same as a share of the gripper's opening beyond the object's width, if less
+PREFER_ZERO = 0.3  # weight of a grasp's yaw against its distance from the hand's
+WIDTH_AS_ANGLE = 20.0  # extra turn accepted for a grasp that is a metre narrower [rad/m]
+FUNNEL_STEEP = 4.0  # `FUNNEL_SLOPE` if the object has neighbours
+FINGER = (0.014, 0.010, 0.016)  # a finger's thickness, half width, and distance at which a neighbour is clear [m]
+SHORT = 0.02  # lack of room for a finger at which a grasp counts as fully crowded [m]
+BESIDE_JAW, NEARER = 0.008, 0.002  # gap to the fixed jaw as the hand comes down; how much less will do [m]
+BY_JAW = 0.004  # `FUNNEL_RADIUS` of a hand with one moving jaw [m]
+NARROW = 0.024  # opening beyond the object's width if a neighbour is in the way of the fully open hand [m]
+CROWDED = 3.0  # extra turn accepted for a grasp whose fingers have room [rad]
+MAX_TILT = 0.3  # tilt of the object off a face above which the hand waits over it [rad]
+CLOSING = (0.022, 0.015, 0.022)  # bounds on the object's centre in the ee frame, x y z, once the fingers close [m]
+LEAN = 0.5  # lean of a hand at full stretch [rad]
 _MIDDLE = (0.0, 0.0, 0.0)
 _QUARTER = math.pi / 2
 _HALF_TURNS = (0.0, -math.pi, math.pi)
@@ -48,11 +48,11 @@ Way = tuple[float, float, float]
 class Lie(NamedTuple):
     """Ways to grasp an object as it lies.
 
-    grasps: yaw of a hand that points down [rad], the object's width between its fingers and length across them [m], and
-    the way from its centre to the middle between them, (3,) [m], for each way it can be grasped. tall: its height [m].
-    tilt: off the nearest way in which it rests [rad]. folds: how many of its yaws look alike, 0 for all. level: of the
-    grasps those whose fingers meet upright sides. above: its top over that middle, half its height unless said [m].
-    fits: the gripper goes around it, as far as that was looked at.
+    grasps: for each, the yaw of a downward hand [rad], the object's width between the fingers and length across them
+    [m], and the vector from its centre to the middle between them, (3,) [m]. tall: its height [m]. tilt: angle to its
+    nearest resting pose [rad]. folds: number of its yaws that look alike, 0 if all do. level: the grasps whose fingers
+    meet upright sides. above: height of its top over the middle between the fingers, by default half `tall` [m].
+    fits: whether the gripper goes around it, if that was checked.
     """
 
     grasps: tuple[tuple[float, float, float, Way], ...]
@@ -70,16 +70,15 @@ class Lie(NamedTuple):
 
 
 class Grasp(NamedTuple):
-    """An object as the hand sees it.
+    """An object relative to the hand.
 
-    offset: its centre in the `ee` frame, off the middle between pads that hold it [m]. width, length, half: of it
-    between the fingers, across them, and half its height [m]. settled: it rests on a face, or leans on something and
-    does not move, or the fingers are around it. yaw: of a hand that points down to grasp it; angle: how far the hand
-    is from that [rad].
-    at: where `ee` grasps it [m]. wide: how far the fingers open on the way to it [m]. open_enough: they pass on both
-    sides of it. off: how far the hand is from being over it, with its angle [m]. funnel: how high over the object it
-    must be for that [m]; height: the same, but no higher than to clear its top. lean: how much the hand leans to get to
-    it, 0 to 1.
+    offset: its centre in the `ee` frame, from the middle between pads that hold it [m]. width, length, half: its size
+    between the fingers and across them, and half its height [m]. settled: it rests on a face, leans on something
+    without moving, or is between the fingers. yaw: the downward hand's yaw to grasp it; angle: the hand's angle to
+    that pose [rad].
+    at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough: they pass on both
+    sides of it. off: misalignment of the hand, angle included [m]. funnel: height over the object that this requires
+    [m]; height: the same, but no more than clears its top [m]. lean: how much the hand leans to reach it, 0 to 1.
     """
 
     offset: tuple[float, float, float]
@@ -99,7 +98,7 @@ class Grasp(NamedTuple):
 
 
 def grasp_of(world: World, name: str) -> Grasp:
-    """Return the pose of an object relative to the hand; computed once a state."""
+    """Return the pose of an object relative to the hand; computed once per state."""
     return world.remember(("grasp", name), partial(_grasp, world, name))
 
 
@@ -109,7 +108,7 @@ def is_cube(world: World, name: str) -> bool:
 
 
 def lie_of(world: World, name: str) -> Lie:
-    """Return how an object lies; computed once a state."""
+    """Return how an object lies; computed once per state."""
     return world.remember(("lie", name), partial(_lie_in, world, name))
 
 
@@ -130,9 +129,9 @@ def _grasp(world: World, name: str) -> Grasp:
     angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
     ee_x, ee_y, ee_z = ee.position.tolist()
     dx, dy, dz = x - ee_x, y - ee_y, z - ee_z
-    aside = world.gripper.middle(width + 2 * BESIDE_JAW)  # of the object before a hand of which one jaw alone moves [m]
+    aside = world.gripper.middle(width + 2 * BESIDE_JAW)  # offset of the object for one moving jaw [m]
     at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
-    room = max(0.0, world.gripper.most - width)  # what the open gripper leaves beside it [m]
+    room = max(0.0, world.gripper.most - width)  # clearance of the open gripper [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
     way = at_x - ee_x, at_y - ee_y
     half = lie.tall / 2 if lie.above is None else lie.above
@@ -163,9 +162,9 @@ def _grasp(world: World, name: str) -> Grasp:
 
 
 def _beside_jaw(x: float, y: float, yaw: float, around: bool) -> tuple[float, float]:
-    """A way to an object, across and along the motion of a hand's one jaw, that need not be gone to the end [m].
+    """Distances left to an object, across and along the motion of the one moving jaw, less what is tolerated [m].
 
-    around: the jaws are on both sides of it, so that it may be at the one that stands.
+    around: the jaws are on both sides of it, so that it may touch the fixed one.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     across, along = c * x + s * y, s * x - c * y
@@ -176,11 +175,11 @@ def _beside_jaw(x: float, y: float, yaw: float, around: bool) -> tuple[float, fl
 def _nearest(
     lie: Lie, world: World, position: F64, widest: float, neighbours: Sequence[tuple[float, float]]
 ) -> tuple[float, float, float, Way]:
-    """The grasp whose yaw is nearest to the hand's, with a small preference for none and for a narrow one.
+    """The grasp whose yaw is nearest to the hand's, with a small preference for zero yaw and narrow grasps.
 
-    Nearest to the hand, not to none: a learner that averages both sides of the boundary between two grasps then leaves
-    it by any turn, and does not stand still in the middle. position: of the object (3,) [m]. widest: what the fingers
-    go around [m]. neighbours: ways to what stands around the object; a grasp between whose fingers they are comes last.
+    Nearest to the hand, not to zero: a learner that averages both sides of the boundary between two grasps then leaves
+    it with any turn, and does not stop in the middle. position: the object's (3,) [m]. widest: width that the fingers
+    go around [m]. neighbours: offsets of what stands around the object; grasps that they obstruct come last.
     """
     grasps, at, ahead = lie.grasps[lie.level], world.hand_yaw, world.ahead(position)
     if world.robot.faces_ahead:
@@ -212,13 +211,13 @@ def _nearest(
 
 
 def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
-    """Return how much the open fingers of a grasp would meet a neighbour of the object, 0 to 1."""
+    """Return how much the open fingers of a grasp would hit a neighbour of the object, 0 to 1."""
     if not neighbours:
         return 0.0
     thick, half, clear = FINGER
     c, s, worst = math.cos(yaw), math.sin(yaw), 0.0
     for x, y in neighbours:
-        along, across = abs(s * x - c * y), abs(c * x + s * y)  # of the fingers' motion
+        along, across = abs(s * x - c * y), abs(c * x + s * y)  # relative to the fingers' motion
         lack = min(1.0, max(0.0, (widest / 2 + thick - along) / SHORT))
         worst = max(worst, lack * min(1.0, max(0.0, (clear - across) / (clear - half))))
     return worst
@@ -240,7 +239,7 @@ def _lie(kind: int, rotation: F64, extents: Sequence[float]) -> Lie:
 
 
 def _hull_lie(hull: Hull, rotation: F64) -> Lie:
-    """A mesh lies on the nearest side of its hull on which it can rest."""
+    """The lie of a mesh, on the nearest side of its hull on which it can rest."""
     cosines = hull.downs.dot(-rotation[2])
     nearest = int(cosines.argmax())
     rest, tilt = hull.rest(nearest), math.acos(min(1.0, float(cosines[nearest])))
@@ -257,7 +256,7 @@ def _hull_lie(hull: Hull, rotation: F64) -> Lie:
 
 
 def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
-    """A box lies on one of its faces, and its yaw is that of the side most along x or y, modulo a quarter turn."""
+    """The lie of a box on its nearest face; its yaw is that of the side nearest to x or y, modulo a quarter turn."""
     ahead, left, vertical = rotation.tolist()
     heights = [abs(height) for height in vertical]
     up = heights.index(max(heights))
@@ -280,7 +279,7 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
 
 
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
-    """Return an angle from a hand that points down [rad] without what a hand (3, 3) may lean."""
+    """Return a hand's angle from pointing down [rad], less what the hand (3, 3) may lean."""
     if not lean:
         return angle
     tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))

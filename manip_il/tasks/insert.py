@@ -23,17 +23,17 @@ from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw
 
 F64 = NDArray[np.float64]
 
-SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # of the peg [m], [m], [kg]
-DEPTH, WALL = 0.03, 0.018  # of the hole, and thickness of the walls around it [m]
-CHAMFER, SLIPPERY = 0.005, 0.05  # of the walls' upper inner edges, as high as wide [m], and its friction
-GUIDED = 0.003  # error of a peg that the chamfer guides into the hole [m]
-AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
-EXACT = 0.02  # error under which the hand is placed exactly [m]
-IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
-SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 4.0  # yaw of a hand that is tilted so far, in [rad]; weight beyond it
-NOT_NEARER = 0.10  # of the hole than the workspace's middle, along x: a tilted hand gets there [m]
-APART = 0.14  # of the peg from the hole at the start [m]
-NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
+SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # peg [m], [m], [kg]
+DEPTH, WALL = 0.03, 0.018  # depth of the hole, and thickness of the walls around it [m]
+CHAMFER, SLIPPERY = 0.005, 0.05  # chamfer of the walls' inner edges, as high as wide [m], and its friction
+GUIDED = 0.003  # peg error up to which the chamfer guides it into the hole [m]
+AT_RIM, GENTLE = 0.005, 0.003  # distance from the rim's height at which the peg goes down by at most `GENTLE` [m]
+EXACT = 0.02  # error below which the hand is placed exactly [m]
+IN = 0.003  # distance from the hole's floor at which the peg is inserted [m]
+SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 4.0  # yaw range of a hand tilted by `TILTED` [rad]; weight outside it
+NOT_NEARER = 0.10  # how much nearer than the workspace's middle the hole may be, for a tilted hand's reach [m]
+APART = 0.14  # least distance of peg and hole at the start [m]
+NOT_FARTHER = 0.05  # how far beyond the workspace's middle a lying peg may start [m]
 _QUARTER = math.pi / 2
 
 
@@ -43,12 +43,12 @@ def is_in(world: World) -> bool:
 
 
 def to_hole(world: World) -> Way:
-    """Return what is left to do for a peg that hangs from the hand; computed once a state."""
+    """Return the remaining motion of a peg that hangs from the hand; computed once per state."""
     return world.remember("to hole", lambda: _to_hole(world))
 
 
 def _to_hole(world: World) -> Way:
-    """Turn the peg with the hand, as it lies in it, to one of the four ways in which it fits the hole."""
+    """Choose the easiest of the four hand rotations at which the held peg fits the hole."""
     peg, hole, hand = world.pose(PEG), world.pose(HOLE), world.ee.rotation
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
@@ -58,7 +58,7 @@ def _to_hole(world: World) -> Way:
 
 
 def _strain(hand: F64) -> float:
-    """Objection to a hand's yaw, in radians of turning: a tilted hand is to point neither ahead nor backwards."""
+    """Cost of a hand's yaw, in radians of turning: a tilted hand should point neither ahead nor backwards."""
     tilt, yaw = math.acos(min(1.0, max(-1.0, -hand.item(2, 2)))), abs(azimuth(hand))
     tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
     return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
@@ -75,7 +75,7 @@ def _is_entered(world: World) -> bool:
 
 
 def _lift(world: World) -> float:
-    """Height over the hole's floor that the peg's lower end is to have [m]."""
+    """Target height of the peg's lower end over the hole's floor [m]."""
     error = to_hole(world).error - GUIDED
     if _is_entered(world) or error <= 0:
         return 0.0
@@ -83,7 +83,7 @@ def _lift(world: World) -> float:
 
 
 def _bring(world: World) -> Target:
-    """Up, over the hole, the nearer the lower, and slowly down into it."""
+    """Lift the peg over the hole, lower it on the way, and slowly insert it."""
     way = to_hole(world)
     missing = _lift(world) - way.low
     if abs(way.low - DEPTH) < AT_RIM:
@@ -108,7 +108,7 @@ _RUNGS = (
 
 @dataclass(frozen=True)
 class Insert:
-    """Put a peg into the hole that it fits. play: how much wider the hole is than the peg [m]."""
+    """Put a peg into a hole that it fits. play: how much wider the hole is than the peg [m]."""
 
     name: str = "insert"
     instruction: str = "Put the peg into the hole."
@@ -128,7 +128,7 @@ class Insert:
             _add_wall(hole, f"hole {side}", quarter * _QUARTER, inner)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw where the hole is and its yaw, and the peg apart from it, half of the time lying, at any yaw."""
+        """Draw the hole's place and yaw, and the peg away from it, lying half of the time, at any yaw."""
         centre = world.scene.robot.workspace.centre
         side, _, length = world.extents(PEG)
 
@@ -151,7 +151,7 @@ class Insert:
         return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, peg and hole, the ways between them, and how the hand is to turn for the peg to fit."""
+        """Return hand, peg, hole, the vectors between them, and the turn of the hand that makes the peg fit."""
         peg, hole, lie = world.pose(PEG).position, world.pose(HOLE), lie_of(world, PEG)
         yaw = math.atan2(hole.rotation[1, 0], hole.rotation[0, 0])
         way = to_hole(world)
@@ -178,7 +178,7 @@ class Insert:
         return math.dist(lower_end(world), world.pose(HOLE).position)
 
     def progress(self, world: World) -> float:
-        """Return progress of grasping, carrying and inserting, by the way that is left."""
+        """Return progress of grasping, carrying and inserting, by the distance left."""
         if is_in(world):
             return 1.0
         if not hangs(world):
@@ -192,7 +192,7 @@ class Insert:
 
 
 def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
-    """Add one wall with a chamfered edge, in the direction of a yaw [rad] from the hole's middle; inner: there [m]."""
+    """Add a chamfered wall at a yaw [rad] from the hole's middle; inner: distance of its inner face [m]."""
     height, steep = DEPTH - CHAMFER, math.pi / 4
     c, s = math.cos(yaw), math.sin(yaw)
     out, thick = inner + WALL / 2, CHAMFER / 2

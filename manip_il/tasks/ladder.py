@@ -2,7 +2,7 @@
 
 Within a rung targets are continuous in the state, and the approach is one funnel rather than waypoints: the nearer the
 hand is to being over the object, the lower it may go. Neighbouring states then have neighbouring labels, which a
-learner can fit. Whether an object is held is read off the fingers that touch it; nothing is stored.
+learner can fit. The fingers' contacts show whether an object is held; nothing is stored.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from manip_il.sim.world import World
 from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside, lie_of
 
 F64 = NDArray[np.float64]
-Which = Callable[[World], str]  # the object that it is about now
-Place = Callable[[World], F64]  # where its centre is to go, (3,) [m]
+Which = Callable[[World], str]  # the current object
+Place = Callable[[World], F64]  # target of its centre, (3,) [m]
 
-CLEAR = 0.03  # of the hand over the object's top: the fingertips are above it [m]
-RISE_FIRST = 0.03  # this far under its way, a hand only rises [m]
-AT_GRASP = (0.015, 0.015, 0.015)  # object's centre in the ee frame, x y z: start to close [m]
+CLEAR = 0.03  # clearance of the hand over the object's top at which the fingertips are above it [m]
+RISE_FIRST = 0.03  # a hand this far below its path only rises [m]
+AT_GRASP = (0.015, 0.015, 0.015)  # bounds on the object's centre in the ee frame, x y z, to start closing [m]
 AT_GRASP_ANGLE = 0.3  # [rad]
-EMPTY = 0.4  # of a mesh's width: fingers so near to each other have nothing between them
-LEAST_DEEP, DEEP_SHARE = 0.004, 0.15  # of the hand over where it grasps a mesh [m], and in heights of that
-IN_HAND = (0.009, 0.020, 0.011)  # object's centre in the ee frame, in x and z beyond half its size: in the hand [m]
-RELEASE = 0.03  # how far the fingers open about an object to let it go, beyond its width, where there is so much [m]
+EMPTY = 0.4  # share of a mesh's width below which the fingers have nothing between them
+LEAST_DEEP, DEEP_SHARE = 0.004, 0.15  # tolerated height over a mesh's grasp [m], and as a share of its height
+IN_HAND = (0.009, 0.020, 0.011)  # bounds on a held object's centre in the ee frame, x and z beyond half its size [m]
+RELEASE = 0.03  # opening beyond an object's width that releases it, if the hand opens so far [m]
 FREED = 0.4  # share of that at which it is free
 AT_GOAL = 0.01  # [m]
 CLOSED = 0.0  # commanded opening of a hand that grips [m]
-_HALFWAY = 0.2  # way still to go at which half of a part's progress is made [m]
+_HALFWAY = 0.2  # distance left at which half of a part's progress is made [m]
 _GRASPED = 0.5  # progress of an object that is held
 
 
@@ -42,7 +42,7 @@ class Lift(NamedTuple):
     """Height of a carried object over its goal, by the horizontal distance still to go [m].
 
     most: height far from the goal [m]. slope: height per distance beyond `free`. free: distance without height [m].
-    rise_first: this far under its height, it only rises [m]. max_step: how far ahead of the hand its target runs [m].
+    rise_first: this far below its height, it only rises [m]. max_step: how far the target runs ahead of the hand [m].
     """
 
     most: float = 0.05
@@ -56,7 +56,7 @@ class Lift(NamedTuple):
         return min(self.most, self.slope * max(0.0, distance - self.free))
 
 
-CARRY = Lift()  # to a goal that nothing stands around
+CARRY = Lift()  # to a goal with nothing around it
 
 
 def held(world: World, name: str) -> bool:
@@ -64,15 +64,15 @@ def held(world: World, name: str) -> bool:
     x, y, z = IN_HAND
     half = max(world.extents(name)) / 2
     if math.dist(world.pose(name).position.tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
-        return False  # without the work of how it could be grasped
-    if world.hull(name) is not None:  # however it has turned in the hand
+        return False  # saves computing its grasps
+    if world.hull(name) is not None:  # whatever its rotation in the hand
         return _is_between(world, name, half) and world.touched(name)
     g = grasp_of(world, name)
     return is_inside(g.offset, (g.length / 2 + x, y, g.half + z)) and world.touched(name)
 
 
 def _is_between(world: World, name: str, half: float) -> bool:
-    """Whether the centre of a mesh as long as 2 `half` [m] is between the fingers."""
+    """Whether the centre of a mesh of length 2 `half` [m] is between the fingers."""
     (x, y, z), ee = IN_HAND, world.ee
     across, along, ahead = (world.pose(name).position - ee.position).dot(ee.rotation).tolist()
     return is_inside((across, along - world.gripper.middle(world.opening), ahead), (half + x, y, half + z))
@@ -83,7 +83,7 @@ def at_grasp(world: World, name: str) -> bool:
     g = grasp_of(world, name)
     box = AT_GRASP if g.open_enough else CLOSING
     if world.hull(name) is not None:
-        # Its sides may be round: higher up they let the fingers slip off.
+        # Its sides may be round, and the fingers would slip off higher up.
         deep = max(LEAST_DEEP, DEEP_SHARE * lie_of(world, name).tall)
         over = float(world.ee.position[2]) - g.at[2]
         if world.opening < EMPTY * g.width or over > (deep if g.open_enough else 2 * deep):
@@ -92,7 +92,7 @@ def at_grasp(world: World, name: str) -> bool:
 
 
 def rise_first(at: F64, to: Sequence[float]) -> F64:
-    """Return where something at a point (3,) goes on its way to another, (3,) [m]: straight up if it is far too low."""
+    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if it is far too low."""
     (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
     sideways = min(1.0, max(0.0, 1.0 - (to_z - z) / RISE_FIRST))
     return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
@@ -101,8 +101,8 @@ def rise_first(at: F64, to: Sequence[float]) -> F64:
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
     """Approach from above: over the object and down around it, fingers open; straight up if too low beside it.
 
-    hover: least height over the object on the way there, where that is more than it takes to clear its top; rise: least
-    height over the grasp [m].
+    hover: least height over the object on the way there, if that is more than clears its top [m]; rise: least height
+    over the grasp [m].
     """
     g = grasp_of(world, name)
     x, y, z = g.at
@@ -115,7 +115,7 @@ def close_on(world: World, name: str) -> Target:
     """Close the fingers at the object's position."""
     g = grasp_of(world, name)
     at = np.array(g.at)
-    if world.gripper.lopsided:  # the jaw that moves brings the object to the other; the hand does not follow
+    if world.gripper.lopsided:  # the moving jaw pushes the object to the fixed one; the hand does not follow
         across = np.array([math.sin(g.yaw), -math.cos(g.yaw), 0.0])
         at += across * float(across @ (world.ee.position - at))
     return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
@@ -133,20 +133,20 @@ def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:
 
 
 def let_go(world: World, name: str, height: float) -> Target:
-    """Open the fingers about an object, no wider than frees it; then straight up to a height over its centre [m]."""
+    """Open the fingers just enough to free an object, then rise straight to a height over its centre [m]."""
     g, ee = grasp_of(world, name), world.ee
     beyond = min(RELEASE, world.gripper.most - g.width)
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
     up = world.pose(name).position[2] + height if free else ee.position[2]
     at = np.array([*ee.position[:2], up])
-    if world.gripper.lopsided:  # the jaw that stands goes off the object, as the other one does
+    if world.gripper.lopsided:  # the fixed jaw leaves the object, as the moving one does
         along = g.offset[1] + world.gripper.middle(g.width) - world.gripper.middle(g.width + beyond)
         at[:2] += along * ee.rotation[:2, 1]
     return Target(at, hand_down(world.hand_yaw), g.width + beyond)
 
 
 def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
-    """Return whether the hand is at an object, so far aside of it and above it at most [m]."""
+    """Return whether the hand is at an object, at most `aside` beside it and `above` over it [m]."""
     x, y, z = (world.ee.position - world.pose(name).position).tolist()
     return math.hypot(x, y) < aside and z < above
 
@@ -186,7 +186,7 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
 
 
 def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> float:
-    """Return progress of getting the fingers around an object, 0 to 1, by the way left; hover, rise: see `approach`."""
+    """Return progress of getting the fingers around an object, 0 to 1, by distance; hover, rise: see `approach`."""
     g = grasp_of(world, name)
     above = float(world.ee.position[2]) - g.at[2]
     height = max(g.height, min(hover, g.funnel), rise)
@@ -194,16 +194,16 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
 
 
 def pick_progress(world: World, name: str) -> float:
-    """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the way left on that path."""
+    """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the distance left on that path."""
     if held(world, name):
         return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
     return 0.9 * _GRASPED * grasp_progress(world, name)
 
 
 def carry_progress(world: World, name: str, to: F64, lift: Lift = CARRY) -> float:
-    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the way left on `carry`'s path.
+    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the distance left on `carry`'s path.
 
-    That is up to its height, sideways, and down.
+    That path goes up, sideways, and down.
     """
     x, y, z = (to - world.pose(name).position).tolist()
     off = math.hypot(x, y)
@@ -212,5 +212,5 @@ def carry_progress(world: World, name: str, to: F64, lift: Lift = CARRY) -> floa
 
 
 def nearness(rest: float) -> float:
-    """Return 1 within `AT_GOAL` [m], and less the longer the way still to go is."""
+    """Return 1 within `AT_GOAL` [m], and less the more distance is left."""
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))

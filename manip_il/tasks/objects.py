@@ -1,4 +1,4 @@
-"""Free objects, furniture and markers of goals, which tasks put on the table."""
+"""Free objects, furniture and goal markers that tasks put on the table."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from manip_il.sim.world import GOAL
 F64 = NDArray[np.float64]
 CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
-MOST_HULL = 500  # points of a mesh's hull that touch: finer ones compile for seconds
-FRICTION = 1.0  # sliding, against anything
+MOST_HULL = 500  # vertices of a mesh's collision hull: finer ones take seconds to compile
+FRICTION = 1.0  # sliding friction against anything
 RED = (0.86, 0.24, 0.16)
 BLUE = (0.16, 0.40, 0.80)
 YELLOW = (0.93, 0.72, 0.16)
@@ -31,7 +31,7 @@ SHAPES = {**GEOMS, ANY: GEOMS["box"], MESH: mujoco.mjtGeom.mjGEOM_MESH}
 def add_cube(
     spec: mujoco.MjSpec, name: str, half: float = CUBE_HALF, mass: float = CUBE_MASS, colour: tuple[float, ...] = RED
 ) -> None:
-    """Add a cube that lies free: half its edge [m], its mass [kg], its red, green and blue."""
+    """Add a free cube. half: half its edge [m]; mass [kg]; colour: red, green and blue."""
     add_object(spec, name, "box", [half] * 3, mass, colour)
 
 
@@ -44,9 +44,9 @@ def add_object(
     colour: tuple[float, ...],
     mesh: Mesh | None = None,
 ) -> None:
-    """Add an object that lies free. shape: of `SHAPES`; size: MuJoCo's for it [m]; mass [kg]; red, green and blue.
+    """Add a free object. shape: key of `SHAPES`; size: MuJoCo's `geom_size` [m]; mass [kg]; colour: red, green, blue.
 
-    mesh: in place of a size.
+    mesh: used in place of the size.
     """
     material = spec.add_material(name=name, rgba=[*colour, 1], specular=0.3, shininess=0.5)
     body = spec.worldbody.add_body(name=name, pos=[0.5, 0, max(size)])
@@ -68,12 +68,12 @@ def add_object(
 
 
 def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
-    """Add a mocap body that parts with contacts can be put on; a scene's start places it. Returns the body."""
+    """Add a mocap body for solid parts, which a start places. Returns the body."""
     return spec.worldbody.add_body(name=name, mocap=True, pos=[0.5, 0, 0])
 
 
 def add_part(body: Any, name: str, half: Sequence[float], at: Sequence[float], colour: tuple[float, ...]) -> None:
-    """Add a box that things touch to a body: half its lengths [m], its middle in the body's frame [m]."""
+    """Add a solid box to a body. half: half its lengths [m]; at: its middle in the body's frame [m]."""
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -86,7 +86,7 @@ def add_part(body: Any, name: str, half: Sequence[float], at: Sequence[float], c
 
 
 def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
-    """Add a marker without contacts; a mocap body, so that lockstep environments can share one model.
+    """Add a goal marker without contacts: a mocap body, so that lockstep environments can share one model.
 
     flat: a disc on the table, not a ball in the air.
     """

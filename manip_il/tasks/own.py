@@ -1,6 +1,6 @@
-"""Tasks that do not ship: a Python file of one's own, or a name that an installed package brings.
+"""Tasks that do not ship: a user's Python file, or a name that an installed package provides.
 
-A file runs when somebody names its path, and never because a dataset, a checkpoint or a result names its task.
+A file runs only if the user gives its path, never because a dataset, a checkpoint or a result names its task.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.sim.task import Task
 
 SUFFIX = ".py"
-GROUP = "manip_il.tasks"  # of entry points: a name, and a class that is a task
+GROUP = "manip_il.tasks"  # entry points: a name, and a class that is a task
 _FACTS = ("name", "instruction", "limits", "objects", "grasped", "sizes", "rungs")
 _FUNCTIONS = ("build", "draw", "observe", "destination", "error", "progress")
 
 
 @cache
 def read_task(path: Path) -> Task:
-    """Run a file and return the task of its one class that is one.
+    """Run a file and return its one task.
 
-    Raises `UsageError` if it cannot be run, has no such class or several, or if its task lacks something.
+    Raises `UsageError` if it cannot be run, has no task class or several, or if its task lacks something.
     """
     if not path.is_file():
         raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
@@ -44,7 +44,7 @@ def read_task(path: Path) -> Task:
 
 @cache
 def packaged_task(name: str) -> Task | None:
-    """Return the task that an installed package brings under a name; None if there is none.
+    """Return the task that an installed package provides under a name; None if there is none.
 
     Raises `UsageError` if it cannot be imported or is no task.
     """
@@ -53,12 +53,12 @@ def packaged_task(name: str) -> Task | None:
 
 
 def packaged(group: str, name: str) -> EntryPoint | None:
-    """Return the entry point of a group and name."""
+    """Return the entry point of a group and name; None if there is none."""
     return next(iter(entry_points(group=group, name=name)), None)
 
 
 def load(entry: EntryPoint) -> Any:
-    """Return what an entry point stands for. Raises `UsageError` if it cannot be imported."""
+    """Return the object that an entry point names. Raises `UsageError` if it cannot be imported."""
     try:
         return entry.load()
     except Exception as error:
@@ -66,7 +66,7 @@ def load(entry: EntryPoint) -> Any:
 
 
 def source_hash(task: Task) -> str:
-    """Return the SHA-256 of the file that a task was written in."""
+    """Return the SHA-256 of a task's source file."""
     return hashlib.sha256(Path(inspect.getfile(type(task))).read_bytes()).hexdigest()
 
 
@@ -75,7 +75,7 @@ def _run(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise UsageError(f"{path} cannot be read as Python")
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # there, as dataclasses look for it
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look it up there
     try:
         spec.loader.exec_module(module)
     except Exception as error:
@@ -87,7 +87,7 @@ def _run(path: Path) -> ModuleType:
 
 
 def _made(what: str, cls: Any) -> Task:
-    """The task that a class makes, checked as far as it can be without a robot."""
+    """The task of a class, checked as far as is possible without a robot."""
     if lacks := [name for name in (*_FACTS, *_FUNCTIONS) if not hasattr(cls, name)]:
         raise UsageError(f"{what} lacks {', '.join(lacks)}; docs/new-task.md says what each is for")
     try:

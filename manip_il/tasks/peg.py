@@ -17,25 +17,25 @@ from manip_il.tasks.grasp import OPEN_SLACK, lie_of
 F64 = NDArray[np.float64]
 
 PEG, HOLE = "peg", "hole"
-_OPEN_SHARE = 0.85  # of what the gripper opens beyond the peg, where that is less than the slack
-FROM_END = 0.04  # of the grip from the peg's upper end [m]
-LOWEST = 0.024  # of the hand over the table at a peg that lies [m]
-BACK = 0.05  # how far behind the hand it is taken to be, when the upper end is the one that is nearer [m]
-STANDS = 0.4  # tilt under which the peg is grasped as it stands, from above [rad]
-LEAN = math.radians(69)  # of the hand, back over the outer end of a peg that lies: less is left to turn [rad]
-LEAN_BY_ROOM = 3.0  # the same at most, by how much farther the arm reaches: its wrist is that far out [rad/m]
-AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # of the hand off its grip: close, keep closing [m]
+_OPEN_SHARE = 0.85  # share of the gripper's opening beyond the peg, if that is less than the slack
+FROM_END = 0.04  # distance of the grip from the peg's upper end [m]
+LOWEST = 0.024  # least height of the hand over the table at a lying peg [m]
+BACK = 0.05  # distance behind the hand of a point: the peg's end that is nearer to it is the upper one [m]
+STANDS = 0.4  # tilt below which the peg stands and is grasped from above [rad]
+LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
+LEAN_BY_ROOM = 3.0  # limit of that lean per spare reach, as the wrist is farther out [rad/m]
+AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # error at which to close, to keep closing [m]
 AT_ANGLE = 0.25  # [rad]
-OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # of the hand over its grip while it is not there; per error; error without [m]
-BARE = 0.012  # of the hand beside a held peg's faces and beyond its ends [m]
-ASLANT = 0.75  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
+OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # height over the grip on approach [m]; per error; tolerated error [m]
+BARE = 0.012  # how far a hand that holds the peg may be from its faces and ends [m]
+ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
 
 
 class Grip(NamedTuple):
     """Grip of the hand on the peg: pose of `ee`, position (3,) [m] and rotation (3, 3).
 
-    off: how far the hand is from being over it, with its angle [m]; angle [rad]; height: how high over it the hand has
-    to be for that [m]. open_enough: the fingers pass on both sides of the peg.
+    off: misalignment of the hand, angle included [m]; angle: to that pose [rad]; height: over the grip that this
+    requires [m]. open_enough: the fingers pass on both sides of the peg.
     """
 
     position: F64
@@ -56,7 +56,7 @@ def hand_at(yaw: float, pitch: float) -> F64:
 
 
 def azimuth(rotation: F64) -> float:
-    """Return the yaw of `hand_at` that a hand (3, 3) has, whatever its pitch [rad]: its fingers' motion is level."""
+    """Return the `hand_at` yaw of a hand (3, 3) whose fingers move level, whatever its pitch [rad]."""
     return math.atan2(rotation[0, 1], -rotation[1, 1])
 
 
@@ -68,12 +68,12 @@ def lower_end(world: World) -> F64:
 
 
 def upper_axis(world: World) -> F64:
-    """Return the direction along the peg to the end that is to be its upper one, (3,)."""
+    """Return the direction along the peg to its intended upper end, (3,)."""
     return world.remember("upper", lambda: _upper_axis(world))
 
 
 def _upper_axis(world: World) -> F64:
-    """Upper end: in the hand the one that it points away from, of a peg that lies the one away from the robot."""
+    """Upper end of a held peg: the one that the hand points away from; of a lying peg: the one away from the robot."""
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
     if stands(world):
@@ -91,7 +91,7 @@ def _far_turn(yaw: float, at: float) -> float:
 
 
 def stands(world: World) -> bool:
-    """Return whether the peg stands, or nearly so: it is grasped from above."""
+    """Return whether the peg stands, or nearly so, and is grasped from above."""
     return abs(world.pose(PEG).rotation[2, 2]) > math.cos(STANDS)
 
 
@@ -108,12 +108,12 @@ def _around(world: World) -> bool:
 
 
 def is_aslant(world: World) -> bool:
-    """Return whether the hand does not point along the peg: it cannot carry it into a hole."""
+    """Return whether the hand is too oblique to the peg to carry it into a hole."""
     return -float(upper_axis(world) @ world.ee.rotation[:, 2]) < math.cos(ASLANT)
 
 
 def grip_of(world: World) -> Grip:
-    """Return how the hand grips the peg as it lies or stands; computed once a state."""
+    """Return how the hand grips the peg as it lies or stands; computed once per state."""
     return world.remember("grip", lambda: _grip(world))
 
 
@@ -140,7 +140,7 @@ def _grip(world: World) -> Grip:
 
 @lru_cache(8)
 def _farthest(scene: Scene) -> float:
-    """Farthest x at which the hand gets to the table [m]."""
+    """Farthest x at which the hand reaches the table [m]."""
     x, y = scene.robot.workspace.centre
     while reach_of(scene.robot).error((x + 0.01, y, 0.0)) < ARRIVES:
         x += 0.01

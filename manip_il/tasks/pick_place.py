@@ -1,4 +1,4 @@
-"""Pick and place: a cube from the table to a goal on it or in the air; lift: to a goal above where it lies."""
+"""Pick and place: move a cube from the table to a goal on it or in the air; lift: to a goal above it."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_go
 F64 = NDArray[np.float64]
 
 OBJECT = "object"
-UNDER = np.array([0.0, 0.0, -1.0])  # no hand gets there [m]
-ANY_SHAPE = Limits(horizon=200)  # what is small or rolls away takes more attempts than a cube
+UNDER = np.array([0.0, 0.0, -1.0])  # out of any hand's reach [m]
+ANY_SHAPE = Limits(horizon=200)  # small or rolling objects take more attempts than a cube
 
 
 @dataclass(frozen=True)
 class PickPlace:
     """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace.
 
-    shape: of the object, a cube of 5 cm unless `--task.object=` says otherwise.
+    shape: the object's, a 5 cm cube unless `--task.object=` says otherwise.
     """
 
     name: str = "pick_place"
@@ -44,7 +44,7 @@ class PickPlace:
     shape: Shape = CUBE
 
     def with_shape(self, shape: Shape) -> Self:
-        """Return the task with another object, in its instruction too."""
+        """Return the task with another object, which its instruction also names."""
         instruction = self.instruction.replace(self.shape.word, shape.word)
         limits = Limits() if shape == CUBE else ANY_SHAPE
         return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, limits=limits)
@@ -59,13 +59,13 @@ class PickPlace:
         add_goal(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the object on the table, lying or standing at any yaw, and the goal, half of the time in the air."""
+        """Draw the object on the table, lying or standing at any yaw, and the goal, in the air half of the time."""
         at, turn = draw_lying(rng, world, OBJECT)
         goal = draw_goal(rng, world, float(at[2]))
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, goal, cube, and the ways between them; four times the cube's yaw, as its faces are alike."""
+        """Return hand, goal, cube and the vectors between them; the yaw times four, as the cube's faces are alike."""
         return observe_cube(world, OBJECT)
 
     def destination(self, world: World) -> F64:
@@ -77,7 +77,7 @@ class PickPlace:
         return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label: a mesh lies too wide or too low for the gripper."""
+        """Return why there is no sound label (a mesh lies too wide or too low for the gripper), or ""."""
         if world.hull(OBJECT) is None or (lie := lie_of(world, OBJECT)).fits or held(world, OBJECT):
             return ""
         if lie.tall < LEAST_HEIGHT:
@@ -86,13 +86,13 @@ class PickPlace:
         return f"{OBJECT} lies on a side on which it is {width:.3f} m wide, more than the gripper goes around"
 
     def progress(self, world: World) -> float:
-        """Return progress by the way that is left along the ladder's path."""
+        """Return progress by the distance left along the ladder's path."""
         return pick_progress(world, OBJECT)
 
 
 @dataclass(frozen=True)
 class Lift(PickPlace):
-    """Pick and place whose goal is above the cube."""
+    """Pick and place with the goal above the cube."""
 
     name: str = "lift"
     instruction: str = "Lift the cube to the green goal above it."
@@ -121,7 +121,7 @@ def observe_cube(world: World, name: str) -> Observed:
 
 
 def observe_object(world: World, name: str) -> Observed:
-    """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the way to it from the hand."""
+    """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the vector to it from the hand."""
     position, lie = world.pose(name).position, lie_of(world, name)
     if world.scene.draws_shape or not is_cube(world, name):
         seen = _observe_lie(name, lie, mesh=world.hull(name) is not None)
@@ -137,9 +137,9 @@ def observe_object(world: World, name: str) -> Observed:
 
 
 def _observe_lie(name: str, lie: Lie, *, mesh: bool) -> Observed:
-    """Return how anything but a cube lies, by its narrowest grasp, so that numbers change steadily as it turns.
+    """Return how a non-cube lies, by its narrowest grasp, so that the numbers change continuously as it turns.
 
-    mesh: with the way from its centre of mass to the middle of that grasp.
+    mesh: include the vector from its centre of mass to the middle of that grasp.
     """
     yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
     of_mesh = {f"{name}.grasp": np.array(centre)} if mesh else {}

@@ -1,4 +1,4 @@
-"""Press: a button that stands anywhere on the table, to its stop."""
+"""Press: push a button, anywhere on the table, to its stop."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from manip_il.tasks.starts import draw_resting_place, draw_yaw
 F64 = NDArray[np.float64]
 
 BUTTON, CAP = "button", "cap"
-TRAVEL = 0.015  # of the cap [m]
+TRAVEL = 0.015  # travel of the cap [m]
 CAP_RADIUS = 0.025  # [m]
-TOP = 0.055  # of the cap that is not pressed, over the table [m]
-STOPPED = 0.002  # of the cap from its stop: pressed [m]
-TIP = 0.02  # of the fingertips beyond `ee` [m]
-OVER = 0.012  # of the hand off the button's middle while it presses [m]
+TOP = 0.055  # height of the unpressed cap over the table [m]
+STOPPED = 0.002  # distance of the cap from its stop at which it is pressed [m]
+TIP = 0.02  # distance of the fingertips beyond `ee` [m]
+OVER = 0.012  # largest offset of the pressing hand from the button's middle [m]
 DEEPER = 0.012  # how far beyond the stop the hand aims, so that it presses [m]
-HOVER, SLOPE = 0.08, 2.0  # of the hand over the cap while it is not above it [m]; height gained per distance from it
-_STIFF, _DAMPED = 150.0, 4.0  # of the spring [N/m], [N s/m]
+HOVER, SLOPE = 0.08, 2.0  # clearance over the cap before the hand is above it [m]; height per distance from it
+_STIFF, _DAMPED = 150.0, 4.0  # stiffness and damping of the spring [N/m], [N s/m]
 
 
 def pressed(world: World) -> float:
@@ -37,13 +37,13 @@ def pressed(world: World) -> float:
 
 
 def _off(world: World) -> float:
-    """Sideways distance of the hand from over the button [m]."""
+    """Horizontal distance of the hand from the button [m]."""
     x, y = (world.ee.position - world.pose(BUTTON).position)[:2].tolist()
     return math.hypot(x, y)
 
 
 def _aim(world: World) -> Target:
-    """Go over the button, the nearer the lower, and through its stop once over it."""
+    """Go over the button, lower as the hand gets nearer, and press beyond its stop once over it."""
     off = _off(world)
     x, y, _ = world.pose(BUTTON).position
     height = min(HOVER, SLOPE * max(0.0, off - OVER)) if off > OVER else -TRAVEL - DEEPER
@@ -97,7 +97,7 @@ class Press:
         return Start({BUTTON: (np.append(at[:2], 0.0), draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
-        """Return the hand, the middle of the cap's top, and the way to it."""
+        """Return the hand, the middle of the cap's top, and the vector to it."""
         cap = world.pose(CAP).position
         return {**observe_hand(world), CAP: cap, "cap_from_ee": cap - world.ee.position}
 

@@ -1,4 +1,4 @@
-"""Push: a puck to a goal on the table, without grasping it."""
+"""Push: move a puck to a goal on the table without grasping it."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ F64 = NDArray[np.float64]
 PUCK = "puck"
 PUCK_SIZE = (0.03, 0.02)  # radius, half its height [m]
 PUCK_MASS = 0.15  # [kg]
-PUSHING = (0.01, 0.12)  # of the hand behind the puck's middle while it pushes: no nearer, no farther [m]
-BESIDE = 0.02  # of the hand off the line through puck and goal while it pushes [m]
-LOW = 0.004  # of the hand while it pushes, over its lowest [m]
-LOW_ENOUGH = 0.025  # over that it pushes [m]
-ABOVE = 0.10  # of the hand on its way around the puck [m]
-SLOPE = 2.0  # height the hand gains per distance from where it stands behind the puck
+PUSHING = (0.01, 0.12)  # range of the pushing hand's distance behind the puck's middle [m]
+BESIDE = 0.02  # largest distance of the pushing hand from the line through puck and goal [m]
+LOW = 0.004  # height of the pushing hand over its lowest [m]
+LOW_ENOUGH = 0.025  # height above that below which it pushes [m]
+ABOVE = 0.10  # height of the hand on its way around the puck [m]
+SLOPE = 2.0  # height of the hand per distance from its place behind the puck
 STEP = 0.03  # how far ahead of the hand its target runs while it pushes [m]
 FAR = 0.08  # least distance of the goal from the puck at the start [m]
-ROOM = 0.06  # within reach behind the puck at the start [m]
+ROOM = 0.06  # reachable margin behind the puck at the start [m]
 
 
 class Hand(NamedTuple):
-    """Measures of a hand that pushes. behind: from the puck's middle, where it stands behind it [m].
+    """Dimensions of a pushing hand. behind: distance at which it starts behind the puck's middle [m].
 
-    opening: of the fingers, across the push: the puck rests against both [m]. touching: behind the puck's middle, where
-    it comes to touch it [m]; lower: over its lowest until then [m].
+    opening: of the fingers, across the push, so that the puck rests against both [m]. touching: distance behind the
+    puck's middle at which it touches the puck [m]; lower: `LOW_ENOUGH` at the distance `behind` [m].
     """
 
     behind: float
@@ -48,7 +48,7 @@ class Hand(NamedTuple):
 
 
 UPRIGHT_HAND = Hand(0.05, 0.04, 0.0, LOW_ENOUGH)
-LEANING_HAND = Hand(0.065, 0.02, 0.045, 0.006)  # of a weak arm: on its way down it would ride on the puck
+LEANING_HAND = Hand(0.065, 0.02, 0.045, 0.006)  # for a weak arm, which would ride on the puck on its way down
 
 
 def _style(world: World) -> Hand:
@@ -63,7 +63,7 @@ def _way(world: World) -> tuple[F64, float]:
 
 
 def _across(world: World, direction: F64) -> F64:
-    """Rotation of a hand that points down with its fingers across the push: of two, the nearer one, (3, 3)."""
+    """Rotation of a downward hand with its fingers across the push, the nearer of two, (3, 3)."""
     yaw, puck = math.atan2(direction[1], direction[0]), world.pose(PUCK).position
     if world.robot.faces_ahead:
         at, turns = world.turned(puck), world.turns(yaw, math.pi, puck)
@@ -73,12 +73,12 @@ def _across(world: World, direction: F64) -> F64:
 
 
 def _hand(world: World) -> F64:
-    """Return where the hand pushes: the middle between its fingers when they are open for that, (3,) [m]."""
+    """Return the point that pushes: the middle between the fingers at the pushing opening, (3,) [m]."""
     return world.ee.position + world.ee.rotation[:, 1] * world.gripper.middle(_style(world).opening)
 
 
 def _to(world: World, position: F64, direction: F64, max_step: float = 0.12) -> Target:
-    """Target of a hand whose middle between the fingers is to be at a position (3,) [m], across a push (2,)."""
+    """Target that puts the middle between the fingers at a position (3,) [m], across a push (2,)."""
     rotation, opening = _across(world, direction), _style(world).opening
     return Target(position - rotation[:, 1] * world.gripper.middle(opening), rotation, opening, max_step=max_step)
 
@@ -106,7 +106,7 @@ def _pushes(world: World) -> bool:
 
 
 def _low_enough(world: World, behind: float) -> float:
-    """Height under which a hand pushes that is some way behind the puck's middle [m]."""
+    """Height below which a hand pushes, by its distance behind the puck's middle [m]."""
     style = _style(world)
     apart = min(1.0, max(0.0, (behind - style.touching) / (style.behind - style.touching)))
     return world.robot.ee.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
@@ -121,7 +121,7 @@ def _push(world: World) -> Target:
 
 
 def _around(world: World) -> Target:
-    """To behind the puck: up, over it and down, the nearer to there the lower; straight up if too low beside it."""
+    """Move behind the puck: over it, and lower as the hand gets nearer; straight up if too low beside it."""
     direction, _ = _way(world)
     hand = _hand(world)
     to = world.pose(PUCK).position[:2] - direction * _style(world).behind
@@ -178,7 +178,7 @@ class Push:
         return Start({PUCK: (at, UPRIGHT), GOAL: (np.append(goal[:2], 0.001), UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, goal and puck, and the ways between them."""
+        """Return hand, goal and puck, and the vectors between them."""
         puck, ee, goal = world.pose(PUCK).position, world.ee.position, world.goal
         way = goal - puck
         return {
@@ -198,7 +198,7 @@ class Push:
         return _way(world)[1]
 
     def progress(self, world: World) -> float:
-        """Return progress by the way of hand and puck that is left."""
+        """Return progress by the distances left for hand and puck."""
         direction, distance = _way(world)
         if _at_goal(world) or _pushes(world):
             return 0.5 + 0.5 * nearness(distance)

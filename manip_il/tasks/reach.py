@@ -1,4 +1,4 @@
-"""Reach: the hand to a goal in the air."""
+"""Reach: move the hand to a goal in the air."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ReachGoal:
         return Start({GOAL: (draw_goal(rng, world, CUBE_HALF, in_air=1.0), UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, goal, and the way from one to the other."""
+        """Return hand, goal, and the vector between them."""
         return {**observe_hand(world), "goal": world.goal, "goal_from_ee": world.goal - world.ee.position}
 
     def destination(self, world: World) -> F64:
@@ -62,11 +62,11 @@ class ReachGoal:
         return math.dist(world.ee.position.tolist(), world.goal.tolist())
 
     def progress(self, world: World) -> float:
-        """Return progress by the distance that is left."""
+        """Return progress by the distance left."""
         return nearness(self.error(world))
 
 
 def observe_hand(world: World) -> Observed:
-    """Return the hand's position and axes: the beginning of every `environment_state`."""
+    """Return the hand's position and axes, which begin every `environment_state`."""
     ee = world.ee
     return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}

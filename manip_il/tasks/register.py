@@ -1,6 +1,6 @@
 """Names for gymnasium: `manip_il/PandaPickPlace-v0` and its siblings, `manip_il/PickPlace-v0`, `manip_il/Task-v0`.
 
-The robot of `manip_il/PickPlace-v0` is an argument, and of `manip_il/Task-v0` the task, too: a name or a file's path.
+`manip_il/PickPlace-v0` takes the robot as an argument, `manip_il/Task-v0` robot and task: names or file paths.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ def _id(name: str) -> str:
 
 
 ENV_IDS = {_id(f"{robot}_{task}"): (robot, task) for robot in ROBOTS for task in NAMES}
-TASK_IDS = {_id(task): task for task in NAMES}  # their robot is an argument
-ANY_ID = "manip_il/Task-v0"  # its task is, too
+TASK_IDS = {_id(task): task for task in NAMES}  # the robot is an argument
+ANY_ID = "manip_il/Task-v0"  # robot and task are arguments
 
 
 def register_envs() -> None:
-    """Register every robot and task, and every task, with gymnasium; a second call changes nothing."""
+    """Register every robot-task pair, every task and `ANY_ID` with gymnasium; a second call changes nothing."""
     named = {env_id: {"robot": robot, "task": task} for env_id, (robot, task) in ENV_IDS.items()}
     named |= {env_id: {"task": task} for env_id, task in TASK_IDS.items()} | {ANY_ID: {}}
     for env_id, kwargs in named.items():

@@ -1,4 +1,4 @@
-"""Move a peg in the hand, set it upright, let go of it, catch it: ladder and progress of a task with one."""
+"""Move a held peg, set it upright, release and catch it: ladder and progress of tasks with a peg."""
 
 from __future__ import annotations
 
@@ -33,28 +33,28 @@ from manip_il.tasks.peg import (
 
 F64 = NDArray[np.float64]
 
-LIFT, LIFT_SLOPE = 0.015, 2.5  # of the peg's lower end over the rim; per error
+LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m]; height per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
 SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
-FARTHER = 1.5  # than its target, in shares of the way, the hand aims where it is exact: the arm's weight stops it short
-TURN = 0.15  # how far ahead of the hand its target turns: its way need not wait for that [rad]
-LET_GO, RELEASE = 0.012, 0.03  # opening beyond the width of a peg that is free, and commanded to free it [m]
-CLEAR = 0.03  # of the hand over the peg once it has let go [m]
-ASIDE = (math.radians(55), math.radians(70))  # yaw, to either side, at which a hand sets the peg up [rad]
-NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
-FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
+FARTHER = 1.5  # factor on the distance that an exact move aims for, as the arm's weight stops it short
+TURN = 0.15  # largest lead of the target's rotation over the hand's, which need not wait for it to move [rad]
+LET_GO, RELEASE = 0.012, 0.03  # opening beyond the peg's width at which it is free, and to command [m]
+CLEAR = 0.03  # clearance of the hand over the peg after release [m]
+ASIDE = (math.radians(55), math.radians(70))  # range of yaw, to either side, at which the hand sets the peg up [rad]
+NEAR_MIDDLE = 0.05  # largest distance from the workspace's middle along x at which the peg is set up [m]
+FROM_HOLE = 0.11  # least distance from the hole at which the peg is set up [m]
 OVER_WALLS = 0.03  # how much higher the peg is carried beside the hole [m]
 SET_DOWN = 0.010  # error at which the peg is down on the table [m]
-ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
-IN_AIR, BESIDE = 0.006, 0.045  # of a falling peg over the table, and of its axis off the hand that catches it [m]
+ON_TABLE = 0.004  # height of the lower end over the table at which the peg stands [m]
+IN_AIR, BESIDE = 0.006, 0.045  # least height of a falling peg; largest distance of its axis from the hand [m]
 
 
 class Way(NamedTuple):
-    """Way that is left for a peg in the hand.
+    """Remaining motion of a held peg.
 
-    rotation: of the hand when the peg stands upright, in line with the hole if it is for that, (3, 3); turn: to there,
-    as a rotation vector, (3,) [rad]. off: sideways to there [m], (2,). error: both together [m]. low: of the peg's
-    lower end over the table, when it stands [m].
+    rotation: the hand's once the peg is upright, and aligned if it is for the hole, (3, 3); turn: rotation vector to
+    it, (3,) [rad]. off: horizontal offset left [m], (2,). error: both together [m]. low: height of the peg's lower end
+    over the table once it is upright [m].
     """
 
     rotation: F64
@@ -65,17 +65,17 @@ class Way(NamedTuple):
 
     @property
     def angle(self) -> float:
-        """Angle that the hand is to turn [rad]."""
+        """Angle left for the hand to turn [rad]."""
         return math.hypot(*self.turn)
 
 
 def to_stand(world: World) -> Way:
-    """Return what is left to do for a peg in the hand that is to stand on the table first; computed once a state."""
+    """Return the remaining motion of a held peg that must stand on the table first; computed once per state."""
     return world.remember("to stand", lambda: _to_stand(world))
 
 
 def _to_stand(world: World) -> Way:
-    """Turn the peg upright on the shortest way, and the hand to one side; near the middle, and not at the hole."""
+    """Turn the peg upright by the smallest rotation and the hand to one side, near the middle but not at the hole."""
     hand, axis = world.ee.rotation, upper_axis(world)
     upright = _upright(axis) @ hand
     y, at = float(world.ee.position[1]) - world.scene.robot.workspace.centre[1], azimuth(hand)
@@ -91,7 +91,7 @@ def _to_stand(world: World) -> Way:
 
 
 def _upright(axis: F64) -> F64:
-    """The rotation on the shortest way that turns an axis up, (3, 3)."""
+    """The smallest rotation that turns an axis up, (3, 3)."""
     x, y, z = axis.tolist()
     if z < -0.99:
         return np.diag([1.0, -1.0, -1.0])
@@ -100,7 +100,7 @@ def _upright(axis: F64) -> F64:
 
 
 def _free_place(world: World, end: F64) -> F64:
-    """Place on the table where a peg is set up, nearest to where its lower end (3,) would be, (3,) [m]."""
+    """Place on the table to set up a peg, nearest to where its lower end (3,) would be, (3,) [m]."""
     x, y, _ = end.tolist()
     middle = world.scene.robot.workspace.centre[0]
     at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])
@@ -110,9 +110,9 @@ def _free_place(world: World, end: F64) -> F64:
 
 
 def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
-    """Return what is left when the peg turns with the hand to a rotation (3, 3).
+    """Return the remaining motion if the hand turns with the peg to a rotation (3, 3).
 
-    to: where the lower end of the upright peg goes from a point (3,) [m].
+    to: target of the upright peg's lower end, given where that would be, (3,) [m].
     """
     ee, peg = world.ee, world.pose(PEG)
     turn = rotation_vector(rotation @ ee.rotation.T)
@@ -124,16 +124,16 @@ def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
 
 
 def _set_up(world: World) -> Target:
-    """Up and upright, to a free place; then down on the table."""
+    """Lift the peg and turn it upright over a free place, then lower it to the table."""
     way = to_stand(world)
     return move(world, way, _set_up_height(world, way) - way.low, sideways_at=0.03)
 
 
 def _set_up_height(world: World, way: Way) -> float:
-    """Height of the lower end over the table; beside the hole, over the walls around it [m]."""
+    """Height of the lower end over the table, and over the walls if beside the hole [m]."""
     room = math.dist(world.pose(PEG).position[:2], world.pose(HOLE).position[:2]) - FROM_HOLE
     most = LIFT + OVER_WALLS * min(1.0, max(0.0, 1 - room / OVER_WALLS))
-    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # whatever the yaw of the hand: it may be out of reach
+    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # not the hand's yaw, which may be out of reach
     error = math.hypot(*way.off) + ANGLE_AS_LENGTH * tilt
     return min(most, LIFT_SLOPE * max(0.0, error - SET_DOWN)) - 0.001
 
@@ -141,7 +141,7 @@ def _set_up_height(world: World, way: Way) -> float:
 def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
     """Return the target that moves the peg with the hand.
 
-    missing: height [m]; sideways_at: how little may be missing for a move sideways.
+    missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m].
     """
     sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
     turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
@@ -154,7 +154,7 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
 
 
 def is_up(world: World) -> bool:
-    """Return whether the peg stands on the table in a hand that does not point down, or is just above that."""
+    """Return whether the peg stands on the table, with an oblique hand around it or just above it."""
     up = float(upper_axis(world)[2]) > math.cos(0.15) and lower_end(world)[2] < ON_TABLE
     return up and is_aslant(world) and _hand_is_at(world)
 
@@ -187,7 +187,7 @@ def _falls(world: World) -> bool:
 
 
 def _catch(world: World) -> Target:
-    """Close the fingers, and go with the peg."""
+    """Close the fingers and follow the peg."""
     peg, ee = world.pose(PEG), world.ee
     axis = upper_axis(world)
     along = float(axis @ (ee.position - peg.position))
@@ -208,7 +208,7 @@ def _close(world: World) -> Target:
 
 
 def _approach(world: World) -> Target:
-    """Over the grip and down to it, fingers open; straight up if too low beside it."""
+    """Move over the grip and down to it, fingers open; straight up if too low beside it."""
     grip = grip_of(world)
     x, y, z = grip.position
     height = grip.height if grip.open_enough else max(grip.height, OVER)
@@ -222,7 +222,7 @@ def hangs(world: World) -> bool:
 
 
 def peg_progress(world: World) -> float:
-    """Return progress of gripping a peg from above, 0 to 1, after setting it up where it lies."""
+    """Return progress of gripping a peg from above, 0 to 1, after setting it up if it lies."""
     grip = grip_of(world)
     above = float(world.ee.position[2] - grip.position[2])
     if is_up(world):

@@ -1,4 +1,4 @@
-"""Sort: of three cubes, the one that the instruction names into the bin of its colour."""
+"""Sort: put the one of three cubes that the instruction names into the bin of its colour."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
 BINS = {name: f"{name}_bin" for name in COLOURS}
-ASKED = "asked"  # a mocap body that is nowhere seen: x is the number of the cube, z that of the sentence
+ASKED = "asked"  # an invisible mocap body: x is the cube's number, z the sentence's
 SENTENCES = (
     "Put the {colour} cube into the {colour} bin.",
     "Sort the {colour} cube into its bin.",
@@ -33,22 +33,22 @@ SENTENCES = (
     "The {colour} cube goes into the {colour} bin.",
 )
 INSIDE = (0.046, 0.068)  # half a bin's inner length and width [m]
-PITCH = 0.105  # of the bins, which stand in a row away from the robot [m]
-SIDE = 0.19  # of the row from the workspace's middle, left or right [m]
-SHIFT = 0.08  # of everything from the workspace's middle, at most, to where the arm reaches farthest around [m]
-HALF = 0.018  # of a cube's edge [m]
-APART = 0.085  # of the cubes at the start [m]
-FROM_BINS = 0.14  # of a cube from the row's middle at the start, sideways [m]
-BEYOND = 0.15  # of a cube at most from the workspace's middle on the side without bins [m]
-LOWER = 0.028  # of a carried cube than over a deeper box: what falls from there does not fly far [m]
-STEP = 0.1  # how far ahead of the hand its target runs while it carries: soon there, it loses less on the way [m]
-SLOPE = 5.0  # of the way around other bins: distance from the row per distance along it
-NEAR_WALL, BY_WALL = 0.045, 0.065  # of a cube in a bin and beside it from the wall, where a finger has no room [m]
-NARROW = 0.024  # opening beyond a cube's width where it lies in a bin [m]
-TURNED = 0.3  # of the hand from such a grasp: it stays over the cube until it has turned [rad]
-AWAY = 0.2  # of the hand over the bin once the cube is in it [m]
-_HIGH = 0.04  # of a cube over a bin's walls where it is carried across them [m]
-_WRONG = 0.1  # what another cube in a bin counts for as an error [m]
+PITCH = 0.105  # spacing of the bins, which stand in a row away from the robot [m]
+SIDE = 0.19  # offset of the row from the workspace's middle, left or right [m]
+SHIFT = 0.08  # largest shift of everything from the workspace's middle to where the arm reaches widest [m]
+HALF = 0.018  # half a cube's edge length [m]
+APART = 0.085  # least distance between cubes at the start [m]
+FROM_BINS = 0.14  # least sideways distance of a cube from the row's middle at the start [m]
+BEYOND = 0.15  # largest distance of a cube from the workspace's middle on the side without bins [m]
+LOWER = 0.028  # how much lower a cube is released than in a deeper box, so that it does not bounce far [m]
+STEP = 0.1  # how far the target runs ahead of the carrying hand: a fast hand drops fewer cubes [m]
+SLOPE = 5.0  # slope of the path around other bins: distance from the row per distance along it
+NEAR_WALL, BY_WALL = 0.045, 0.065  # distance from a wall, in a bin and beside it, at which a finger has no room [m]
+NARROW = 0.024  # opening beyond the width of a cube near a bin's wall [m]
+TURNED = 0.3  # angle to such a grasp above which the hand stays over the cube [rad]
+AWAY = 0.2  # height of the hand over the bin once the cube is in it [m]
+_HIGH = 0.04  # clearance of a cube that is carried across a bin's walls [m]
+_WRONG = 0.1  # error for each other cube in a bin [m]
 
 
 def asked(world: World) -> str:
@@ -65,18 +65,18 @@ def _is_sorted(world: World, name: str) -> bool:
 
 
 def _wrong(world: World) -> int:
-    """Number of cubes in a bin that are to be left alone."""
+    """Number of other cubes that are in a bin."""
     others = [name for name in COLOURS if name != asked(world)]
     return sum(any(is_in(world, name, one, INSIDE) for one in BINS.values()) for name in others)
 
 
 def _place(world: World) -> F64:
-    """Place over its bin where the named cube is let go, (3,) [m]."""
+    """Release point of the named cube over its bin, (3,) [m]."""
     return drop_place(world, asked(world), BINS[asked(world)]) - [0.0, 0.0, LOWER]
 
 
 def _to(world: World) -> F64:
-    """Place where the named cube is let go, (3,) [m], or off the bins beside it while over another's."""
+    """Release point of the named cube, (3,) [m], or a place beside the bins while it is not at its own."""
     name = asked(world)
     place = _place(world)
     along = abs(place[0] - world.pose(name).position[0])
@@ -85,19 +85,19 @@ def _to(world: World) -> F64:
 
 
 def _carry_progress(world: World) -> float:
-    """Progress by the way that is left around the other bins, and by the height that is missing on it, 0 to 1."""
+    """Progress by the distance left around the other bins and the missing height, 0 to 1."""
     along, across, up = (_place(world) - world.pose(asked(world)).position).tolist()
     lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))
     return nearness(abs(along) + abs(across) + max(0.0, up + lift))
 
 
 def _other_held(world: World) -> str:
-    """The cube in the hand that is to be left alone; empty for none."""
+    """The other cube that is in the hand; empty if there is none."""
     return next((name for name in COLOURS if name != asked(world) and held(world, name)), "")
 
 
 def _put_back(world: World) -> Target:
-    """Bring a wrong cube off the bins, lower it to the table and open the fingers."""
+    """Move a wrong cube away from the bins, lower it to the table and open the fingers."""
     name = _other_held(world) or asked(world)
     at, ee = world.pose(name).position, world.ee.position
     low = at[2] - lie_of(world, name).tall / 2
@@ -111,7 +111,7 @@ def _put_back(world: World) -> Target:
 
 
 def _free_yaw(world: World) -> float | None:
-    """Yaw at which walls leave room for the fingers, modulo half a turn [rad]; None where there is room all around."""
+    """Yaw at which walls leave room for the fingers, modulo half a turn [rad]; None if there is room all around."""
     name = asked(world)
     x, y = world.pose(name).position[:2].tolist()
     row = [world.pose(one).position for one in BINS.values()]
@@ -123,7 +123,7 @@ def _free_yaw(world: World) -> float | None:
 
 
 def _approach(world: World) -> Target:
-    """As any cube is approached, but with the fingers where no wall is in their way."""
+    """Approach as for any cube, but with the fingers where no wall is in their way."""
     target, free = approach(world, asked(world), OVER), _free_yaw(world)
     if free is None:
         return target
@@ -137,7 +137,7 @@ def _approach(world: World) -> Target:
 
 
 def _middle(world: World) -> tuple[float, float]:
-    """Middle of cubes and bins [m]: what falls from the hand shall fall where it can be picked up."""
+    """Middle of cubes and bins [m], such that a dropped cube falls where it can be picked up."""
     x, y = world.scene.robot.workspace.centre
     line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
     shifts = [
@@ -150,7 +150,7 @@ def _middle(world: World) -> tuple[float, float]:
 
 
 def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) -> F64:
-    """Draw where a cube rests, (3,) [m], off the bins on a side (-1 or 1)."""
+    """Draw a resting place of a cube, (3,) [m], away from the bins on a side (-1 or 1)."""
     (x, y), wide = _middle(world), world.scene.robot.workspace.half_width
     along, across = rng.uniform(-1, 1) * wide, side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
     return np.array([x + along, y + across, resting_height(world, name)])
@@ -191,7 +191,7 @@ class Sort:
         return tuple(sentence.format(colour=colour) for colour in COLOURS for sentence in SENTENCES)
 
     def ask(self, world: World, instruction: str) -> None:
-        """Make a world's episode one of another sentence."""
+        """Change the sentence of a world's episode."""
         number, sentence = divmod(self.instructions.index(instruction), len(SENTENCES))
         world.place(ASKED, np.array([number, 0.0, sentence]), UPRIGHT)
 
@@ -201,18 +201,18 @@ class Sort:
         return SENTENCES[number].format(colour=asked(world))
 
     def objects_in(self, world: World) -> tuple[str, ...]:
-        """Return the cube that is named: the others may lie where the arm does not reach."""
+        """Return the named cube; the others may lie out of reach."""
         return (asked(world),)
 
     def build(self, spec: mujoco.MjSpec) -> None:
-        """Add the cubes, a bin for each, and what holds which one is named."""
+        """Add the cubes, a bin for each, and the body that encodes which one is named."""
         for name, colour in COLOURS.items():
             add_cube(spec, name, HALF, 0.05, colour)
             add_bin(spec, BINS[name], INSIDE, colour)
         add_furniture(spec, ASKED).pos = [0, 0, 0]
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the sentence, on which side the bins stand and in which order, and the cubes, apart, at any yaw."""
+        """Draw the sentence, the bins' side and order, and the cubes, apart and at any yaw."""
         number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
         poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
         (x, y), hand = _middle(world), world.scene.robot.workspace.centre
@@ -231,7 +231,7 @@ class Sort:
         return Start(poses)
 
     def observe(self, world: World) -> Observed:
-        """Return which cube is named, that one and the way to its bin; hand, and where every cube and bin is."""
+        """Return hand, which cube is named, its pose, the vectors to its bin, and all positions of cubes and bins."""
         name = asked(world)
         return {
             **observe_hand(world),
@@ -248,7 +248,7 @@ class Sort:
         return world.pose(BINS[asked(world)]).position
 
     def error(self, world: World) -> float:
-        """Return how far the named cube is from its bin's middle [m], 0 in it; more where another is in a bin."""
+        """Return how far the named cube is from its bin's middle [m], 0 if it is in; more if another is in a bin."""
         name = asked(world)
         off = math.dist(world.pose(name).position, world.pose(BINS[name]).position)
         return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)

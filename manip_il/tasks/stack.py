@@ -1,4 +1,4 @@
-"""Stack: one cube on another, standing there by itself."""
+"""Stack: put one cube on another, where it stands by itself."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from manip_il.tasks.starts import draw_resting, draw_until, draw_yaw
 F64 = NDArray[np.float64]
 
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
-ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # off the place on the base: sideways, in height [m]; tilt [rad]
-LEANS_Z, LEANS = 0.008, 0.3  # the same of a cube in a hand that leans: in height [m], its tilt [rad]
-OVER_BASE = Lift(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # of the carried cube over its place
-PRESS = 0.01  # aimed at below the base's top: the cube comes down surely, and does not hang over it [m]
-AWAY, AWAY_ENOUGH = 0.06, 0.035  # of the hand over the stack's top once it has let go; at which it is away [m]
-APART = 0.09  # of the cubes at the start [m]
-ROOM = 0.05  # within reach around each of them at the start [m]
-_HAND = 0.05  # what a hand that is still at the cube counts for as an error [m]
+ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # tolerances on the base: sideways, in height [m]; tilt [rad]
+LEANS_Z, LEANS = 0.008, 0.3  # the same for a cube in a leaning hand: in height [m]; tilt [rad]
+OVER_BASE = Lift(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # carried cube over its place
+PRESS = 0.01  # how far below the base's top the cube is aimed, so that it surely comes down [m]
+AWAY, AWAY_ENOUGH = 0.06, 0.035  # height of the hand over the stack after release, and at which it is away [m]
+APART = 0.09  # least distance between cubes at the start [m]
+ROOM = 0.05  # reachable margin around each cube at the start [m]
+_HAND = 0.05  # error added while the hand is at the cube [m]
 
 
 def place_on_base(world: World) -> F64:
-    """Return where the centre of the upper cube is to be, (3,) [m]."""
+    """Return the target of the upper cube's centre, (3,) [m]."""
     height = (lie_of(world, BASE).tall + lie_of(world, TOP).tall) / 2
     return world.pose(BASE).position + [0.0, 0.0, height]
 
@@ -44,7 +44,7 @@ def stands(world: World) -> bool:
 
 
 def _rests(world: World) -> bool:
-    """Whether the upper cube is on the base as a hand that leans puts it there: it lies level once it is let go."""
+    """Whether a leaning hand has put the upper cube on the base, where it will lie level once released."""
     x, y, z = (world.pose(TOP).position - place_on_base(world)).tolist()
     return world.robot.leans and math.hypot(x, y) < ON_XY and abs(z) < LEANS_Z and lie_of(world, TOP).tilt < LEANS
 
@@ -107,7 +107,7 @@ class Stack:
         return Start({TOP: (top, draw_yaw(rng)), BASE: (base, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
-        """Return hand and cubes, and the ways between them."""
+        """Return hand and cubes, and the vectors between them."""
         return {
             **observe_hand(world),
             **observe_object(world, TOP),

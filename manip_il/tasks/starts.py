@@ -15,12 +15,12 @@ from manip_il.tasks.grasp import is_cube
 
 F64 = NDArray[np.float64]
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
-FROM_HAND = 0.1  # of an object from the hand at the start, x and y, as in gymnasium-robotics' FetchPickAndPlace [m]
-LIFT_HEIGHT = 0.45  # of a workspace with that room; in a lower one it is less [m]
-FROM_HAND_SHARE = 0.75  # the same in half widths of the workspace, where that is less
-IN_AIR = 0.5  # share of goals that are off the table, as in the same environment
-LIFT = (0.1, 0.25)  # of a goal above an object's start [m]
-FEW_DRAWS = 50  # beside others, before they are drawn anew
+FROM_HAND = 0.1  # least horizontal distance from hand to object, as in gymnasium-robotics' FetchPickAndPlace [m]
+LIFT_HEIGHT = 0.45  # workspace height for the full `LIFT`, which is less in lower ones [m]
+FROM_HAND_SHARE = 0.75  # the same as a share of the workspace's half width, if that is less
+IN_AIR = 0.5  # share of goals above the table, as in FetchPickAndPlace
+LIFT = (0.1, 0.25)  # height of a goal above the object's start [m]
+FEW_DRAWS = 50  # draws of one place before all are drawn again
 _MOST_DRAWS = 1_000
 _BOX, _SPHERE, _CAPSULE = (int(kind) for kind in (mjtGeom.mjGEOM_BOX, mjtGeom.mjGEOM_SPHERE, mjtGeom.mjGEOM_CAPSULE))
 _HALF = np.sqrt(0.5)
@@ -28,9 +28,9 @@ _UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.
 
 
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
-    """Draw on which side an object lies or stands, where, and its yaw: (3,) [m] and wxyz (4,).
+    """Draw the side an object rests on, its position and its yaw: (3,) [m] and quaternion wxyz (4,).
 
-    Sides that look alike count once; a capsule lies; a mesh is as it was made, or on the nearest side. A cube turns
+    Sides that look alike count once; a capsule lies; a mesh rests as modelled, or on the nearest side. A cube's yaw is
     within an eighth of a turn, as its faces are alike.
     """
     lengths = world.extents(name)
@@ -50,7 +50,7 @@ def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, 
 
 
 def _upright(down: F64) -> F64:
-    """Return the least turn that gets a direction (3,) of an object to point down: wxyz."""
+    """Return the smallest rotation, wxyz, that makes a direction (3,) of an object point down."""
     turn, upright = np.empty(4), np.empty(4)
     mujoco.mju_quatZ2Vec(turn, -down)
     mujoco.mju_negQuat(upright, turn)
@@ -58,19 +58,19 @@ def _upright(down: F64) -> F64:
 
 
 def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
-    """Own axes that may point up: one of each length, where an object may rest so."""
+    """Axes that may point up, one of each length, if the object can rest that way."""
     if kind in (_SPHERE, _CAPSULE):
         return [0]
     return [axis for axis in range(3) if lengths[axis] not in lengths[:axis] or (kind != _BOX and axis == 2)]
 
 
 def draw_resting(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> F64:
-    """Draw where an object's centre rests on the table, (3,) [m], not under the hand; room: see `has_room`."""
+    """Draw a resting place of an object's centre, (3,) [m], not under the hand; room: see `has_room`."""
     return draw_resting_place(rng, world, name, resting_height(world, name), room)
 
 
 def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
-    """Draw a place on the table, (3,) [m], where the hand reaches to a height [m] and does not begin."""
+    """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's start."""
     space = world.scene.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
@@ -84,16 +84,16 @@ def draw_resting_place(rng: np.random.Generator, world: World, name: str, height
 
 
 def has_room(world: World, at: F64, room: float) -> bool:
-    """Return whether the hand reaches to a point (3,) and to `room` around it on the table [m].
+    """Return whether the hand reaches a point (3,) and the points `room` around it [m].
 
-    A thing that is knocked then stays within reach.
+    An object that is knocked then stays within reach.
     """
     around = ((room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0)) if room else ()
     return world.reach.has(at) and all(world.reach.has(at + np.array(way)) for way in around)
 
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:
-    """Draw a goal on the table, `height` over it, or for a share of `in_air` anywhere above that; (3,) [m]."""
+    """Draw a goal at `height` over the table or, with probability `in_air`, anywhere above that; (3,) [m]."""
     top = world.scene.robot.workspace.height if rng.uniform() < in_air else 0.0
     return draw_until(
         lambda: np.append(_xy(rng, world), height + rng.uniform(0, top)), world.reach.has, world, "the goal"
@@ -107,7 +107,7 @@ def draw_yaw(rng: np.random.Generator, widest: float = np.pi / 4) -> F64:
 
 
 def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: World, what: str) -> F64:
-    """Draw until it fits, (3,). Raises `UsageError` after a thousand draws."""
+    """Return the first draw that fits, (3,). Raises `UsageError` after a thousand draws."""
     for _ in range(_MOST_DRAWS):
         drawn = draw()
         if fits(drawn):
@@ -118,9 +118,9 @@ def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: Worl
 def draw_together(
     draw: Callable[[str], F64], names: Iterable[str], fits: Callable[[F64, Sequence[F64]], bool], world: World
 ) -> list[F64]:
-    """Draw a place (3,) for each name that fits beside those before it, anew from the first where there is none.
+    """Draw a place (3,) for each name that fits beside the earlier ones; start over if one finds none.
 
-    Raises `UsageError` after a thousand beginnings.
+    Raises `UsageError` after a thousand attempts.
     """
     for _ in range(_MOST_DRAWS):
         places: list[F64] = []
@@ -143,7 +143,7 @@ def _no_place(world: World, what: str) -> UsageError:
 
 
 def resting_height(world: World, name: str) -> float:
-    """Return the height of an object's centre over the table when it lies as it was made [m]."""
+    """Return the height of an object's centre over the table in its modelled orientation [m]."""
     return world.extents(name)[2] / 2
 
 

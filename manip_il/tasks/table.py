@@ -37,10 +37,10 @@ TASKS: dict[str, Task] = {
 
 
 def get_task(name: str, shape: str = "") -> Task:
-    """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or of a Python file, with an object of a shape where given.
+    """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or its Python file, with an object of a shape if given.
 
-    shape: as `Shape.parse` reads it. Raises `UnknownName`, and `UsageError` for a file that holds no task, and for an
-    argument or a shape that cannot be or that the task does not take.
+    shape: as `Shape.parse` reads it. Raises `UnknownName`, and `UsageError` for a file without a task, and for an
+    argument or a shape that is invalid or that the task does not take.
     """
     if name.endswith(SUFFIX):
         task = _of_file(name)
@@ -56,13 +56,13 @@ def get_task(name: str, shape: str = "") -> Task:
     return _shaped(task, shape) if shape else task
 
 
-@cache  # so that the same words are the same task, and its scene is built once
+@cache  # the same text gives the same task, so that its scene is built once
 def _shaped(task: TakesShape, shape: str) -> Task:
     return task.with_shape(Shape.parse(shape))
 
 
 def is_task(name: str) -> bool:
-    """Return whether a task ships, or an installed package brings it: nothing is run to see that."""
+    """Return whether a task ships or an installed package provides it, without running anything."""
     base = name.partition(":")[0]
     return base in TASKS or packaged(GROUP, base) is not None
 

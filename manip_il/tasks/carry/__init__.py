@@ -1,6 +1,6 @@
-"""Carry: an object past what stands on the table, as a reward likes it; `carry:REWARD` for another reward.
+"""Carry: move an object past things on the table as cheaply as possible; `carry:REWARD` sets another reward.
 
-`task.py` is the task, `starts.py` its starts; `layout.py` is what stands where and what a metre of path costs there,
-`grid.py` plans on it, `reward.py` reads rewards; `things.py` has the things as bodies, and what of the hand may meet
-them.
+`task.py` is the task, `starts.py` its starts; `layout.py` has the things' places and the cost of a metre of path,
+`grid.py` plans on it, `reward.py` reads rewards; `things.py` has the things' bodies, and the parts of the hand that
+may hit them.
 """

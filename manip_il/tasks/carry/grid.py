@@ -1,7 +1,7 @@
-"""A grid of the free space of a layout, its costs-to-go for a reward, and their descent from anywhere.
+"""A grid over a layout's free space, its costs-to-go for a reward, and their descent from anywhere.
 
-The grid is laid so that the goal is one of its nodes. Its edges have the features of straight lines, by the same
-integral as any path, so that what inverse reinforcement learning compares is of one kind.
+The goal is one of the grid's nodes. Its edges have the features of straight lines, by the same integral as any path,
+so that inverse reinforcement learning compares like with like.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from manip_il.tasks.carry.layout import Layout
 from manip_il.tasks.carry.reward import Reward
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
-CELL = 0.02  # of the grid, at full scale [m]
-BEYOND = 0.09  # of the grid beyond half the workspace's width, at full scale [m]
-TOP = 0.32  # of the grid over the table, at full scale [m]
-LIFTED = 0.02  # of the object over where it rests, wherever it is not about to be put down [m]
-DOWN = 0.03  # from the goal, sideways, where it may be lower, at full scale [m]
-AHEAD = 3  # cells to which the descent looks from anywhere
-OUTSIDE = 0.12  # from a node with a path, at most, where there is none about, at full scale [m]
-KEPT = 8  # plans of a process
-_STEEP, _SHORT = 0.004, 0.3  # of the descent's average: cost that halves a node's share [m]; price of near nodes
-_QUARTERS = np.array([0.25, 0.5, 0.75])  # of a line, where its room and its costs are looked at
-_LOOK = 24  # points of a path that is snapped, at a quarter of a cell, that one node may stand for
-_SLACK = 0.003  # of the room on the way from beside a node, which is as near to things as can be [m]
-_WORSE = 1e-4  # of the room at the start, on the way out of where there is none [m]
+CELL = 0.02  # grid spacing, at full scale [m]
+BEYOND = 0.09  # how far the grid extends beyond the workspace's half width, at full scale [m]
+TOP = 0.32  # height of the grid over the table, at full scale [m]
+LIFTED = 0.02  # least height of the object over its resting height, except near the goal [m]
+DOWN = 0.03  # sideways distance from the goal within which it may be lower, at full scale [m]
+AHEAD = 3  # how far the descent looks ahead [cells]
+OUTSIDE = 0.12  # largest distance to a node with a path if none is nearby, at full scale [m]
+KEPT = 8  # plans cached per process
+_STEEP, _SHORT = 0.004, 0.3  # weights of the descent's mean: cost scale of a node's share [m]; price of near nodes
+_QUARTERS = np.array([0.25, 0.5, 0.75])  # shares of a line at which its room and its costs are evaluated
+_LOOK = 24  # most points of a snapped path, a quarter cell apart, that one edge may replace
+_SLACK = 0.003  # tolerated lack of room on the way from beside a node that has none to spare [m]
+_WORSE = 1e-4  # how much less room than at the start is tolerated on the way out of a tight place [m]
 
 
 def reaches(robot: Robot, points: F64) -> NDArray[np.bool_]:
-    """Return whether a robot's hand gets to points (N, 3) [m], (N,)."""
+    """Return whether a robot's hand reaches points (N, 3) [m], (N,)."""
     reach = reach_of(robot)
     index = np.floor((points - reach.origin) / reach.cell).astype(np.int64)
     last = np.array(reach.arrives.shape) - 1
@@ -46,7 +46,7 @@ def reaches(robot: Robot, points: F64) -> NDArray[np.bool_]:
 
 
 class _Links(NamedTuple):
-    """Edges of a grid of a shape, sorted by the node they leave: nodes, places on the grid twice as fine, and cells."""
+    """Edges of a grid, sorted by the node they leave: nodes, places on the grid twice as fine, and lengths in cells."""
 
     edges: I64  # (E, 2)
     fine: I64  # (E, 3): from, middle, to
@@ -78,7 +78,7 @@ class Grid:
         (x, y), half = robot.workspace.centre, robot.workspace.half_width + BEYOND * layout.scale
         goal, low = np.array(layout.goal), np.array([x - half, y - half, 0.0])
         sizes = np.array([2 * half, 2 * half, TOP * layout.scale])
-        before = np.floor((goal - low) / self.cell + 1e-9).astype(np.int64)  # nodes on this side of the goal
+        before = np.floor((goal - low) / self.cell + 1e-9).astype(np.int64)  # nodes before the goal
         self.origin = goal - self.cell * before
         counts = np.maximum(np.floor(sizes / self.cell + 1e-9).astype(np.int64), before) + 1
         self.shape: tuple[int, int, int] = tuple(counts.tolist())
@@ -97,7 +97,7 @@ class Grid:
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
-        """Whether an object may be at each node, (S,): within reach, off things, and lifted."""
+        """Whether an object may be at each node, (S,): within reach, clear of things, and lifted."""
         layout, points = self.layout, self.points
         off = np.hypot(*(points[:, :2] - np.array(layout.goal[:2])).T)
         low = (points[:, 2] < layout.half + LIFTED - 1e-9) & (off > DOWN * layout.scale)
@@ -107,7 +107,7 @@ class Grid:
 
     @cached_property
     def _links(self) -> _Links:
-        """Return those of the edges that are free from end to end."""
+        """Return the edges that are free from end to end."""
         every = _links(self.shape)
         kept: NDArray[np.bool_] = np.all(self.free[every.edges], axis=1)
         middles = every.fine[kept, 1]
@@ -133,11 +133,11 @@ class Grid:
         return plan(problem, np.ones(1)).costs
 
     def _number(self, index: I64) -> I64:
-        """Numbers (n,) of nodes by their places along x, y and z, (n, 3)."""
+        """Numbers (n,) of the nodes with indices (n, 3) along x, y and z."""
         return np.array(np.ravel_multi_index(tuple(index.T), self.shape), np.int64)
 
     def near(self, position: F64) -> I64:
-        """Return the nodes within `AHEAD` cells of a position (3,) [m], and the goal where it is, (n,)."""
+        """Return the free nodes within `AHEAD` cells of a position (3,) [m], (n,)."""
         around = np.round((position - self.origin) / self.cell).astype(np.int64) + _AROUND
         inside = around[((around >= 0) & (around < self.shape)).all(axis=1)]
         nodes = self._number(inside)
@@ -147,8 +147,8 @@ class Grid:
     def snap(self, positions: F64) -> I64:
         """Return the path of free nodes along a path of positions (T, 3) [m], joined by edges, (n,).
 
-        A straight line becomes a path no longer than the grid's shortest. Where there is no free node, it goes the
-        shortest way to the next one; near the goal, it ends there.
+        A straight line becomes a path no longer than the grid's shortest. Gaps without free nodes are bridged by the
+        shortest path; a path that ends near the goal is extended to it.
         """
         dense = _dense(positions, self.cell / 4)
         index = np.round((dense - self.origin) / self.cell).astype(np.int64).clip(0, np.array(self.shape) - 1)
@@ -158,7 +158,7 @@ class Grid:
             nodes.append(self.goal)
         path = nodes[:1]
         while path and path[-1] != nodes[-1]:
-            begin = len(nodes) - 1 - nodes[::-1].index(path[-1])  # where it comes back to, it has not been away
+            begin = len(nodes) - 1 - nodes[::-1].index(path[-1])  # skips detours that return to this node
             nodes = nodes[begin:]
             ahead = [place for place, node in enumerate(nodes[1:_LOOK], 1) if self.joined(path[-1], node)]
             last = ahead[-1] if ahead else 1
@@ -184,7 +184,7 @@ _AROUND = np.array([step for step in np.ndindex(*[2 * AHEAD + 1] * 3)]) - AHEAD
 
 
 def _dense(positions: F64, step: float) -> F64:
-    """A path (T, 3) with points between, at most `step` apart [m]."""
+    """A path (T, 3) with points added so that they are at most `step` apart [m]."""
     found = [positions[:1]]
     for start, end in pairwise(positions):
         count = max(1, int(np.ceil(np.linalg.norm(end - start) / step)))
@@ -194,7 +194,7 @@ def _dense(positions: F64, step: float) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Costs-to-go of a grid, and the way down from anywhere.
+    """Costs-to-go of a grid, and their descent from anywhere.
 
     costs: (S,); weights: (K,) per metre.
     """
@@ -204,11 +204,11 @@ class Descent:
     weights: F64
 
     def leads(self, position: F64) -> bool:
-        """Return whether there are nodes about a position (3,) [m] from which a path leads to the goal."""
+        """Return whether a path leads to the goal from nodes near a position (3,) [m]."""
         return len(self._around(position)) > 0
 
     def _around(self, position: F64) -> I64:
-        """Nodes with a path within `AHEAD` cells of a position (3,) [m]; where there are none, the nearest, (n,)."""
+        """Nodes with a path within `AHEAD` cells of a position (3,) [m]; if there are none, the nearest, (n,)."""
         nodes = self.grid.near(position)
         nodes = nodes[np.isfinite(self.costs[nodes])]
         if len(nodes):
@@ -218,10 +218,10 @@ class Descent:
         return np.array([nearest] if off[nearest] < OUTSIDE * self.grid.layout.scale else [], np.int64)
 
     def look(self, position: F64) -> tuple[float, F64 | None]:
-        """Return the cost-to-go at a position (3,) [m], and where to head from there, some `AHEAD` cells off, (3,).
+        """Return the cost-to-go at a position (3,) [m], and a point to head for, about `AHEAD` cells away, (3,).
 
-        The cost is that of the cheapest straight line to a node and of the path from there: infinite, and None to head
-        for, where no free line leads to a node with a path.
+        The cost is that of the cheapest straight line to a node and of the path from there. It is infinite, and the
+        point None, if no free line leads to a node with a path.
         """
         nodes = self._around(position)
         ends = self.grid.points[nodes]
@@ -246,7 +246,7 @@ class Descent:
         return self.grid.layout.densities(points) @ self.weights
 
     def _heading(self, position: F64, price: float, nodes: I64, ends: F64, totals: F64, off: F64, spare: float) -> F64:
-        """Average of the best nodes, the farther ones first, so that neighbouring positions head alike, (3,) [m]."""
+        """Mean of the best nodes, farther ones preferred, so that neighbouring positions head alike, (3,) [m]."""
         layout, radius = self.grid.layout, AHEAD * self.grid.cell
         late = np.where(nodes == self.grid.goal, 0.0, _SHORT * price * (radius - off))
         shares = np.exp(-(totals + late - (totals + late).min()) / (_STEEP * layout.scale * price))
@@ -259,6 +259,6 @@ class Descent:
 
 @lru_cache(KEPT)
 def descent(layout: Layout, reward: Reward, robot: Robot) -> Descent:
-    """Return the descent of a layout's costs-to-go for a reward, computed once and kept for a while."""
+    """Return the descent of a layout's costs-to-go for a reward, computed once and cached."""
     grid, weights = Grid(layout, robot), np.array(reward.weights)
     return Descent(grid, grid.costs_to_go(weights), weights)

@@ -1,7 +1,7 @@
 """Layouts of `carry`: what stands on the table, and what a metre of path costs there, as pure geometry.
 
 Paths are those of the carried object's centre. Features are densities per metre of path, functions of a point alone;
-whatever has a length, a path of points or an edge of the grid, has their line integrals.
+a path of points and an edge of the grid have their line integrals.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 
 
 class Thing(NamedTuple):
-    """Half its lengths along x and y, and its height [m], on the table of an arm whose workspace is 30 cm wide."""
+    """Half lengths along x and y, and height of a thing [m], for an arm whose workspace is 30 cm wide."""
 
     half: tuple[float, float]
     height: float
@@ -31,24 +31,24 @@ THINGS = {
     "laptop": Thing((0.065, 0.048), 0.03),
     "candle": Thing((0.016, 0.016), 0.11),
 }
-FULL = 0.15  # half the width of a workspace in which things have these sizes [m]
-ASIDE, ABOVE = 0.012, 0.012  # room between a thing and what is carried past it, beside it and over it [m]
-HEIGHT = 0.1  # in which the feature `height` counts [m]
-OVER = 0.015  # standard deviation of how "above" ends beside a thing [m]
-NEAR = 0.08  # the same of how near something is [m]
-NEAR_EDGE = 0.05  # the same of the table's edge [m]
-STEP = 0.005  # of the quadrature along a path, at most [m]
+FULL = 0.15  # half width of a workspace in which things have these sizes [m]
+ASIDE, ABOVE = 0.012, 0.012  # clearance between a thing and what is carried past it, beside and over it [m]
+HEIGHT = 0.1  # unit of the feature `height` [m]
+OVER = 0.015  # standard deviation of the `above` features beside a thing [m]
+NEAR = 0.08  # standard deviation of the `near` features of things [m]
+NEAR_EDGE = 0.05  # standard deviation of `near_edge` [m]
+STEP = 0.005  # longest quadrature step along a path [m]
 
 
 class Edge(NamedTuple):
-    """Edge of the table: a point on it (x, y) [m], and the direction away from the table, of length 1."""
+    """Edge of the table: a point on it (x, y) [m], and the unit vector away from the table."""
 
     at: tuple[float, float]
     outwards: tuple[float, float]
 
 
 class Part(NamedTuple):
-    """Part of what moves: its lowest point from the object's centre, and how far it reaches to all sides [m]."""
+    """Part of the object or the hand: its lowest point from the object's centre, and its radius [m]."""
 
     bottom: float
     radius: float
@@ -56,11 +56,11 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """Places of what there is, in one episode.
+    """What stands on the table in one episode.
 
-    scale: of all lengths, 1 for a workspace of `FULL`. goal: of the object's centre [m]. places: (x, y) [m] of the
-    things there are, by name. edge: None where none is near. half: of the object's height [m]. parts: of object and
-    hand, as they hang on the object's centre.
+    scale: of all lengths, 1 for a workspace of `FULL`. goal: target of the object's centre [m]. places: (x, y) [m] of
+    the things present, by name. edge: None if none is near. half: half the object's height [m]. parts: of object and
+    hand, relative to the object's centre.
     """
 
     scale: float
@@ -72,7 +72,7 @@ class Layout:
 
     @cached_property
     def boxes(self) -> tuple[tuple[str, F64, F64, float], ...]:
-        """Name, middle (2,), half lengths (2,) and height of every thing there is [m]."""
+        """Name, middle (2,), half lengths (2,) and height of every thing present [m]."""
         return tuple(
             (name, np.array(place), self.scale * np.array(THINGS[name].half), self.scale * THINGS[name].height)
             for name, place in self.places
@@ -80,7 +80,7 @@ class Layout:
 
     @cached_property
     def meeting(self) -> bool:
-        """Whether a thing stands in another."""
+        """Whether two things overlap."""
         return any(
             bool((np.abs(middle - other) < half + its).all())
             for (_, middle, half, _), (_, other, its, _) in combinations(self.boxes, 2)
@@ -101,9 +101,9 @@ class Layout:
         return found
 
     def room(self, points: F64) -> F64:
-        """Return how much room there is to spare about things for an object carried at points (N, 3), (N,) [m].
+        """Return the clearance to spare for an object carried at points (N, 3), (N,) [m].
 
-        Where it is negative, object or hand come nearer to a thing than `ASIDE` or `ABOVE`.
+        If it is negative, object or hand is nearer to a thing than `ASIDE` or `ABOVE`.
         """
         found = np.full(len(points), np.inf)
         bottoms, radii = self._parts

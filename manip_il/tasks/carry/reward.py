@@ -12,7 +12,7 @@ from manip_il.errors import ManipError, UsageError, nearest, shorten
 
 FEATURES = (
     "length",  # 1
-    "height",  # of the object over where it rests, in tenths of a metre
+    "height",  # height of the object over its resting height, in tenths of a metre
     "above_vase",  # 1 over it, and within about 2 cm beside it
     "above_laptop",
     "above_candle",
@@ -21,16 +21,16 @@ FEATURES = (
     "near_candle",
     "near_edge",  # 1 at the edge of the table or beyond it, 0.6 at 5 cm
 )
-MOST = 1e6  # of a weight
-_LARGEST = 1 << 20  # of a file [bytes]
+MOST = 1e6  # largest weight
+_LARGEST = 1 << 20  # largest file [bytes]
 
 
 @dataclass(frozen=True)
 class Reward:
     """Weights, in the order of `FEATURES`: the costs of a metre of path.
 
-    Raises `UsageError` for weights that are not finite or below 0, and for a `length` of 0: a path without a cost of
-    its length may be of any.
+    Raises `UsageError` for weights that are not finite or below 0, and for a `length` of 0: paths without a cost of
+    length could have any.
     """
 
     weights: tuple[float, ...]
@@ -44,9 +44,9 @@ class Reward:
 
     @classmethod
     def of(cls, weights: Mapping[str, object]) -> Reward:
-        """Return the reward of weights by name, 0 where none is said.
+        """Return the reward of weights by name; missing ones are 0.
 
-        Raises `UsageError` for a name that is no feature, and for what is no number.
+        Raises `UsageError` for a name that is no feature, and for a value that is no number.
         """
         for name in weights:
             if name not in FEATURES:
@@ -59,7 +59,7 @@ class Reward:
 
     @classmethod
     def parse(cls, text: str) -> Reward:
-        """Return the reward that a text means: a shipped one's name, a `reward.json`, or `NAME=NUMBER,...`.
+        """Return the reward that a text describes: a shipped one's name, a `reward.json`, or `NAME=NUMBER,...`.
 
         Raises `UsageError` for any other text, and for a file that cannot be read or is no reward.
         """
@@ -82,7 +82,7 @@ class Reward:
 
     @classmethod
     def _read(cls, path: Path) -> Reward:
-        """Read the lists `names` and `weights` of a `reward.json`, which has whatever else."""
+        """Read the lists `names` and `weights` of a `reward.json`, and ignore the rest."""
         try:
             tree = checks.mapping(str(path), checks.read_json(path, "a reward: names and weights", _LARGEST))
             names, weights = (checks.array(f"{path}: {key}", tree.get(key)) for key in ("names", "weights"))
@@ -92,7 +92,7 @@ class Reward:
 
     @property
     def numbers(self) -> str:
-        """`NAME=NUMBER,...` of the weights that are not 0, exactly."""
+        """`NAME=NUMBER,...` of the nonzero weights, exactly."""
         pairs = zip(FEATURES, self.weights, strict=True)
         return ",".join(f"{name}={_short(weight)}" for name, weight in pairs if weight)
 

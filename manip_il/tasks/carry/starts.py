@@ -1,4 +1,4 @@
-"""Starts of `carry`: which things there are, and where they leave a way."""
+"""Starts of `carry`: which things are present, and places that leave a path."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from manip_il.tasks.starts import UPRIGHT
 
 F64 = NDArray[np.float64]
 
-SPARE = 0.008  # room beyond what is kept anyway, at the start and at the goal [m]
-GAP = 0.02  # between two things, at full scale [m]
-BETWEEN, OFF = 0.8, 0.05  # share of things that stand between start and goal, and how far off that line, as a deviation
-FROM_EDGE = (0.045, 0.09)  # of start and goal from the table's edge, at least, and of the nearer one at most [m]
-TRIES = 40  # of a thing's place, before the layout is drawn anew
-_SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # of the table where its edge may be: away from the robot, left, right
+SPARE = 0.008  # extra clearance at the start and at the goal [m]
+GAP = 0.02  # least gap between two things, at full scale [m]
+BETWEEN, OFF = 0.8, 0.05  # share of things between start and goal, and their standard deviation from that line [m]
+FROM_EDGE = (0.045, 0.09)  # range of the table edge's distance from the nearer of start and goal [m]
+TRIES = 40  # draws of a thing's place before the layout is drawn again
+_SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # sides that the edge may be on: away from the robot, left, right
 
 
 def draw_names(rng: np.random.Generator) -> list[str]:
-    """Draw which one to four of the things there are, the table's edge among them."""
+    """Draw which one to four things are present, counting the table's edge."""
     names = rng.permutation([*THINGS, EDGE]).tolist()
     return names[: int(rng.integers(1, len(names) + 1))]
 
 
 def draw_things(rng: np.random.Generator, world: World, here: Sequence[str], at: F64, goal: F64) -> dict[str, Pose]:
-    """Draw where the things stand that are there, beside an object at (3,) with a goal (3,) [m].
+    """Draw the places of the things present, beside an object at (3,) with a goal (3,) [m].
 
-    Return poses of all things, empty where they do not fit.
+    Return the poses of all things, empty if they do not fit.
     """
     scene, lengths = world.scene, world.extents(OBJECT)
     x, y = scene.robot.workspace.centre
@@ -45,7 +45,7 @@ def draw_things(rng: np.random.Generator, world: World, here: Sequence[str], at:
         poses[EDGE] = edge[0], np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
     places: dict[str, F64] = {}
     for name in (one for one in THINGS if one in here):
-        nearest = x - scene.robot.workspace.half_width + scale_of(scene) * THINGS[name].half[0]  # to the robot
+        nearest = x - scene.robot.workspace.half_width + scale_of(scene) * THINGS[name].half[0]  # towards the robot
         for _ in range(TRIES):
             place = _draw_place(rng, scene, at, goal)
             layout = make_layout(scene, lengths, goal, {**places, name: place}, edge)
@@ -58,7 +58,7 @@ def draw_things(rng: np.random.Generator, world: World, here: Sequence[str], at:
 
 
 def _draw_edge(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> tuple[F64, F64]:
-    """Draw a point on the table's edge and the direction away from the table, (3,) each, off start and goal."""
+    """Draw a point on the table's edge and the direction away from the table, (3,) each, clear of start and goal."""
     scale, middle = scale_of(scene), np.array([*scene.robot.workspace.centre, 0.0])
     outwards = np.array([*_SIDES[rng.integers(len(_SIDES))], 0.0])
     farthest = max(float((one - middle) @ outwards) for one in (at, goal))
@@ -78,7 +78,7 @@ def _draw_place(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> F
 
 
 def _fits(layout: Layout, home: F64, at: F64) -> bool:
-    """Whether the last thing leaves room at the start, at the goal and to the hand at home, to others and the edge."""
+    """Whether the last thing leaves room at the start, the goal and the hand's home, and to others and the edge."""
     ends = np.array([at, layout.goal, [*home[:2], max(home[2], layout.half)]])
     if layout.room(ends).min() < SPARE:
         return False

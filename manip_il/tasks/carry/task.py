@@ -1,7 +1,7 @@
-"""Carry: the object to the goal over a table on which things stand, past them as a reward likes it.
+"""Carry: move the object to the goal past things on the table, on the cheapest path for a reward.
 
-The way is planned for the object's centre, on a grid of the free space of the episode's layout. The reward's weights
-are part of the state, as places of mocap bodies that are nowhere seen, so that a label is a function of the state.
+The path is planned for the object's centre, on a grid over the free space of the episode's layout. The reward's weights
+are part of the state, as positions of invisible mocap bodies, so that a label is a function of the state.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying
 F64 = NDArray[np.float64]
 
 NAME = "carry"
-APART = 0.22  # of the goal from the object at the start, sideways, at full scale [m]
-HIGHEST = 0.2  # of a goal over where the object rests, at full scale [m]
+APART = 0.22  # least sideways distance of the goal from the object at the start, at full scale [m]
+HIGHEST = 0.2  # greatest height of a goal over the object's resting height, at full scale [m]
 STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
-OVER, STEEP = 0.012, 8.0  # misalignment at which an empty hand may be down beside things [m]; its rise beyond that
-_DRAWS, _TOO_MANY = 4_000, 80  # of starts, and those after which there is one thing less
+OVER, STEEP = 0.012, 8.0  # misalignment up to which an empty hand may be down beside things [m]; slope beyond
+_DRAWS, _TOO_MANY = 4_000, 80  # draws of a start; after every so many, one more thing is left out
 _GRASPED = 0.5  # progress of an object that is held
 
 
@@ -56,7 +56,7 @@ def descent_of(world: World) -> Descent:
 
 
 def _look(world: World) -> tuple[float, F64 | None]:
-    """Cost-to-go of the object where it is, and where it is to head; computed once a state."""
+    """Cost-to-go at the object's position, and the point to head for; computed once per state."""
     return world.remember("look", lambda: descent_of(world).look(world.pose(OBJECT).position))
 
 
@@ -65,36 +65,36 @@ def _at_goal(world: World) -> bool:
 
 
 def _to_goal(world: World) -> Target:
-    """Carry the object down the costs-to-go; stay where no path is."""
+    """Carry the object down the costs-to-go; stay if there is no path."""
     heading = world.goal if _at_goal(world) else _look(world)[1]
     at, ee = world.pose(OBJECT).position, world.ee.position
     position = ee + (0.0 if heading is None else heading - at)
     position[2] = max(position[2], world.robot.ee.lowest)
-    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # where a hand that turns would meet a thing
+    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # a turning hand would hit a thing
     yaw = world.hand_yaw if beside else world.ahead(position)
     return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
 
 
 def _safe_height(world: World) -> float:
-    """Height of `ee` over the table at which an open hand is over everything on it [m]."""
+    """Height of `ee` over the table at which an open hand clears everything on it [m]."""
     layout = layout_of(world, OBJECT)
     tallest = max((layout.scale * THINGS[name].height for name, _ in layout.places), default=0.0)
     return tallest + ABOVE - min(part.bottom for part in layout.parts[1:]) if tallest else 0.0
 
 
 def _rise(world: World) -> float:
-    """Return the height over its grasp that the hand keeps for the things around, by how far off it is [m]."""
+    """Return the height over its grasp at which the hand clears the things around, by its misalignment [m]."""
     g = grasp_of(world, OBJECT)
     return min(STEEP * max(0.0, g.off - OVER), max(0.0, _safe_height(world) - g.at[2]))
 
 
 def _approach(world: World) -> Target:
-    """Approach as any object is, but above all things until the hand is over it."""
+    """Approach as for any object, but above all things until the hand is over it."""
     return approach(world, OBJECT, rise=_rise(world))
 
 
 def _hand_fits(world: World) -> bool:
-    """Whether the hand is off the things where it grasps the object."""
+    """Whether the hand is clear of the things when it grasps the object."""
     layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
     if layout.room(world.pose(OBJECT).position[None])[0] >= -ASIDE:
         return True
@@ -110,9 +110,9 @@ _RUNGS = (
 
 @dataclass(frozen=True)
 class Carry(PickPlace):
-    """Carry the object's centre to the goal past the things on the table, as cheaply as can be for a reward.
+    """Carry the object's centre to the goal past the things on the table, as cheaply as possible for a reward.
 
-    reward: what starts are about; the expert reads it from the state.
+    reward: the one that starts put into the state, where the expert reads it.
     """
 
     name: str = NAME
@@ -127,16 +127,16 @@ class Carry(PickPlace):
         return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
 
     def with_argument(self, text: str) -> Self:
-        """Return the task with starts that are about the reward that a text means, whose numbers are in its name."""
+        """Return the task with the reward that a text describes, named by its numbers."""
         reward = Reward.parse(text)
         return replace(self, name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}", reward=reward)
 
     def fitted(self, robot: Robot) -> Self:
-        """Return the task with things of a size for a robot's workspace."""
+        """Return the task with things scaled to a robot's workspace."""
         return replace(self, scale=robot.workspace.half_width / FULL)
 
     def build(self, spec: mujoco.MjSpec) -> None:
-        """Add the object and the goal, the things, and what holds the reward."""
+        """Add the object and the goal, the things, and the bodies that hold the reward."""
         super().build(spec)
         add_things(spec, self.scale)
 
@@ -159,11 +159,11 @@ class Carry(PickPlace):
         )
 
     def observe(self, world: World) -> Observed:
-        """Return what `pick_place` does, where every thing is and whether it is there, but nothing of the reward."""
+        """Return what `pick_place` observes, and every thing's position and presence, but not the reward."""
         return {**observe_cube(world, OBJECT), **observe_things(world)}
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label, empty where there is one: no room for the hand, or no way to the goal."""
+        """Return why there is no sound label (no room for the hand, or no path to the goal), or ""."""
         layout, at = layout_of(world, OBJECT), world.pose(OBJECT).position
         if layout.meeting:
             return "a thing stands in another"
@@ -181,7 +181,7 @@ class Carry(PickPlace):
         return TASTE_BODIES
 
     def progress(self, world: World) -> float:
-        """Return progress by the way to the grasp, then by the cost-to-go in metres of path at the goal."""
+        """Return progress by the distance to the grasp, then by the cost-to-go as metres of path at the goal."""
         if not held(world, OBJECT):
             return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
         if _at_goal(world):
@@ -201,7 +201,7 @@ def _draw_goal(rng: np.random.Generator, world: World, at: F64) -> F64:
 
 
 def _has_way(world: World, at: F64, goal: F64) -> bool:
-    """Whether a goal is off the object and the hand reaches over all things on the way there, whatever these are."""
+    """Whether a goal is away from the object, and the hand can carry it there over any things."""
     scale = scale_of(world.scene)
     if math.dist(at[:2], goal[:2]) < APART * scale or not world.reach.has(goal):
         return False

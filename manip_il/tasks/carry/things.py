@@ -1,4 +1,4 @@
-"""Things of `carry` as bodies, the layout and the reward that a world has, and what of a hand may meet a thing."""
+"""Bodies of `carry`'s things, a world's layout and reward, and the parts of a hand that may hit a thing."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ Pose = tuple[F64, F64]  # position (3,) [m], quaternion wxyz (4,)
 
 EDGE = "edge"  # the mocap body of the table's edge; its x points away from the table
 TASTE_BODIES = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights
-LEANING = 0.01  # how much farther a hand that leans reaches to all sides [m]
-_ALIKE = 0.005  # radii of parts that count as one [m]
-_BARELY = 0.004  # room that a hand keeps from a thing beside which it grasps [m]
-PARKED = 0.25  # of what is not there, under the table's top [m]
-_PLATE = (0.15, 0.36, 0.0005)  # half of what lies beyond the edge, which is only seen [m]
+LEANING = 0.01  # extra radius of a leaning hand [m]
+_ALIKE = 0.005  # difference of radii up to which parts count as one [m]
+_BARELY = 0.004  # clearance of a grasping hand from a thing beside it [m]
+PARKED = 0.25  # depth of absent things below the table's top [m]
+_PLATE = (0.15, 0.36, 0.0005)  # half lengths of the visual plate beyond the edge [m]
 _DARK, _LID, _KEYS = (0.16, 0.17, 0.20), (0.62, 0.64, 0.68), (0.20, 0.21, 0.24)
 _CLAY, _WAX, _FLAME = (0.20, 0.45, 0.52), (0.96, 0.93, 0.84), (1.0, 0.62, 0.15)
-_LOOKS = {  # of a thing: kind, half its size, its middle, in shares of the thing's box; colour
+_LOOKS = {  # visual geoms: kind, half size and middle in shares of the thing's box, colour
     "vase": (
         ("CYLINDER", (0.60, 0.05), 0.05, _CLAY),
         ("ELLIPSOID", (1.0, 0.36), 0.42, _CLAY),
@@ -43,13 +43,13 @@ _LOOKS = {  # of a thing: kind, half its size, its middle, in shares of the thin
 
 
 def add_things(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add every thing, solid as its box, the table's edge, and what holds the weights of the reward."""
+    """Add every thing with its box for contacts, the table's edge, and the bodies that hold the reward."""
     for name, thing in THINGS.items():
         body = add_furniture(spec, name)
         body.pos = [0.5, 0, -PARKED]
         half = scale * np.array([*thing.half, thing.height / 2])
         add_part(body, name, half.tolist(), (0, 0, half[2]), _LID)
-        body.first_geom().rgba = [0, 0, 0, 0]  # what is seen of it lies within
+        body.first_geom().rgba = [0, 0, 0, 0]  # its visual geoms lie within
         for kind, (wide, tall), middle, colour in _LOOKS[name]:
             size = half * [wide, wide, 2 * tall]
             _add_look(body, kind, size if kind != "CYLINDER" else size[[0, 2, 2]], middle * 2 * half[2], colour)
@@ -74,12 +74,12 @@ def _add_look(body: object, kind: str, size: F64, up: float, colour: Sequence[fl
 
 
 def scale_of(scene: Scene) -> float:
-    """Return the scale of the things for an arm: its workspace's width in that of `FULL`."""
+    """Return the scale of the things for an arm: its workspace's half width over `FULL`."""
     return scene.robot.workspace.half_width / FULL
 
 
 def reward_in(world: World) -> Reward:
-    """Return the reward that an episode is about."""
+    """Return the reward of an episode."""
     return world.remember("reward", lambda: _reward(world))
 
 
@@ -93,7 +93,7 @@ def is_there(world: World, name: str) -> bool:
 
 
 def layout_of(world: World, name: str) -> Layout:
-    """Return the layout of an episode in which an object is carried to the goal; computed once a state."""
+    """Return the layout of an episode in which an object is carried to the goal; computed once per state."""
     return world.remember(("layout", name), lambda: _layout(world, name))
 
 
@@ -131,7 +131,7 @@ def _numbers(vector: F64) -> tuple[float, float, float]:
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
     """Return the layout of an episode with an object by that name, as `environment_state` shows it.
 
-    seen: numbers by name. Raises `MismatchError` where one that it takes is missing.
+    seen: numbers by name. Raises `MismatchError` if one that it needs is missing.
     """
 
     def vector(of: str) -> F64:
@@ -150,7 +150,7 @@ def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layou
 
 
 def observe_things(world: World) -> dict[str, F64 | float]:
-    """Return where every thing is [m] and whether it is there, and the table's edge: a point on it, its direction."""
+    """Return every thing's position [m] and presence, and the table's edge: a point on it, and its direction."""
     found: dict[str, F64 | float] = {}
     for name in (*THINGS, EDGE):
         found |= {name: world.pose(name).position, f"{name}.here": float(is_there(world, name))}
@@ -160,7 +160,7 @@ def observe_things(world: World) -> dict[str, F64 | float]:
 class Box(NamedTuple):
     """Upright box around a part of the hand: its lowest point over `ee`, its middle (2,) and half lengths (2,) [m].
 
-    Along the hand's own x and y, from `ee`.
+    The latter two are along the hand's own x and y, from `ee`.
     """
 
     bottom: float
@@ -169,7 +169,7 @@ class Box(NamedTuple):
 
 
 class Hand(NamedTuple):
-    """The open hand, pointing down: parts as heights and radii about the vertical through `ee`, the same as boxes.
+    """The open, downward hand: its parts as heights and radii about the vertical through `ee`, and as boxes.
 
     home: where `ee` is at home, (3,) [m].
     """
@@ -215,7 +215,7 @@ def _box(points: F64, axes: F64) -> Box:
 
 
 def fits(hand: Hand, at: F64, yaw: float, layout: Layout) -> bool:
-    """Return whether a hand at a point (3,) [m], turned by a yaw [rad], is off the things of a layout."""
+    """Return whether a hand at a point (3,) [m], turned by a yaw [rad], is clear of the things of a layout."""
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])  # the hand's x and y
     for _, middle, half, height in layout.boxes:
         for box in hand.boxes:

@@ -1,4 +1,4 @@
-"""What stock environments share: a count of steps, and how a state and a model are read."""
+"""What stock environments share: counts of steps, and reading MuJoCo's state."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 class StockBase:
     """An environment of another package, whose reset and step are its own."""
 
-    world: ClassVar[None] = None  # its expert restores states
+    world: ClassVar[None] = None  # its expert restores states itself
     model: mujoco.MjModel
     data: mujoco.MjData
 
@@ -26,20 +26,20 @@ class StockBase:
         raise ManipError("a stock environment cannot be copied or pickled; use get_state()")
 
     def begin_step(self) -> None:
-        """Leave the world as it is: nothing disturbs it."""
+        """Do nothing: stock environments have no disturbances."""
 
     @property
     def solved(self) -> bool:
-        """State of the task after the last step."""
+        """Whether the task is solved after the last step."""
         return self._streak > 0
 
     def _begin(self, state: State | None = None) -> None:
-        """Count from 0, or on from a state."""
+        """Start counting from 0, or from a state's counts."""
         self._step, self._streak, self._ever = (state.step, state.streak, state.ever) if state else (0, 0, False)
         self.reward = 0.0
 
     def _count(self, reward: float, solved: bool) -> None:
-        """Count a step and what came of it."""
+        """Count a step, its reward and whether it solved the task."""
         self.reward = reward
         self._step += 1
         self._streak = self._streak + 1 if solved else 0

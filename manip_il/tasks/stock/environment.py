@@ -1,4 +1,4 @@
-"""One Fetch environment of gymnasium-robotics under this program's interface; nothing of it is changed."""
+"""One Fetch environment of gymnasium-robotics, unmodified, under this program's interface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-# First: it chooses the OpenGL that mujoco takes on import.
+# First: it chooses OpenGL before mujoco is imported.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import MismatchError
 from manip_il.mdp import Observation, State
@@ -23,7 +23,7 @@ F64 = NDArray[np.float64]
 
 
 class StockActions(ActionSpace):
-    """Actions [dx, dy, dz, fingers] in [-1, 1]; what is near a state does not depend on the state."""
+    """Actions [dx, dy, dz, fingers] in [-1, 1]; they do not depend on the state."""
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
         """Draw any action, (4,), whatever the state (4,) is."""
@@ -61,18 +61,18 @@ class StockEnv(StockBase):
         Raises `NotFiniteError`, `MismatchError`.
         """
         _, reward, _, _, info = self._env.step(ACTIONS.clip(action, self._step))
-        if self.task.blocked:  # it has computed all poses again
+        if self.task.blocked:  # its step has recomputed all poses
             self._remember()
         self._count(float(reward), bool(info["is_success"]))
         return action
 
     @property
     def progress(self) -> float:
-        """Share of the task that is done: 1 within the tolerance, 0.5 at twice as far."""
+        """Share of the task that is done: 1 within the tolerance, 0.5 at twice that distance."""
         return TOLERANCE / max(TOLERANCE, self.distance())
 
     def distance(self) -> float:
-        """Return how far cube, or gripper, and goal are apart [m]."""
+        """Return the distance of the cube, or the gripper if there is none, from the goal [m]."""
         return float(np.linalg.norm((self.object if self.task.has_object else self.gripper) - self.goal))
 
     @property
@@ -92,7 +92,7 @@ class StockEnv(StockBase):
 
     @property
     def opening(self) -> float:
-        """Distance of the fingers [m]."""
+        """Distance between the fingers [m]."""
         return sum(float(self.data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0]) for side in "rl")
 
     @property
@@ -129,22 +129,22 @@ class StockEnv(StockBase):
 
     @property
     def positions(self) -> dict[str, F64]:
-        """Positions (3,) [m] of hand and goal, and of the cube where there is one."""
+        """Positions (3,) [m] of hand and goal, and of the cube if there is one."""
         return {"hand": self.gripper, "goal": self.goal} | ({"object": self.object} if self.task.has_object else {})
 
     def _remember(self) -> None:
-        """Poses are those of positions and velocities as they are now."""
+        """Store the positions and velocities that the poses are computed from."""
         self._begun = (self.data.qpos.copy(), self.data.qvel.copy())
 
     def _run_physics(self, action: NDArray[Any]) -> None:
-        """Run the environment's physics steps in two calls, between which the last one's beginning is remembered."""
+        """Run the environment's physics steps in two calls, to store the state before the last one."""
         mujoco.mj_step(self.model, self.data, nstep=self._env.n_substeps - 1)
         self._remember()
         mujoco.mj_step(self.model, self.data, nstep=1)
 
 
 def _make(task: StockTask) -> Any:
-    """The environment without gymnasium's wrappers, whose time limit is the rollout's horizon."""
+    """The environment without gymnasium's wrappers: the rollout's horizon is its time limit."""
     with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics announces its versions there
         module = import_module(f"gymnasium_robotics.envs.fetch.{task.module}")
     return getattr(module, task.cls)(reward_type="sparse")

@@ -21,7 +21,7 @@ StockLabeller = StockExpert | AlohaExpert
 def make_stock(
     robot: str, task: str, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
 ) -> StockEnvironment:
-    """Make an environment. Raises `UsageError` for cameras that it has not, or conditions that change it."""
+    """Make an environment. Raises `UsageError` for cameras that it does not have, or conditions that change it."""
     check_cameras(robot, cameras)
     if changed := [one.name for one in conditions if one.ranges]:
         raise UsageError(
@@ -37,7 +37,7 @@ def make_stock_expert(robot: str, task: str) -> StockLabeller:
 
 
 def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
-    """Raise `UsageError` for cameras that a robot, stock or not, has not."""
+    """Raise `UsageError` for cameras that a robot, stock or not, does not have."""
     known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
     if cameras is not None and not known:
         raise UsageError(f"{robot} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
@@ -46,5 +46,5 @@ def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
 
 @cache
 def described_stock(robot: str, task: str) -> StockEnvironment:
-    """Return an environment for descriptions, which no episode runs in."""
+    """Return an environment for descriptions; no episode runs in it."""
     return make_stock(robot, task)

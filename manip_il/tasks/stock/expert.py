@@ -1,7 +1,7 @@
 """Experts of the stock environments: ladders over gripper, cube and goal, latest rung first.
 
 All are functions of the state alone. An action of 1 moves the gripper by about `REACH` in a control step along each
-axis by itself, so that the longest of x, y and z says how long a way takes.
+axis independently, so that the longest of x, y and z determines how long a move takes.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from manip_il.tasks.stock.table import PHASES
 
 F64 = NDArray[np.float64]
 
-REACH = 0.032  # way of the gripper in one control step at an action of 1 [m]
+REACH = 0.032  # displacement of the gripper in one control step at an action of 1 [m]
 OPEN, CLOSE = 1.0, -1.0
-HALF = 0.025  # of the cube's edge [m]
+HALF = 0.025  # half the cube's edge length [m]
 
 # Pick and place; heights are of the gripper over the cube's middle
 GRASP_HEIGHT = 0.0145  # [m]
 CLEAR = 0.053  # height at which the fingers pass over the cube [m]
-STRADDLE = 0.042  # off the cube in y, from where the gripper comes to be over it while it goes down [m]
-NEAR = np.array([0.082, 0.04, 0.082])  # way that the gripper still goes while the fingers close [m]
-OPENING = 0.25  # how much wider the fingers must be for a cube that is farther off in x, a ratio
-LEAD = 0.04  # way in y towards the goal on which the gripper sets out while they close, at most [m]
-CLOSED_ON = 0.03  # way to the grasp at which it begins to set out [m]
-GRASPED = np.array([0.03, 0.026, 0.04])  # off the cube in x, y, z at most when the fingers hold it [m]
+STRADDLE = 0.042  # offset from the cube in y from which the gripper gets over it while descending [m]
+NEAR = np.array([0.082, 0.04, 0.082])  # distance that the gripper still covers while the fingers close [m]
+OPENING = 0.25  # extra opening needed per distance of the cube in x, a ratio
+LEAD = 0.04  # largest lead of the gripper in y towards the goal while they close [m]
+CLOSED_ON = 0.03  # distance to the grasp at which that lead begins [m]
+GRASPED = np.array([0.03, 0.026, 0.04])  # largest offset from the cube in x, y, z if the fingers hold it [m]
 HELD = 0.054  # opening below which they hold it [m]
 
 # Push
-BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half the sides of where the gripper's middle cannot be [m]
-CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]  # on the way around it [m]
+BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half sides of the area blocked to the gripper's middle by the cube [m]
+CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]  # waypoints around it [m]
 LOW, HIGH = 0.012, 0.05  # heights of the gripper over the cube's middle, to push it and to pass over it [m]
-AHEAD = 0.004  # room between gripper and cube when it arrives behind it [m]
-ALONG, ACROSS, BELOW = 0.028, 0.021, 0.03  # off the place behind the cube, from where the gripper pushes [m]
-LOOK = 0.003  # time by which the cube's way is foreseen where it is pushed on [s]
-DECELERATION = 9.0  # of a cube that slides on the table [m/s^2]
+AHEAD = 0.004  # gap between gripper and cube on arrival behind it [m]
+ALONG, ACROSS, BELOW = 0.028, 0.021, 0.03  # offsets from the place behind the cube within which the gripper pushes [m]
+LOOK = 0.003  # time by which the pushed cube's motion is predicted [s]
+DECELERATION = 9.0  # deceleration of a cube that slides on the table [m/s^2]
 AT_GOAL = 0.05  # [m]
-CENTRING = 0.35  # share of the way to the line through cube and goal that the gripper makes good in a step
-DETOUR = 0.03  # way around the cube beyond the straight one, from which on the gripper goes over it [m]
-DOWN = 0.5  # share of a step after which a gripper that goes down as it passes over the cube has to be beside it
-LEG = 0.005  # cost of every leg of a way around the cube beside its length [m]
+CENTRING = 0.35  # share of the distance to the line through cube and goal that the gripper corrects in a step
+DETOUR = 0.03  # extra length of the path around the cube from which the gripper goes over it [m]
+DOWN = 0.5  # share of a step after which a gripper that descends past the cube must be beside it
+LEG = 0.005  # cost of every leg of a path around the cube, added to its length [m]
 
 
 class Scene:
@@ -60,17 +60,17 @@ class Scene:
 
     @cached_property
     def to_cube(self) -> F64:
-        """Way from gripper to cube, (3,) [m]."""
+        """Vector from gripper to cube, (3,) [m]."""
         return self.cube - self.gripper
 
     @cached_property
     def to_grasp(self) -> F64:
-        """Way from gripper to where it grasps the cube, (3,) [m]."""
+        """Vector from gripper to where it grasps the cube, (3,) [m]."""
         return self.to_cube + [0, 0, GRASP_HEIGHT]
 
 
 class Rung(NamedTuple):
-    """A phase, whether it holds, and its command: the gripper's way (3,) [m], and the fingers', -1 to 1."""
+    """A phase, whether it holds, and its command: the gripper's displacement (3,) [m], and the fingers', -1 to 1."""
 
     name: str
     holds: Callable[[Scene], bool]
@@ -94,13 +94,13 @@ def _carry(scene: Scene) -> tuple[F64, float]:
 
 
 def _between(scene: Scene) -> bool:
-    """The cube is between the fingers, or will be before they have closed."""
+    """Whether the cube is between the fingers, or will be before they have closed."""
     wide = scene.opening > 2 * HALF + OPENING * max(0.0, abs(scene.to_grasp[0]) - 0.02)
     return wide and bool((np.abs(scene.to_grasp) < NEAR).all())
 
 
 def _grasp(scene: Scene) -> tuple[F64, float]:
-    """Go to the cube, and the nearer it is, the more already on the way to the goal: a finger takes it along."""
+    """Go to the cube, leading towards the goal as it gets nearer, so that a finger takes it along."""
     way = scene.to_grasp.copy()
     share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
     way[1] += share * np.clip(scene.goal[1] - scene.cube[1], -LEAD, LEAD)
@@ -108,7 +108,7 @@ def _grasp(scene: Scene) -> tuple[F64, float]:
 
 
 def _over(scene: Scene) -> tuple[F64, float]:
-    """Go to the cube, and not below its top before the fingers are on both sides of it."""
+    """Go to the cube, but not below its top before the fingers are on both sides of it."""
     way = scene.to_grasp.copy()
     if abs(way[1]) > STRADDLE or scene.opening < 2 * HALF + 0.01:
         way[2] = max(way[2], scene.to_cube[2] + CLEAR)
@@ -116,7 +116,7 @@ def _over(scene: Scene) -> tuple[F64, float]:
 
 
 def _rests_at_goal(scene: Scene) -> bool:
-    """The cube is at the goal, or will slide there by itself."""
+    """Whether the cube is at the goal, or will slide there by itself."""
     velocity = scene.velocity[:2]
     left = (scene.goal - scene.cube)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
     return bool(np.hypot(*left) < AT_GOAL)
@@ -127,13 +127,13 @@ def _stay(scene: Scene) -> tuple[F64, float]:
 
 
 def _direction(scene: Scene) -> F64:
-    """Direction in which the cube is to go, a unit vector in the plane, (2,)."""
+    """Direction in which to move the cube, a unit vector in the plane, (2,)."""
     way = (scene.goal - scene.cube)[:2] - LOOK * scene.velocity[:2]
     return way / max(float(np.hypot(*way)), 1e-6)
 
 
 def _touching(direction: F64) -> float:
-    """Distance of gripper and cube when they touch, the gripper behind the cube [m]."""
+    """Distance between gripper and cube when the gripper touches it from behind [m]."""
     return float(min(BOX / np.maximum(np.abs(direction), 1e-6)))
 
 
@@ -144,7 +144,7 @@ def _is_behind(scene: Scene) -> bool:
 
 
 def _push(scene: Scene) -> tuple[F64, float]:
-    """Move as fast as can be where the cube is to go, and towards the line through cube and goal."""
+    """Move at full speed in the cube's direction, and towards the line through cube and goal."""
     direction = _direction(scene)
     across = np.array([-direction[1], direction[0]])
     way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (scene.to_cube[:2] @ across)
@@ -152,7 +152,7 @@ def _push(scene: Scene) -> tuple[F64, float]:
 
 
 def _ends(scene: Scene) -> tuple[F64, F64]:
-    """Places of the gripper now and behind the cube, both relative to the cube, (2,) [m]."""
+    """Positions of the gripper now and behind the cube, both relative to the cube, (2,) [m]."""
     direction = _direction(scene)
     return -scene.to_cube[:2], -direction * (_touching(direction) + AHEAD)
 
@@ -164,7 +164,7 @@ def _around(scene: Scene) -> tuple[F64, float]:
 
 
 def _is_better_over(scene: Scene) -> bool:
-    """The cube is in the way, and the way around it is long or the gripper is high already."""
+    """Whether the cube is in the way, and the path around it is long or the gripper is high already."""
     start, end = _ends(scene)
     height = -scene.to_cube[2]
     if _is_free(start, end) or (_is_inside(start) and height < HIGH - 0.02):
@@ -174,7 +174,7 @@ def _is_better_over(scene: Scene) -> bool:
 
 
 def _over_cube(scene: Scene) -> tuple[F64, float]:
-    """Straight over the cube to behind it: not into it before the gripper is high, and down as soon as it is past."""
+    """Go straight over the cube to behind it: rise before crossing it, and descend as soon as it is past."""
     start, end = _ends(scene)
     way = _walk(start, [end])
     if not _is_inside(start) and REACH - scene.to_cube[2] < HIGH:
@@ -190,7 +190,7 @@ def _is_inside(place: F64) -> bool:
 
 
 def _path(start: F64, end: F64) -> list[F64]:
-    """Points (2,) of the fastest way around the cube, relative to it; the last is the end [m]."""
+    """Points (2,) of the fastest path around the cube, relative to it; the last is the end [m]."""
     if _is_free(start, end):
         return [end]
     ways = [[one, end] for one in CORNERS if _is_free(one, end)]
@@ -216,7 +216,7 @@ def _walk(start: F64, points: list[F64]) -> F64:
 
 
 def _is_free(start: F64, end: F64) -> bool:
-    """Whether the gripper's straight way misses the cube; both relative to the cube, (2,) [m]."""
+    """Whether a straight line misses the cube; both ends relative to the cube, (2,) [m]."""
     way, box = end - start, BOX - 0.001
     flat = np.abs(way) < 1e-9
     if (flat & (np.abs(start) >= box)).any():
@@ -251,7 +251,7 @@ class StockExpert:
         self._ladder = LADDERS[task]
 
     def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's action in `state`, (4,). Raises `MismatchError` for another task's."""
+        """Return the expert's action in `state`, (4,). Raises `MismatchError` for another task's state."""
         self._env.set_state(state)
         scene = Scene(self._env)
         rung = next(rung for rung in self._ladder if rung.holds(scene))

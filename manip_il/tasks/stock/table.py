@@ -19,9 +19,9 @@ PHASES = ("none", "approach", "grasp", "carry", "push", "hold")
 
 @dataclass(frozen=True)
 class StockTask:
-    """One environment. has_object: it moves a cube and not the gripper; blocked: the fingers stay closed.
+    """One environment. has_object: the goal is a cube's, not the gripper's; blocked: the fingers stay closed.
 
-    module, cls: of gymnasium-robotics.
+    module, cls: the class in gymnasium-robotics.
     """
 
     name: str
@@ -75,9 +75,9 @@ ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  #
 
 @dataclass(frozen=True)
 class Held:
-    """Facts of an object. open: half the gap of fingers that may come over it; thin: that cannot hold it [m].
+    """How an object is held. open: half the finger gap that passes over it; thin: half one too small to hold it [m].
 
-    long: its own x is the axis that it is named by.
+    long: whether its own x is its long axis.
     """
 
     open: float
@@ -87,7 +87,7 @@ class Held:
 
 @dataclass(frozen=True)
 class AlohaTask:
-    """One task of `gym_aloha`. own: its name of it. module: of its ladders. grasped: the hand that takes each object.
+    """One task of `gym_aloha`. own: its name there. module: its ladders'. grasped: the hand that takes each object.
 
     inserted: an object and the one that it goes into.
     """
@@ -103,13 +103,13 @@ class AlohaTask:
 
     @property
     def phases(self) -> tuple[str, ...]:
-        """None, then every pair of a left and a right hand's rung, the first ones of both first."""
+        """`none`, then every pair of a left and a right hand's rung, in their order."""
         left, right = (self.rungs[side] for side in SIDES)
         return ("none", *(f"{one}, {other}" for one in left for other in right))
 
     @property
     def observed(self) -> tuple[str, ...]:
-        """Names of `environment_state`, (k,): lengths [m], entries of rotations, and 1 for what touches."""
+        """Names of `environment_state`, (k,): lengths [m], entries of rotations, and 1 for contacts."""
         names = [name for side in SIDES for name in _vectors(f"{side}_ee", f"{side}_ahead", f"{side}_across")]
         for thing in self.objects:
             names += [*_vectors(thing, f"{thing}_ahead", f"{thing}_up"), f"{thing}_on_table"]
@@ -147,9 +147,9 @@ ALOHA_TASKS: dict[str, AlohaTask] = {
 
 @dataclass(frozen=True)
 class StockRobot:
-    """The environments of one package. fixed: settings of `EnvConfig` that cannot be others; horizon: by default.
+    """The environments of one package. fixed: settings of `EnvConfig` that cannot change; horizon: the default.
 
-    cameras: of the environment, the one that is taken by default first.
+    cameras: the environment's, the default one first.
     """
 
     tasks: Mapping[str, StockTask | AlohaTask]
@@ -173,8 +173,8 @@ ROBOTS = {
         ALOHA_TASKS,
         ALOHA_NAMES,
         TWO_ARMS,
-        400,  # as LeRobot's environment; an episode that is registered with gymnasium has 300
-        {"control_hz": 50, "tolerance": TOLERANCE, "success_steps": 1},  # its own reward says what is solved
+        400,  # as in LeRobot's environment; the one registered with gymnasium has 300
+        {"control_hz": 50, "tolerance": TOLERANCE, "success_steps": 1},  # its own reward tells when it is solved
         OTHERS,
         ends_solved=True,
     ),

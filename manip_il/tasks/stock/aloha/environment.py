@@ -1,4 +1,4 @@
-"""One environment of `gym_aloha` under this program's interface; nothing of it is changed."""
+"""One environment of `gym_aloha`, unmodified, under this program's interface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-# First: it chooses the OpenGL that mujoco takes on import.
+# First: it chooses OpenGL before mujoco is imported.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import Observation, State
@@ -26,8 +26,8 @@ F64 = NDArray[np.float64]
 INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
 MOST_REWARD = 4
 GRIPPERS = np.array([6, 13])
-LONGEST = 0.04  # step of a joint, as the expert makes them [rad]
-_DEEP = 1e-3  # what is redrawn may overlap with something by so much [m]
+LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
+_DEEP = 1e-3  # tolerated overlap of a redrawn object [m]
 _BLANK = np.zeros((1, 1, 3), np.uint8)
 
 
@@ -42,9 +42,9 @@ class AlohaActions(ActionSpace):
 
 
 class AlohaEnv(StockBase):
-    """An environment of `gym_aloha`. task: its name. cameras: what is pictured in every step.
+    """An environment of `gym_aloha`. task: its name. cameras: those drawn in every step.
 
-    Raises `ManipError` where the package is not installed.
+    Raises `ManipError` if the package is not installed.
     """
 
     def __init__(self, task: str, cameras: CameraConfig | None = None):
@@ -72,11 +72,11 @@ class AlohaEnv(StockBase):
 
     @property
     def progress(self) -> float:
-        """Share of the environment's highest reward that a state has."""
+        """Reward of the state as a share of the environment's highest."""
         return float(self._env._env.task.get_reward(self.physics)) / MOST_REWARD
 
     def scene(self, kind: type[Scene] = Scene) -> Scene:
-        """Return what is read of the state."""
+        """Return the scene read from the state."""
         return kind(self.task, self.model, self.data)
 
     def measured(self) -> F64:
@@ -84,7 +84,7 @@ class AlohaEnv(StockBase):
         return self._env._env.task.get_qpos(self.physics)
 
     def observe(self) -> Observation:
-        """Return joints and grippers, (14,), what is read of the scene, (k,), and pictures."""
+        """Return joints and grippers, (14,), the scene's `environment_state`, (k,), and pictures."""
         state, environment = self.measured().astype(np.float32), self.scene().observed().astype(np.float32)
         return Observation(state, environment, self._pictures() if self._cameras else {})
 
@@ -102,14 +102,14 @@ class AlohaEnv(StockBase):
 
     @property
     def positions(self) -> dict[str, F64]:
-        """Positions (3,) [m] of the right hand and the objects, of which the first is called `object`."""
+        """Positions (3,) [m] of the right hand and the objects; the first object is called `object`."""
         scene = self.scene()
         names = ["object", *list(scene.things)[1:]]
         things = zip(names, scene.things.values(), strict=True)
         return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
 
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
-        """Return a state with other places of the objects that no finger touches; None for one that cannot be."""
+        """Return a state with new places for the objects that no finger touches; None if these overlap something."""
         self.set_state(state)
         scene, moved = self.scene(), list[int]()
         self._env.reset(seed=int(rng.integers(2**32)))
@@ -143,7 +143,7 @@ class AlohaEnv(StockBase):
 
 @cache
 def _painter(task: str) -> AlohaEnv:
-    """The environment that draws a task's states in this process: one OpenGL context, and not one an environment."""
+    """The environment that draws a task's states in this process, so that one OpenGL context is enough."""
     return AlohaEnv(task)
 
 
@@ -155,8 +155,8 @@ def _gym_aloha() -> Any:
 
 
 def _actions(model: mujoco.MjModel) -> ActionSpace:
-    """The actuators' own bounds: MuJoCo keeps to them, and the environment's -1 to 1 is not meant."""
-    chosen = [*range(7), *range(8, 15)]  # the right finger of a hand does as the left one
+    """Actions within the actuators' own bounds, which MuJoCo enforces; the environment's -1 to 1 does not apply."""
+    chosen = [*range(7), *range(8, 15)]  # a hand's right finger mirrors the left one
     low, high = model.actuator_ctrlrange[chosen].T.copy()
     low[GRIPPERS], high[GRIPPERS] = 0.0, 1.0
     is_joint = np.ones(len(chosen), bool)

@@ -1,4 +1,4 @@
-"""The expert of two arms: a label over both hands, a function of the state alone."""
+"""The expert of two arms: one label for both hands, a function of the state alone."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from manip_il.tasks.stock.table import SIDES
 
 F64 = NDArray[np.float64]
 
-ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], where the position has 1 [1/m]
-ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # pull on the forearm's roll where the wrist is straight, for a wrist up and down
+ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
+ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # cost of forearm roll at a straight wrist; its width, wrist up and down [rad]
 FOREARM_ROLL, WRIST = 3, 4
-MOST_STEP, MOST_TURN = 0.10, 0.5  # of a hand, towards its target [m], [rad]
+MOST_STEP, MOST_TURN = 0.10, 0.5  # largest step of a hand towards its target [m], [rad]
 FALLEN = -0.02  # an object under this height has left the table [m]
-REACH = (0.2, 0.68)  # of a hand that takes something from the table, from its arm's foot [m]
-CREEPS = 0.95  # share of the friction's lead below which a joint creeps
+REACH = (0.2, 0.68)  # range of an arm on the table, from its foot [m]
+CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
 
 
@@ -40,7 +40,7 @@ class AlohaExpert:
         self._arms = {side: _Arm(self._env, number, side) for number, side in enumerate(SIDES)}
 
     def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's action in `state`, (14,). Raises `MismatchError` for another task's."""
+        """Return the expert's action in `state`, (14,). Raises `MismatchError` for another task's state."""
         env = self._env
         env.set_state(state)
         scene = env.scene(self._kind)
@@ -75,7 +75,7 @@ class AlohaExpert:
 
 
 class _Arm:
-    """One arm: from a target of its hand to targets of its joints, (6,) [rad]."""
+    """One arm: converts a target of its hand to targets of its joints, (6,) [rad]."""
 
     def __init__(self, env: AlohaEnv, number: int, side: str):
         model, self._data = env.model, env.data
@@ -86,12 +86,12 @@ class _Arm:
         self._ik = PoseProgram(_alone(side), f"cali_{side}_site1", home, (ORIENTATION, POSTURE))
         self._gain = model.actuator_gainprm[joints, 0]
         self._breakaway = model.dof_frictionloss[joints] / self._gain  # lead at which a joint overcomes friction [rad]
-        # Below it MuJoCo's friction, an impedance of 0.9 within 0.02 s, lets through what makes a joint creep.
+        # Below it joints creep, as MuJoCo's friction is soft: an impedance of 0.9 within 0.02 s.
         softness = self._gain * model.dof_invweight0[joints] * (0.1 / 0.9) * (CREEPS * constants.DT) / 2 * constants.DT
         self._creep = 1 - np.exp(-softness)  # step per lead [rad/rad]
 
     def command(self, hand: Hand, target: Target) -> F64 | None:
-        """Return joint targets (6,) [rad] one step towards a target; None where there is no way."""
+        """Return joint targets (6,) [rad] one step towards a target; None if there is no solution."""
         way = target.position - hand.position
         length = float(np.linalg.norm(way))
         position = hand.position + way * min(1.0, MOST_STEP / max(length, MOST_STEP))
@@ -106,14 +106,14 @@ class _Arm:
         return hand.q + self._lead(step) + gravity
 
     def _lead(self, step: F64) -> F64:
-        """How far targets have to lead joints (6,) for them to make a step (6,) against friction [rad]."""
+        """Lead of the targets over the joints (6,) that makes them step (6,) against friction [rad]."""
         size, most = np.abs(step), CREEPS * self._breakaway
         crept = self._creep * most
         return np.sign(step) * np.where(size <= crept, size / self._creep, most + (size - crept) / BREAKAWAY)
 
 
 def _posture_costs(q: F64) -> F64:
-    """Costs of the posture, (6,) [1/rad]: they keep the forearm from winding around where the wrist is straight."""
+    """Costs of the posture, (6,) [1/rad]: they keep the forearm from winding around if the wrist is straight."""
     costs = np.full(len(q), POSTURE)
     straight = math.exp(-((q[WRIST] / STRAIGHT[int(q[WRIST] <= 0)]) ** 2))
     costs[FOREARM_ROLL] = math.hypot(POSTURE, ROLL * straight)

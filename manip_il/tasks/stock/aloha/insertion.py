@@ -27,13 +27,13 @@ F64 = NDArray[np.float64]
 
 PEG, SOCKET = "peg", "socket"
 OF = {"left": SOCKET, "right": PEG}
-MEETING = np.array([-0.06, 0.5, 0.10])  # place of the socket where the peg goes in [m]
-WAITING = np.array([0.17, 0.0, 0.0])  # of the peg, from there [m]
-AT_MEETING, LEVEL = 0.03, 0.2  # how far the socket is off there, and off level, at most when the peg comes [m], [rad]
-BEFORE, DEEP = 0.135, 0.085  # of the peg before the socket, and in it, along its axis; it meets the pin at 0.10 [m]
-SLOPE, TOLERANCE = 8.0, 0.003  # of the funnel: the way back for what the peg is aside, but for so much [m]
-ADVANCE = 0.05  # of the peg in a step, at most [m]
-LOW, HIGH = 0.015, 0.055  # heights between which an object that is lifted begins to go sideways [m]
+MEETING = np.array([-0.06, 0.5, 0.10])  # position of the socket for the insertion [m]
+WAITING = np.array([0.17, 0.0, 0.0])  # offset of the waiting peg from there [m]
+AT_MEETING, LEVEL = 0.03, 0.2  # largest errors of the socket's position and rotation when the peg comes [m], [rad]
+BEFORE, DEEP = 0.135, 0.085  # place of the peg along the socket's axis, before and in it; it meets the pin at 0.10 [m]
+SLOPE, TOLERANCE = 8.0, 0.003  # funnel: retreat per sideways error of the peg, and tolerated error [m]
+ADVANCE = 0.05  # largest advance of the peg in a step [m]
+LOW, HIGH = 0.015, 0.055  # heights between which a lifted object begins to move sideways [m]
 INSERTED = 0.03  # longest step of a joint with the peg before the socket [rad]
 CARRIED = 0.04  # and before that [rad]
 
@@ -57,7 +57,7 @@ class Insertion(Scene):
 
     @cached_property
     def ready(self) -> bool:
-        """The socket is held where the peg goes in."""
+        """Whether the socket is held in place for the insertion."""
         socket = self.things[SOCKET]
         if not self.has["left"] or self.on_table(SOCKET):
             return False
@@ -66,7 +66,7 @@ class Insertion(Scene):
 
     @cached_property
     def depth(self) -> float:
-        """Next place of the peg along the socket's axis: straight in, or back before it where it is aside [m]."""
+        """Next position of the peg along the socket's axis: straight in, or back if it is misaligned [m]."""
         peg, socket = self.things[PEG], self.things[SOCKET]
         frame = socket.frame
         off = frame.T @ (peg.position - socket.position)
@@ -76,7 +76,7 @@ class Insertion(Scene):
 
 
 def _lifted_to(thing: Thing, to: F64) -> F64:
-    """Where an object goes on its way to a place (3,): up first [m]."""
+    """Next target of an object on its way to a place (3,): up first [m]."""
     share = min(1.0, max(0.0, (thing.position[2] - LOW) / (HIGH - LOW)))
     way = share * (to - thing.position)
     return np.array([thing.position[0] + way[0], thing.position[1] + way[1], to[2]])

@@ -1,4 +1,4 @@
-"""What is read of one state of two arms, hands, objects and what touches what; and the rungs that tasks share."""
+"""Hands, objects and contacts read from one state of two arms, and the rungs that tasks share."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from manip_il.tasks.stock.table import SIDES, AlohaTask, Held
 
 F64 = NDArray[np.float64]
 
-FINGER_AT_TOUCH = 0.0224  # joint of a finger at which the two would touch each other [m]
-GRASP_AHEAD = -0.002  # where the hand holds an object, along its fingers from its site [m]
-AROUND = (0.010, 0.012, 0.010)  # off that place at most when the fingers begin to close, in the hand's axes [m]
-HELD_AROUND = (0.020, 0.022, 0.020)  # and while they close or hold [m]
-ANGLE, HELD_ANGLE = 0.25, 0.6  # off the grasp's rotation at most, then and then [rad]
+FINGER_AT_TOUCH = 0.0224  # finger joint position at which the two would touch [m]
+GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
+AROUND = (0.010, 0.012, 0.010)  # largest offset from there to begin closing, in the hand's axes [m]
+HELD_AROUND = (0.020, 0.022, 0.020)  # the same while closing or holding [m]
+ANGLE, HELD_ANGLE = 0.25, 0.6  # largest angle to the grasp's rotation, for the two [rad]
 LIFTED = 0.04  # height of an object that has left the table [m]
-SLACK = 0.004  # half the gap beyond `Held.open` at which fingers still get hold of what is between them, in the air [m]
+SLACK = 0.004  # half gap beyond `Held.open` at which fingers still hold an object in the air [m]
 X, Y, Z = np.eye(3)
 
 OPEN, CLOSED = 1.0, 0.0
 FAST = 0.04  # longest step of a joint [rad]
-PITCH = math.radians(60)  # by which a hand points down when it takes something from the table
-STANDOFF = 0.09  # before an object where the hand goes down to it from [m]
-SLOPE, TOLERANCE = 2.0, 0.006  # of the funnel: the way back for what the hand is aside of its line, but for so much [m]
-ARM = 0.06  # lever by which an angle counts as a way aside [m/rad]
-OPENING_STANDOFF = 0.045  # before an object while the fingers are not open [m]
-OPENING_SPAN = 0.004  # of half the gap, over which that falls to nothing [m]
-BACK_FIRST = 0.03  # a hand that is so much too near does not go sideways before it has gone back [m]
-MOST_TURN = 0.3  # of an object in a step [rad]
+PITCH = math.radians(60)  # downward pitch of a hand that takes something from the table
+STANDOFF = 0.09  # distance from an object at which the hand starts to close in [m]
+SLOPE, TOLERANCE = 2.0, 0.006  # funnel: retreat per sideways error of the hand, and tolerated error [m]
+ARM = 0.06  # sideways error that a radian counts as [m/rad]
+OPENING_STANDOFF = 0.045  # distance from an object while the fingers are not open [m]
+OPENING_SPAN = 0.004  # range of half the gap over which that falls to 0 [m]
+BACK_FIRST = 0.03  # a hand that is this much too near retreats before it moves sideways [m]
+MOST_TURN = 0.3  # largest turn of an object in a step [rad]
 
 
 @dataclass(frozen=True)
 class Hand:
-    """One hand: where it is (3,) [m], its axes (ahead, across the fingers, up) (3, 3), half the gap of its fingers [m].
+    """One hand: its position (3,) [m], axes (ahead, across the fingers, up) (3, 3), half the gap of its fingers [m].
 
-    q: joints of its arm, (6,) [rad]. outward: the way that its fingers open when it reaches for the table's middle.
+    q: joints of its arm, (6,) [rad]. outward: direction of its fingers' opening when it reaches for the table's middle.
     """
 
     position: F64
@@ -52,13 +52,13 @@ class Hand:
     outward: F64
 
     def sees(self, point: F64) -> F64:
-        """Return a point (3,) in the hand's axes, from the hand [m]."""
+        """Return a point (3,) relative to the hand, in its axes [m]."""
         return self.rotation.T @ (point - self.position)
 
 
 @dataclass(frozen=True)
 class Thing:
-    """One object: its middle (3,) [m] and its axes (3, 3), and what is known of it."""
+    """One object: its middle (3,) [m], its axes (3, 3), and how it is held."""
 
     position: F64
     axes: F64
@@ -66,9 +66,9 @@ class Thing:
 
     @cached_property
     def frame(self) -> F64:
-        """Axes, its own long one first, with the order and signs nearest to the world's, (3, 3).
+        """Axes, the long one first, with the order and signs nearest to the world's, (3, 3).
 
-        It looks the same turned into any of them.
+        The object looks the same in all of these frames.
         """
         if self.about.long:
             ahead = nearest(self.axes[:, :1], X)
@@ -80,7 +80,7 @@ class Thing:
 
 
 class Scene:
-    """One state. A task's own scene adds the facts that its rungs ask for."""
+    """One state. A task's own scene adds the facts that its rungs need."""
 
     def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
         self.task, self._model = task, model
@@ -94,7 +94,7 @@ class Scene:
         self._touching = model.geom_bodyid[data.contact.geom]  # (c, 2)
 
     def touches(self, side: str, name: str) -> tuple[bool, ...]:
-        """Return whether the left, and the right, finger of a hand touches an object."""
+        """Return whether each finger of a hand, left and right, touches an object."""
         return tuple(self._meet(f"vx300s_{side}/{finger}_finger_link", name) for finger in SIDES)
 
     def on_table(self, name: str) -> bool:
@@ -103,14 +103,14 @@ class Scene:
 
     @cached_property
     def arms_touch(self) -> bool:
-        """One arm touches the other."""
+        """Whether one arm touches the other."""
         arms = {self._model.body(f"vx300s_{side}").id for side in SIDES}
         return any({*pair} == arms for pair in self._model.body_rootid[self._touching].tolist())
 
     def holds(self, side: str, name: str) -> bool:
-        """Return whether a hand has an object between its fingers: both touch it, or it is off the table already.
+        """Return whether a hand has an object between its fingers: both touch it, or it is already in the air.
 
-        In the air a touch that is lost for a moment changes nothing: the fingers close on.
+        In the air a brief loss of contact does not matter, as the fingers keep closing.
         """
         hand, thing = self.hands[side], self.things[name]
         if not _within(hand.sees(thing.position), HELD_AROUND) or hand.gap < thing.about.thin:
@@ -118,7 +118,7 @@ class Scene:
         return all(self.touches(side, name)) or (thing.position[2] > LIFTED and hand.gap < thing.about.open + SLACK)
 
     def is_at_grasp(self, side: str, name: str, rotation: F64) -> bool:
-        """Return whether a hand may close on an object, or go on closing, to hold it in this rotation (3, 3)."""
+        """Return whether a hand may close, or keep closing, on an object in a grasp's rotation (3, 3)."""
         hand, thing = self.hands[side], self.things[name]
         if hand.gap < thing.about.thin:  # closed beside it: open again
             return False
@@ -147,20 +147,20 @@ class Scene:
 
 
 def cross(a: F64, b: F64) -> F64:
-    """Return the cross product of (3,) and (3,), a tenth of the time of numpy's."""
+    """Return the cross product of (3,) and (3,), in a tenth of numpy's time."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def nearest(axes: F64, way: F64) -> F64:
-    """Return the column of `axes` (3, c), with its sign, that is nearest to a way (3,)."""
+    """Return the column of `axes` (3, c), with its sign, that is nearest to a direction (3,)."""
     along = way @ axes
     best = int(np.abs(along).argmax())
     return axes[:, best] * math.copysign(1.0, along[best])
 
 
 def ahead_across(ahead: F64, across: F64) -> F64:
-    """Return the rotation (3, 3) of a hand that points one way (3,), its fingers nearest to another (3,)."""
+    """Return the rotation (3, 3) of a hand that points along a direction (3,), its fingers nearest to another (3,)."""
     x = ahead / np.linalg.norm(ahead)
     y = across - x * (x @ across)
     y /= np.linalg.norm(y)
@@ -168,7 +168,7 @@ def ahead_across(ahead: F64, across: F64) -> F64:
 
 
 def pitched(across: F64, pitch: float) -> F64:
-    """Return the rotation (3, 3) of a hand whose fingers open along a way (3,), levelled; it points down by `pitch`."""
+    """Return the rotation (3, 3) of a hand pitched down by `pitch` whose fingers open along a levelled way (3,)."""
     level = np.array([across[0], across[1], 0.0])
     y = level / np.linalg.norm(level)
     return ahead_across(math.cos(pitch) * cross(y, Z) - math.sin(pitch) * Z, y)
@@ -186,7 +186,7 @@ def _within(off: F64, box: tuple[float, float, float]) -> bool:
 
 
 class Target(NamedTuple):
-    """Pose that a hand is to have, (3,) [m] and (3, 3), its gripper's command, the longest step of a joint [rad]."""
+    """Target pose of a hand, (3,) [m] and (3, 3), its gripper's command, and the longest step of a joint [rad]."""
 
     position: F64
     rotation: F64
@@ -203,19 +203,19 @@ class Rung(NamedTuple):
 
 
 def always(scene: Scene) -> bool:
-    """Hold in every state."""
+    """Return True: the rung holds in every state."""
     return True
 
 
 def close_on(scene: Scene, name: str, rotation: F64, longest: float = FAST) -> Target:
-    """Close where the object is, in a grasp's rotation (3, 3)."""
+    """Close the fingers at the object, in a grasp's rotation (3, 3)."""
     return Target(scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest)
 
 
 def approach(scene: Scene, side: str, name: str, rotation: F64, back: float = 0.0, longest: float = FAST) -> Target:
-    """Go to an object in a funnel along the hand's own way ahead, open.
+    """Approach an object with open fingers, in a funnel along the grasp's axis.
 
-    rotation: of the grasp, (3, 3). back: stay at least so far before it [m].
+    rotation: the grasp's, (3, 3). back: least distance to keep from it [m].
     """
     hand, thing = scene.hands[side], scene.things[name]
     off = rotation.T @ (thing.position - hand.position)
@@ -238,7 +238,7 @@ def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[Rung,
 
 
 def move_object(scene: Scene, side: str, name: str, to: F64, frame: F64, longest: float) -> Target:
-    """Bring an object that a hand holds to a place (3,) [m] and its `frame` to axes (3, 3)."""
+    """Bring a held object to a place (3,) [m] and its `frame` to axes (3, 3)."""
     hand, thing = scene.hands[side], scene.things[name]
     turn = turned_towards(np.eye(3), frame @ thing.frame.T, MOST_TURN)
     return Target(to + turn @ (hand.position - thing.position), turn @ hand.rotation, CLOSED, longest)

@@ -30,14 +30,14 @@ from manip_il.tasks.stock.aloha.ladder import (
 F64 = NDArray[np.float64]
 
 CUBE = "box"
-MEETING = np.array([0.0, 0.5, 0.25])  # place of the cube where it is handed over [m]
-WAITING = np.array([-0.12, 0.0, 0.0])  # of the left hand, from there [m]
-NEAR = 0.1  # of the cube from the meeting, where the left hand sets out [m]
-KEPT_OFF, ARRIVED = 0.12, 0.02  # the left hand stays back by twice what the cube has to go, but for so much [m]
-LEFT_CLOSED = 0.025  # half the gap of left fingers that hold it [m]
-OPENED, OPENING = 0.022, 0.004  # half the gap of right fingers that let it go, and the span over which they do [m]
-CLEAR = 0.12  # of the right hand from the cube, in the end [m]
-CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest steps [rad]
+MEETING = np.array([0.0, 0.5, 0.25])  # position of the cube for the handover [m]
+WAITING = np.array([-0.12, 0.0, 0.0])  # offset of the waiting left hand from there [m]
+NEAR = 0.1  # distance of the cube from there at which the left hand sets out [m]
+KEPT_OFF, ARRIVED = 0.12, 0.02  # largest gap that the left hand keeps; cube's distance left at which it keeps none [m]
+LEFT_CLOSED = 0.025  # half the gap below which the left fingers hold it [m]
+OPENED, OPENING = 0.022, 0.004  # half the gap at which the right hand starts to leave, and the range to full [m]
+CLEAR = 0.12  # final distance of the right hand from the cube [m]
+CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest joint steps [rad]
 
 
 class Transfer(Scene):
@@ -67,22 +67,22 @@ class Transfer(Scene):
 
     @cached_property
     def lifted(self) -> bool:
-        """The cube has left the table."""
+        """Whether the cube has left the table."""
         return bool(self.cube[2] > LIFTED) and not self.on_table(CUBE)
 
     @cached_property
     def right_holds(self) -> bool:
-        """The right hand has the cube."""
+        """Whether the right hand has the cube."""
         return self.holds("right", CUBE)
 
     @cached_property
     def left_holds(self) -> bool:
-        """The left hand has the cube, in the air."""
+        """Whether the left hand has the cube, in the air."""
         return self.lifted and self.holds("left", CUBE) and all(self.touches("left", CUBE))
 
     @cached_property
     def to_go(self) -> float:
-        """Way of the cube to where it is handed over [m]."""
+        """Distance of the cube from the handover [m]."""
         return float(np.linalg.norm(self.cube - MEETING))
 
 
