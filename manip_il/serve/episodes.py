@@ -19,7 +19,7 @@ from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import env_of
 
 
-class Episodes:
+class ServedEpisodes:
     """Episodes of a station; those to keep are journals in a folder, for `manip-il data build`.
 
     folder: None for no journals. seed: shifts the worlds; those that have a journal are not drawn again. driver: who

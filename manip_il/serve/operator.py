@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.mdp import Actor
-from manip_il.serve.episodes import Episodes
+from manip_il.serve.episodes import ServedEpisodes
 from manip_il.serve.station import Read, Station
 
 RIGHT, LEFT, ENTER, PAUSE, CORRECT, INTERRUPT = b"\x1b[C", b"\x1b[D", b"\n", b" ", b"\t", b"\x03"
@@ -37,7 +37,7 @@ class Operator:
     strategy [rad]. failed, solved: episodes so far. status: the program's exit code, once it has ended.
     """
 
-    def __init__(self, command: Sequence[str], station: Station, episodes: Episodes, intervene: float):
+    def __init__(self, command: Sequence[str], station: Station, episodes: ServedEpisodes, intervene: float):
         self._station, self._episodes, self._intervene = station, episodes, intervene
         self._driver, self._keep, self.solved, self.failed = Actor.EXPERT, True, 0, 0
         self._heard, self.status = "", None

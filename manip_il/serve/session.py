@@ -13,7 +13,7 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Actor
 from manip_il.serve.cameras import RATE, Cameras
 from manip_il.serve.config import SessionConfig
-from manip_il.serve.episodes import Episodes
+from manip_il.serve.episodes import ServedEpisodes
 from manip_il.serve.operator import INTERRUPT, Operator, weigh_session
 from manip_il.serve.station import Station
 from manip_il.sim.conditions import Condition
@@ -44,7 +44,7 @@ def serve(
         stack.callback(weigh_session, weigh_session() or "0")
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
-        episodes = Episodes(station, env, config.log, config.seed)
+        episodes = ServedEpisodes(station, env, config.log, config.seed)
         gc.collect()
         gc.freeze()  # a full collection of what LeRobot and torch have imported takes longer than a client waits
         stack.callback(gc.unfreeze)
@@ -89,7 +89,7 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
     ]
 
 
-def _stand(station: Station, episodes: Episodes, renews: bool, say: Say) -> None:
+def _stand(station: Station, episodes: ServedEpisodes, renews: bool, say: Say) -> None:
     """Serve clients until Ctrl-C; draw a new world on Enter and, if it `renews`, once the task is solved."""
     station.on_read = episodes.frame
     episodes.begin(Actor.EXPERT)

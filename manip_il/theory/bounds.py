@@ -30,7 +30,7 @@ Learner = Literal["cloning", "DAgger"]
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class LossCurve:
     """Losses of a learner over the horizon, for each draw of its data, (h, D).
 
     errors: share of states in which the policy errs; gaps: the expert's return minus the policy's; bounds: upper bounds
@@ -81,20 +81,20 @@ class Curve:
         return np.log(ratios) @ x / (x @ x)
 
 
-def all_curves(horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[Curve]:
+def all_curves(horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[LossCurve]:
     """Yield the curves of every process and learner."""
     for process in PROCESSES:
         yield from curves(process, horizons, draws)
 
 
-def curves(process: Process, horizons: Sequence[int], draws: int) -> Iterator[Curve]:
+def curves(process: Process, horizons: Sequence[int], draws: int) -> Iterator[LossCurve]:
     """Yield the curves of both learners on one process."""
     found: dict[Learner, list[F64]] = {"cloning": [], "DAgger": []}
     for horizon in horizons:
         for learner, policies in _fitted(process, horizon, draws).items():
             found[learner].append(losses_of(process, learner, policies))
     for learner, losses in found.items():
-        yield Curve(process.name, learner, tuple(horizons), *np.stack(losses, axis=1))
+        yield LossCurve(process.name, learner, tuple(horizons), *np.stack(losses, axis=1))
 
 
 def losses_of(process: Process, learner: Learner, policies: F64) -> F64:

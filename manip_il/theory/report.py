@@ -12,7 +12,7 @@ from manip_il.evaluation.figures import ARMS, CLONING, DAGGER, SOFT, Figure, dra
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
-from manip_il.theory.bounds import DRAWS, ERROR, Curve
+from manip_il.theory.bounds import DRAWS, ERROR, LossCurve
 from manip_il.theory.linear import GUST, OPEN_LOOPS, Drift
 from manip_il.theory.processes import PROCESSES
 from manip_il.theory.shift import WRONG, RoundShift, Shift
@@ -28,7 +28,7 @@ _DATA = "#b9bfc6"
 class Theory:
     """All results. shift: a run's distribution shift, if a run was given."""
 
-    curves: tuple[Curve, ...]
+    curves: tuple[LossCurve, ...]
     drifts: tuple[Drift, ...]
     shift: Shift | None = None
 
@@ -38,7 +38,7 @@ class Theory:
         return sum(curve.above for curve in self.curves)
 
     @property
-    def by_name(self) -> dict[tuple[str, str], Curve]:
+    def by_name(self) -> dict[tuple[str, str], LossCurve]:
         """Curves by process and learner."""
         return {(curve.problem, curve.learner): curve for curve in self.curves}
 
@@ -88,7 +88,7 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any]) -> Re
     )
 
 
-def _slope(curve: Curve) -> str:
+def _slope(curve: LossCurve) -> str:
     return "{:.2f} [{:.2f}, {:.2f}]".format(curve.slope, *curve.interval)
 
 
@@ -117,7 +117,7 @@ def _theorems(theory: Theory) -> Section:
     )
 
 
-def _theorem_figure(curves: Sequence[Curve]) -> Figure:
+def _theorem_figure(curves: Sequence[LossCurve]) -> Figure:
     """Gap over error against the horizon: one panel per process, with both learners and their bounds."""
     with drawing(len(PROCESSES), size=(3.2, 3.0)) as (drawn, axes):
         for axis, process in zip(axes[0], PROCESSES, strict=True):
