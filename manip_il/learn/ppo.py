@@ -23,7 +23,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import CallbackList
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
@@ -161,7 +161,7 @@ class Learner:
         with torch.no_grad():
             self.policy.head.raw_log_std.fill_(raw)
         self._first_spread = self.policy.spread.numpy().copy()
-        self.ppo.set_logger(configure(None, []))
+        self.ppo.set_logger(Logger(folder=None, output_formats=[]))  # `configure` would make a folder in /tmp
         self.ppo.ep_info_buffer, self.ppo.ep_success_buffer = deque(maxlen=1), deque(maxlen=1)
         self._callback = CallbackList([])
         self._callback.init_callback(self.ppo)
