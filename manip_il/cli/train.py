@@ -58,16 +58,16 @@ class TrainOptions(Seeded, Trusting):
 
     def run(self) -> None:
         """Read the datasets, fit, and print the checkpoint's path."""
-        from manip_il.learn.lerobot_config import lerobot_options
-        from manip_il.learn.samples import rabc_weights
-        from manip_il.learn.train import Trainer
-
         writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
         if not writes:
             set_quiet(True)
         config, folder = self.config(), self.output.output_dir
-        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         datasets, weights = self._datasets(config), None
+        from manip_il.learn.lerobot_config import lerobot_options  # here, as what does not fit is said at once
+        from manip_il.learn.samples import rabc_weights
+        from manip_il.learn.train import Trainer
+
+        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         if self.weights is not None:
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
@@ -104,7 +104,6 @@ class TrainOptions(Seeded, Trusting):
 
     def _datasets(self, config: FitConfig) -> list[Dataset]:
         """Return the datasets; raises unless they agree with each other and have the policy's inputs."""
-        from manip_il.cli.inputs import dataset_differences
         from manip_il.data.dataset import Dataset
         from manip_il.learn.names import PLAIN
         from manip_il.learn.sources import check_same_sources, input_columns
@@ -112,8 +111,10 @@ class TrainOptions(Seeded, Trusting):
         datasets = [*map(Dataset.open, self.dataset.root)]
         specs, language = [one.spec for one in datasets], config.kind not in PLAIN
         check_same_sources(self.dataset.root, specs, pictures=config.takes_images, language=language)
-        for one in datasets:
-            seen = input_columns(config, one.root, one.info)
+        inputs = [input_columns(config, one.root, one.info) for one in datasets]
+        from manip_il.cli.inputs import dataset_differences  # here, as it imports the simulator
+
+        for one, seen in zip(datasets, inputs, strict=True):
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
             odd = [key for key in one.cameras if config.takes_images and key not in seen]
             warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))

@@ -61,6 +61,12 @@ def test_a_mistyped_command_or_option_imports_nothing_heavy(tmp_path):
         assert (code, err.count("\n"), err.startswith("manip-il: error: ")) == (2, 1, True)
 
 
+def test_a_dataset_that_does_not_fit_is_named_before_lerobot_and_the_simulator_are_imported(tmp_path):
+    words = ["train", f"--dataset.root={SAMPLE}", "--observation=images", "--policy.type=act"]
+    [(_, code, _, err)] = answers([words], tmp_path, ["torch", "lerobot", "mujoco", "mink", "scipy"])
+    assert (code, "the dataset has no pictures, which --observation=images needs" in err) == (1, True)
+
+
 TRAIN, EXPERT = "train --dataset.root=SAMPLE", "eval --policy.type=expert"
 MISTAKES = {
     "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: data build, ",
