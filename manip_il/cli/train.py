@@ -68,6 +68,7 @@ class TrainOptions(Seeded, Trusting):
         from manip_il.learn.train import Trainer
 
         options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
+        self._warn(config, datasets)
         if self.weights is not None:
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
@@ -111,11 +112,17 @@ class TrainOptions(Seeded, Trusting):
         datasets = [*map(Dataset.open, self.dataset.root)]
         specs, language = [one.spec for one in datasets], config.kind not in PLAIN
         check_same_sources(self.dataset.root, specs, pictures=config.takes_images, language=language)
-        inputs = [input_columns(config, one.root, one.info) for one in datasets]
-        from manip_il.cli.inputs import dataset_differences  # here, as it imports the simulator
+        for one in datasets:
+            input_columns(config, one.root, one.info)
+        return datasets
 
-        for one, seen in zip(datasets, inputs, strict=True):
+    def _warn(self, config: FitConfig, datasets: list[Dataset]) -> None:
+        """Warn of what differs between the datasets and this machine, and of pictures that are left out."""
+        from manip_il.cli.inputs import dataset_differences  # which imports the simulator
+        from manip_il.learn.sources import input_columns
+
+        for one in datasets:
+            seen = input_columns(config, one.root, one.info)
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
             odd = [key for key in one.cameras if config.takes_images and key not in seen]
             warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
-        return datasets
