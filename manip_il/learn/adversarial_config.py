@@ -13,21 +13,21 @@ class PPOConfig:
 
     lr: float | None = option(
         None,
-        "first learning rate of actor and critic, falls linearly to a twentieth over the run; by default 5e-4, or 2e-4 "
-        "of a clone",
+        "initial learning rate of actor and critic, which falls linearly to a twentieth; by default 5e-4, or 2e-4 "
+        "for a clone",
         at_least=1e-9,
         at_most=1,
     )
     epochs: int = option(10, "passes over an iteration's steps", at_least=1)
     minibatches: int = option(4, "gradient steps in one pass", at_least=1)
     gamma: float | None = option(
-        None, "discount of a control step; by default 0.9, or 0.97 of a clone", at_least=0, at_most=1
+        None, "discount per control step; by default 0.9, or 0.97 for a clone", at_least=0, at_most=1
     )
-    gae_lambda: float = option(0.95, "of generalised advantage estimation", at_least=0, at_most=1)
-    clip_range: float = option(0.2, "of the ratio of densities", at_least=1e-6, at_most=1)
-    entropy: float = option(0.0, "weight of the entropy", at_least=0)
+    gae_lambda: float = option(0.95, "lambda of generalised advantage estimation", at_least=0, at_most=1)
+    clip_range: float = option(0.2, "clipping range of the probability ratio", at_least=1e-6, at_most=1)
+    entropy: float = option(0.0, "weight of the entropy bonus", at_least=0)
     target_kl: float = option(
-        0.05, "an iteration's passes end once the actor has moved 1.5 times as far [nats]", at_least=1e-6
+        0.05, "end an iteration's passes once the KL divergence reaches 1.5 times this [nats]", at_least=1e-6
     )
 
     def __post_init__(self) -> None:

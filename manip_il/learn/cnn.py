@@ -56,9 +56,9 @@ class CNNConfig(MLPConfig):
     """
 
     channels: tuple[int, ...] = (16, 32, 32, 32)
-    keypoints: int = option(32, "a camera", at_least=1)
-    aux_weight: float = option(0.5, "of what is read off", at_least=0)
-    heatmap_weight: float = option(0.0, "of heat maps", at_least=0)
+    keypoints: int = option(32, "keypoints per camera", at_least=1)
+    aux_weight: float = option(0.5, "loss weight of the predicted state", at_least=0)
+    heatmap_weight: float = option(0.0, "loss weight of the heat maps", at_least=0)
     privileged_size: int = 0  # size of the predicted state; taken from the dataset
     named_points: int = 0  # number of points with a heat map; taken from the dataset
 

@@ -34,13 +34,13 @@ _ADDED = ("delay", "offset")
 class ServoConfig:
     """Parameters of every servo of an arm. Raises `UsageError` for one out of bounds."""
 
-    stiffness: float = option(27.0, "torque for an error at P_Coefficient 32 [N m/rad]", at_least=1, at_most=1000)
-    torque: float = option(2.94, "at stall [N m]", at_least=0.1, at_most=20)
-    speed: float = option(4.7, "without load [rad/s]", at_least=0.5, at_most=50)
-    play: float = option(0.9, "of the gears [deg]", at_least=0, at_most=10)
-    delay: float = option(0.005, "between a command and its effect [s]", at_least=0, at_most=0.5)
-    friction: float = option(0.052, "of the gears [N m]", at_least=0, at_most=2)
-    offset: float = option(0.0, "of a joint from where its calibration has it [deg]", at_least=-10, at_most=10)
+    stiffness: float = option(27.0, "torque per position error at P_Coefficient 32 [N m/rad]", at_least=1, at_most=1000)
+    torque: float = option(2.94, "stall torque [N m]", at_least=0.1, at_most=20)
+    speed: float = option(4.7, "speed without load [rad/s]", at_least=0.5, at_most=50)
+    play: float = option(0.9, "backlash of the gears [deg]", at_least=0, at_most=10)
+    delay: float = option(0.005, "delay between a command and its effect [s]", at_least=0, at_most=0.5)
+    friction: float = option(0.052, "friction of the gears [N m]", at_least=0, at_most=2)
+    offset: float = option(0.0, "error of each joint's calibration [deg]", at_least=-10, at_most=10)
 
     def __post_init__(self) -> None:
         check_bounds(self, "servo.")
@@ -62,15 +62,17 @@ class ServoConfig:
 class SessionConfig(Seeded):
     """Options of a session: how the follower's servos move, when a new world is drawn, and what is saved."""
 
-    output_dir: Path = option(Path("runs/serve"), "folder of the links follower and leader, and of their calibrations")
+    output_dir: Path = option(Path("runs/serve"), "folder for the links follower and leader and their calibrations")
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
-    camera_port: int = option(5599, "where the cameras are served (ZMQ)", at_least=1, at_most=65_535)
+    camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
-        "solved", "without a COMMAND, the world is drawn anew on Enter, or also a second after it is solved"
+        "solved", "without a COMMAND: draw a new world on Enter, or also one second after the task is solved"
     )
     intervene: float = option(
-        0.15, "with LeRobot's DAgger: correct a policy whose targets differ by more from the expert's [rad]", at_least=0
+        0.15,
+        "with LeRobot's DAgger: correct the policy if its targets differ from the expert's by more [rad]",
+        at_least=0,
     )
-    log: Path | None = option(None, "folder for journals of what the client cannot see: states and labels")
+    log: Path | None = option(None, "folder for journals of states and labels, which the client cannot see")
     servos: ServoConfig = field(default_factory=ServoConfig)
     varies: bool = False  # whether to redraw the servos for each world

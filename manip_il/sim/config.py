@@ -72,8 +72,8 @@ class CameraConfig:
     """
 
     names: tuple[str, ...]
-    height: int = option(128, "of a picture [pixels]")
-    width: int = option(128, "of a picture [pixels]")
+    height: int = option(128, "picture height [pixels]")
+    width: int = option(128, "picture width [pixels]")
     look: Look = field(default_factory=Look)
 
     def __post_init__(self) -> None:
