@@ -27,6 +27,7 @@ _PATIENCE = 2  # number of horizons after which an episode counts as failed
 _DIFFERS = 0.25  # how long a policy must differ from the expert before it is corrected [s]
 _TELEOPERATED = 3  # number of commands after which a client is past its setup
 _REMEMBERED = 400  # characters of output that are kept, as a message may arrive in parts
+_AUTOGROUP = Path("/proc/self/autogroup")
 _HIDDEN = ("DISPLAY", "WAYLAND_DISPLAY")  # without them LeRobot reads its keys from the terminal
 
 
@@ -243,8 +244,8 @@ def weigh_session(weight: str = "-20") -> str:
     terminal to the other.
     """
     with contextlib.suppress(OSError):
-        group = Path("/proc/self/autogroup")
-        before = group.read_text().split()[-1]  # "/autogroup-12 nice 0"
-        group.write_text(weight)
-        return before
+        before = _AUTOGROUP.read_text().split()  # "/autogroup-12 nice 0"; nothing if sessions are not weighed
+        if before:
+            _AUTOGROUP.write_text(weight)
+            return before[-1]
     return ""

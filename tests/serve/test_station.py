@@ -15,6 +15,7 @@ from lerobot.robots.so_follower import SO101Follower, SOFollowerRobotConfig
 from lerobot.teleoperators.so_leader import SO101Leader, SOLeaderTeleopConfig
 
 from manip_il.errors import UsageError
+from manip_il.serve import operator
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.serve.station import Station
 from manip_il.sim.env import joint_state
@@ -77,6 +78,18 @@ def test_a_lower_gain_sags_more(station: Station):
     sag = np.abs(station.follower.sag()).max()
     station.buses["follower"]["P_Coefficient"] = 16
     assert np.abs(station.follower.sag()).max() == pytest.approx(2 * sag)
+
+
+def test_the_weight_of_a_session_is_raised_and_given_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """On systems that do not weigh sessions the file is empty or missing."""
+    group = tmp_path / "autogroup"
+    monkeypatch.setattr(operator, "_AUTOGROUP", group)
+    assert operator.weigh_session() == ""  # no such file
+    group.write_text("")
+    assert operator.weigh_session() == ""
+    group.write_text("/autogroup-12 nice 3\n")
+    assert operator.weigh_session() == "3"
+    assert group.read_text() == "-20"
 
 
 def test_servos_that_vary_differ_within_their_ranges():
