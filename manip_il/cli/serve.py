@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import ClassVar
 
-from manip_il.cli.common_options import Varied, env_config
+from manip_il.cli.common_options import Trusting, Varied
 from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say, warn
+from manip_il.errors import UnknownName
 from manip_il.option import option
-from manip_il.serve.config import ServoConfig, SessionConfig
+from manip_il.serve.config import LEADERS, ServoConfig, SessionConfig
 from manip_il.tasks.config import EnvConfig
 
 SERVO = "servo"  # a value of --vary
 
 
 @dataclass(frozen=True)
-class ServeOptions(Varied):
+class ServeOptions(Varied, Trusting):
     """Run a simulated SO-101 behind serial ports, which LeRobot's own programs open like those of a real arm.
 
     Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that program on them and
     presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded again.
-    --vary also takes servo.
+    --vary also takes servo. By default a policy at the leader (--leader=runs/lift) also gives the
+    task and the cameras.
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
-    first: ClassVar[str] = "task.type cameras servo log output_dir"
+    first: ClassVar[str] = "task.type cameras leader servo log output_dir"
     command: list[str] = option(list, "a LeRobot program and its options, after `--`", positional=True)
     env: Given = given(EnvConfig, robot="so101")
     session: Given = given(SessionConfig, prefix="")
@@ -33,13 +36,20 @@ class ServeOptions(Varied):
 
     def run(self) -> None:
         """Serve until the program ends or the user presses Ctrl-C."""
+        from manip_il.cli.inputs import open_driver
         from manip_il.data.atomic import exclusive
+        from manip_il.evaluation.policy_folder import find_policy
         from manip_il.evaluation.suites import varied
         from manip_il.serve.session import serve
 
-        env = env_config(self.env)
-        cameras = self.camera_config(env) if self.cameras else None
+        leader, policy = self.session.get("leader", LEADERS[0]), None
+        if leader not in LEADERS:
+            if not Path(leader).exists():
+                raise UnknownName("leader", leader, (*LEADERS, "the folder of a policy"))
+            policy = find_policy(Path(leader))
+        env, _, seen = open_driver(policy, "expert", self.env, trust=self.trust)
+        cameras = self.camera_config(env) if self.cameras else seen
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)
         session = SessionConfig(**self.session, servos=self.servos, varies=SERVO in self.vary)
         with exclusive(session.output_dir):
-            serve(env, session, self.command, cameras, conditions, say, warn)
+            serve(env, session, self.command, cameras, conditions, policy, say, warn, trust=self.trust)

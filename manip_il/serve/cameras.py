@@ -16,6 +16,7 @@ from manip_il.errors import UsageError
 from manip_il.serve.station import Station
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
+from manip_il.sim.render import Picture
 
 RATE = 30  # pictures per second
 _QUALITY = 90  # JPEG quality
@@ -24,12 +25,13 @@ _QUALITY = 90  # JPEG quality
 class Cameras:
     """A thread that streams a station's cameras on one port, `RATE` times per second.
 
-    rate: pictures of each camera that this machine renders per second. Raises `UsageError` for a port that is taken,
-    `RenderError` without off-screen OpenGL.
+    images: the last picture of each. rate: pictures of each that this machine renders per second. Raises `UsageError`
+    for a port that is taken, `RenderError` without off-screen OpenGL.
     """
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
-        self._station, self._cameras = station, cameras
+        self._station, self.config = station, cameras
+        self.images: dict[str, Picture] = {}
         self._data = mujoco.MjData(station.env.scene.model)
         self._socket: Any = zmq.Context.instance().socket(zmq.PUB)
         self._socket.setsockopt(zmq.SNDHWM, 2)
@@ -63,7 +65,7 @@ class Cameras:
     def _send(self) -> None:
         env = self._station.env
         self._data.qpos[:], self._data.mocap_pos[:] = self._station.seen
-        images = render.pictures(env.scene, self._data, self._cameras, env.world.variation)
+        self.images = render.pictures(env.scene, self._data, self.config, env.world.variation)
         # RGB is encoded without swapping and the client's `imdecode` does not swap either, so red stays red.
-        texts = {name: encode_image(image, _QUALITY) for name, image in images.items()}
+        texts = {name: encode_image(image, _QUALITY) for name, image in self.images.items()}
         self._socket.send_string(json.dumps({"timestamps": dict.fromkeys(texts, time.time()), "images": texts}))

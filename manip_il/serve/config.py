@@ -17,6 +17,7 @@ from manip_il.option import Seeded, check_bounds, option
 if TYPE_CHECKING:
     import numpy as np
 
+LEADERS = ("expert", "sliders", "none")  # or a policy
 _IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}
 VARIED = {  # ranges of `--vary=servo`: factors, except for delay and offset, which are added
     "stiffness": (0.7, 1.3),
@@ -63,6 +64,10 @@ class SessionConfig(Seeded):
     """Options of a session: how the follower's servos move, when a new world is drawn, and what is saved."""
 
     output_dir: Path = option(Path("runs/serve"), "folder for the links follower and leader and their calibrations")
+    leader: str = option(
+        "expert", "who moves the leader: expert, sliders (of a window), none, or a policy's checkpoint or run"
+    )
+    speed: float = option(1.0, "speed of time in the world; a test may run it faster", at_least=0.1, at_most=10)
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(

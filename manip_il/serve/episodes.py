@@ -14,7 +14,7 @@ from manip_il.data.episodes import to_episode
 from manip_il.data.journal import Journal, list_seeds
 from manip_il.mdp import Actor, Transition
 from manip_il.seeding import BLOCK, stream_seeds
-from manip_il.serve.station import Read, Station
+from manip_il.serve.station import Mover, Read, Station
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import env_of
 
@@ -22,12 +22,12 @@ from manip_il.tasks.envs import env_of
 class ServedEpisodes:
     """Episodes of a station; those to keep are journals in a folder, for `manip-il data build`.
 
-    folder: None for no journals. seed: shifts the worlds; those that have a journal are not drawn again. driver: who
-    moves the follower now.
+    folder: None for no journals. seed: shifts the worlds; those that have a journal are not drawn again. leader: moves
+    the leader, by default the expert. driver: who moves the follower now.
     """
 
-    def __init__(self, station: Station, config: EnvConfig, folder: Path | None = None, seed: int = 0):
-        self._station, self._env = station, env_of(config)
+    def __init__(self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover):
+        self._station, self._env, self._leader = station, env_of(config), leader
         self._expert, self.driver = Expert(self._env.scene), Actor.EXPERT
         self._reads: list[tuple[Read, Actor]] = []
         self._running = False
@@ -50,9 +50,10 @@ class ServedEpisodes:
         self.drive(driver)
 
     def drive(self, driver: Actor) -> None:
-        """Set who moves the follower from now on: the expert, through the leader, or a policy."""
-        self.driver = driver
-        self._station.mover = self._station.expert if driver is Actor.EXPERT else lambda: None
+        """Set who moves the follower from now on: the leader, if `driver` is the expert, or a program's policy."""
+        leads = driver is Actor.EXPERT
+        self._station.mover = self._leader if leads else lambda: None
+        self.driver = driver if not leads or self._leader == self._station.expert else Actor.LEARNER
 
     def frame(self, read: Read) -> None:
         """Log a moment at which the client has read the follower's position."""

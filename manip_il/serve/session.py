@@ -8,12 +8,14 @@ import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from manip_il.errors import ManipError
 from manip_il.mdp import Actor
 from manip_il.serve.cameras import RATE, Cameras
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.episodes import ServedEpisodes
+from manip_il.serve.leader import load_policy, mover_of
 from manip_il.serve.operator import INTERRUPT, Operator, weigh_session
 from manip_il.serve.station import Station
 from manip_il.sim.conditions import Condition
@@ -30,13 +32,17 @@ def serve(
     command: Sequence[str],
     cameras: CameraConfig | None,
     conditions: Sequence[Condition],
+    policy: Path | None,
     say: Say,
     warn: Say,
+    *,
+    trust: bool,
 ) -> None:
     """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
 
-    cameras: those to serve; None for none. conditions: how worlds vary. say, warn: called with lines for the user.
-    Raises `UsageError` for a robot without Feetech servos or a port that is taken, `ManipError` if the program failed.
+    cameras: those to serve; None for none. conditions: how worlds vary. policy: folder of the one that moves the
+    leader, if any, and whether to `trust` it. say, warn: called with lines for the user. Raises `UsageError` for a
+    robot without Feetech servos or a port that is taken, `ManipError` if the program failed, what `mover_of` raises.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
@@ -44,15 +50,19 @@ def serve(
         stack.callback(weigh_session, weigh_session() or "0")
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
-        episodes = ServedEpisodes(station, env, config.log, config.seed)
-        gc.collect()
-        gc.freeze()  # a full collection of what LeRobot and torch have imported takes longer than a client waits
-        stack.callback(gc.unfreeze)
+        shown = None
         if cameras is not None:
             shown = Cameras(station, cameras, config.camera_port)
             stack.callback(shown.close)
             if shown.rate < RATE:
                 warn(f"pictures are drawn {shown.rate:.0f} times a second here; {RATE} need smaller or fewer ones")
+        task = station.env.task_description
+        leads = load_policy(policy, env, shown, task, trust=trust) if policy is not None else None
+        leader = mover_of(config.leader, leads, station, shown)
+        episodes = ServedEpisodes(station, env, config.log, config.seed, leader)
+        gc.collect()
+        gc.freeze()  # a full collection of what LeRobot and torch have imported takes longer than a client waits
+        stack.callback(gc.unfreeze)
         for line in described(station, config, cameras):
             say(line)
         if command:

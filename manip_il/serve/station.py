@@ -30,6 +30,9 @@ _LATE = 0.25  # largest lag behind the wall clock; beyond it the clock is reset 
 _FULL_TURN = "wrist_roll"  # LeRobot's calibration gives it a full turn
 
 
+Mover = Callable[[], F64 | None]
+
+
 class Read(NamedTuple):
     """A client's read of the follower.
 
@@ -71,7 +74,7 @@ class Station:
         self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])  # the servos' joint limits [rad], (n, 2)
         self.buses = {name: self._open(name) for name in ("follower", "leader")}
         self.follower = Follower(env.world, self.buses["follower"], self.slice)
-        self.mover: Callable[[], F64 | None] = lambda: None
+        self.mover: Mover = lambda: None
         self.hand: F64 | None = None
         self.on_read: Callable[[Read], None] = lambda read: None
         self.reset(0)
@@ -137,7 +140,7 @@ class Station:
 
     def _wait(self, begun: float, slices: int) -> float:
         """Wait until a slice is due; return the start time, moved later if the machine is too slow."""
-        behind = time.perf_counter() - begun - slices * self.slice
+        behind = time.perf_counter() - begun - slices * self.slice / self._config.speed
         time.sleep(max(0.0, -behind))
         return begun + behind if behind > _LATE else begun
 

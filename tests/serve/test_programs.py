@@ -130,6 +130,17 @@ def test_rollout_lets_a_policy_drive(run: Run, policy: str):
 
 
 @pytest.mark.gl
+def test_a_policy_at_the_leader_drives_whoever_follows_it(run: Run, policy: str):
+    """It gives the task and the cameras; twice as fast as real time twice as many attempts end."""
+    served = (f"--leader={policy}", "--camera_port=5634", "--env.horizon=30", "--speed=2")
+    logged = run("lerobot-teleoperate", "--fps=60", "--teleop_time_s=5", served=served)
+    assert len(logged) >= 3
+    assert {*np.concatenate([one.columns["actor"] for one in logged]).ravel()} == {Actor.LEARNER}
+    first = logged[0].columns["executed_action"]
+    assert np.abs(first - first[0]).max() > 0.01
+
+
+@pytest.mark.gl
 def test_episodic_rollout_keeps_what_is_not_solved(run: Run, policy: str, tmp_path: Path):
     words = [*rollout(policy, 5632, "episodic"), *dataset(tmp_path, "rollout_t", 2)]
     logged = run("lerobot-rollout", *words, arms="follower", served=pictures(5632, 30))
