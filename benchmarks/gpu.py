@@ -2,10 +2,11 @@
 
 python benchmarks/gpu.py
 
-Samples/s of ACT (two cameras of 96 and of 240 pixels), diffusion and cnn (96), batches of 32, mixed precision if the
-policy has it: for `manip_il`'s trainer, which decodes pictures once, and for LeRobot's DataLoader with one process per
-core (at most 8), its processors and updates as in `lerobot-train`. Both after a warm-up, alternating, on one dataset of
-videos. Then milliseconds per action for 25 episodes in lockstep, on GPU and CPU, and pictures/s of the renderer.
+Samples/s of ACT (two cameras of 96 and of 240 pixels; aloha's one of 480 x 640, if gym_aloha is installed), diffusion
+and cnn (96), batches of 32, mixed precision if the policy has it: for `manip_il`'s trainer, which decodes pictures
+once, and for LeRobot's DataLoader with one process per core (at most 8), its processors and updates as in
+`lerobot-train`. Both after a warm-up, alternating, on one dataset of videos. Then milliseconds per action for 25
+episodes in lockstep, on GPU and CPU, and pictures/s of the renderer.
 At most 8 minutes. Without a GPU it prints a message and exits with 0.
 """
 
@@ -19,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -47,11 +49,14 @@ SECONDS, REPEATS = 5.0, 3  # duration [s] and number of measurements
 LIMIT = 7 * 60  # [s] after which no further row is started
 ACT = {"type": "act", "use_amp": True, "pretrained_backbone_weights": None}
 DIFFUSION = {"type": "diffusion", "use_amp": True, "pretrained_backbone_weights": None, "crop_shape": [84, 84]}
-ROWS: dict[str, tuple[int, dict[str, Any]]] = {
-    "act, 96 pixels": (96, ACT),
-    "act, 240 pixels": (240, ACT),
-    "diffusion, 96 pixels": (96, DIFFUSION),
-    "cnn, 96 pixels": (96, {"type": "cnn"}),
+SIZES = {"small": (96, 96), "large": (240, 240), "aloha": (480, 640)}  # pictures of each dataset [pixels]
+ALOHA = ["--robot.type=aloha", "--task.type=AlohaTransferCube-v0", "--cameras=top"]
+ROWS: dict[str, tuple[str, dict[str, Any]]] = {
+    "act, 96 pixels": ("small", ACT),
+    "act, 240 pixels": ("large", ACT),
+    "act, aloha, 480 x 640": ("aloha", ACT),
+    "diffusion, 96 pixels": ("small", DIFFUSION),
+    "cnn, 96 pixels": ("small", {"type": "cnn"}),
 }
 
 
@@ -64,20 +69,23 @@ def main() -> int:
     print(f"{torch.cuda.get_device_name()}; {describe_machine()}")
     print(f"training, batches of {BATCH}: samples/s   LeRobot's      ours   ratio (range)   ms an action: card, CPU")
     with tempfile.TemporaryDirectory() as folder:
-        roots = {size: record(Path(folder) / str(size), size) for size in (96, 240)}
-        for name, (size, options) in ROWS.items():
+        names = [name for name in SIZES if name != "aloha" or find_spec("gym_aloha")]
+        roots = {name: record(Path(folder) / name, name) for name in names}
+        for name, (data, options) in ROWS.items():
+            if data not in roots:
+                continue
             if time.monotonic() - began > LIMIT:
                 break
             config = FitConfig(
                 {**options, "device": "cuda"}, observation="images", steps=10**6, batch_size=BATCH, log_freq=10**9
             )
-            trainer = Trainer((Dataset.open(roots[size]),), config, Path(folder) / name)
-            steps = trainer.run(), lerobots_steps(roots[size], trainer)
+            trainer = Trainer((Dataset.open(roots[data]),), config, Path(folder) / name)
+            steps = trainer.run(), lerobots_steps(roots[data], trainer)
             pairs = [tuple(BATCH * per_s(partial(next, step)) for step in steps) for _ in range(REPEATS)]
             trainer.save()
             saved = Path(folder) / name / "checkpoints/last/pretrained_model"
             devices = ("cuda",) if options is DIFFUSION else ("cuda", "cpu")  # on a CPU a plan takes a minute
-            times = [milliseconds_an_action(saved, device, size) for device in devices]
+            times = [milliseconds_an_action(saved, device, SIZES[data]) for device in devices]
             print(row(name, pairs, times), flush=True)
         for size in (96, 240):
             print(f"drawing, {size} x {size} pixels, {os.environ['MUJOCO_GL']}: {pictures_per_s(size):,.0f}/s")
@@ -85,9 +93,10 @@ def main() -> int:
     return 0
 
 
-def record(root: Path, size: int) -> Path:
-    words = ["record", "--cameras=front,wrist", f"--image.height={size}", f"--image.width={size}"]
-    words += ["--dataset.num_episodes=20", f"--dataset.root={root}"]
+def record(root: Path, name: str) -> Path:
+    height, width = SIZES[name]
+    words = ["record", f"--image.height={height}", f"--image.width={width}", f"--dataset.root={root}"]
+    words += ["--dataset.num_episodes=20", *(ALOHA if name == "aloha" else ["--cameras=front,wrist"])]
     command = "import sys; from manip_il.cli.main import main; sys.exit(main())"
     subprocess.run([sys.executable, "-c", command, *words], check=True, capture_output=True)
     return root
@@ -132,10 +141,10 @@ def per_s(call: Callable[[], object]) -> float:
     return count / (time.perf_counter() - started)
 
 
-def milliseconds_an_action(path: Path, device: str, size: int) -> float:
+def milliseconds_an_action(path: Path, device: str, size: tuple[int, int]) -> float:
     policy, rng = LearnedPolicy.load(path, device), np.random.default_rng(0)
     states = rng.normal(size=(EPISODES_AT_ONCE, policy.checkpoint.action)).astype(np.float32)
-    shape = (EPISODES_AT_ONCE, size, size, 3)
+    shape = (EPISODES_AT_ONCE, *size, 3)
     images = {camera: rng.integers(256, size=shape, dtype=np.uint8) for camera in policy.cameras}
     around = np.empty((EPISODES_AT_ONCE, 0), np.float32)
     return 1e3 / (EPISODES_AT_ONCE * per_s(lambda: policy.act(states, around, images)))
