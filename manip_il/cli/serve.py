@@ -9,7 +9,7 @@ from typing import ClassVar
 from manip_il.cli.common_options import Trusting, Varied
 from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say, warn
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 from manip_il.serve.config import LEADERS, ServoConfig, SessionConfig
 from manip_il.tasks.config import EnvConfig
@@ -23,8 +23,7 @@ class ServeOptions(Varied, Trusting):
 
     Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that program on them and
     presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded again.
-    --vary also takes servo. By default a policy at the leader (--leader=runs/lift) also gives the
-    task and the cameras.
+    --vary also takes servo. A policy at the leader (--leader=runs/lift) sets the default task and cameras.
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
@@ -41,12 +40,15 @@ class ServeOptions(Varied, Trusting):
         from manip_il.evaluation.policy_folder import find_policy
         from manip_il.evaluation.suites import varied
         from manip_il.serve.session import serve
+        from manip_il.sim.window import has_display
 
         leader, policy = self.session.get("leader", LEADERS[0]), None
         if leader not in LEADERS:
             if not Path(leader).exists():
                 raise UnknownName("leader", leader, (*LEADERS, "the folder of a policy"))
             policy = find_policy(Path(leader))
+        if leader == "sliders" and not has_display():
+            raise UsageError("--leader=sliders needs a window: a DISPLAY")
         env, _, seen = open_driver(policy, "expert", self.env, trust=self.trust)
         cameras = self.camera_config(env) if self.cameras else seen
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)

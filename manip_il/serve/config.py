@@ -44,7 +44,7 @@ class ServoConfig:
     offset: float = option(0.0, "error of each joint's calibration [deg]", at_least=-10, at_most=10)
 
     def __post_init__(self) -> None:
-        check_bounds(self, "servo.")
+        check_bounds(self, "--servos.")
 
     def ideal(self) -> ServoConfig:
         """Return stiff servos without play, friction or delay."""
@@ -65,9 +65,9 @@ class SessionConfig(Seeded):
 
     output_dir: Path = option(Path("runs/serve"), "folder for the links follower and leader and their calibrations")
     leader: str = option(
-        "expert", "who moves the leader: expert, sliders (of a window), none, or a policy's checkpoint or run"
+        "expert", "who moves the leader: expert, sliders (of a window), none, or a policy (a checkpoint or a run)"
     )
-    speed: float = option(1.0, "speed of time in the world; a test may run it faster", at_least=0.1, at_most=10)
+    speed: float = option(1.0, "how fast time passes in the world; 2: twice as fast as real time", at_least=0.1, at_most=10)
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
@@ -78,6 +78,6 @@ class SessionConfig(Seeded):
         "with LeRobot's DAgger: correct the policy if its targets differ from the expert's by more [rad]",
         at_least=0,
     )
-    log: Path | None = option(None, "folder for journals of states and labels, which the client cannot see")
+    log: Path | None = option(None, "folder for journals of every episode: states, labels and who drove, which the client cannot see")
     servos: ServoConfig = field(default_factory=ServoConfig)
     varies: bool = False  # whether to redraw the servos for each world
