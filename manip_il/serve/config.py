@@ -67,7 +67,9 @@ class SessionConfig(Seeded):
     leader: str = option(
         "expert", "who moves the leader: expert, sliders (of a window), none, or a policy (a checkpoint or a run)"
     )
-    speed: float = option(1.0, "how fast time passes in the world; 2: twice as fast as real time", at_least=0.1, at_most=10)
+    speed: float = option(
+        1.0, "how fast time passes in the world; 2: twice as fast as real time", at_least=0.1, at_most=10
+    )
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
@@ -78,6 +80,6 @@ class SessionConfig(Seeded):
         "with LeRobot's DAgger: correct the policy if its targets differ from the expert's by more [rad]",
         at_least=0,
     )
-    log: Path | None = option(None, "folder for journals of every episode: states, labels and who drove, which the client cannot see")
+    log: Path | None = option(None, "folder for journals with what the client cannot see: states, labels, who drove")
     servos: ServoConfig = field(default_factory=ServoConfig)
     varies: bool = False  # whether to redraw the servos for each world
