@@ -129,7 +129,7 @@ def _film(
     for row, policy in zip(rows, policies, strict=True):
         episode = run_states(trial.job(policy), seed)
         caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
-        shots.append(Shot(trial.job(policy), episode, row.name, caption, stills=6))
+        shots.append(Shot(trial.job(policy), episode, row.name, caption))
     stages.start("films", len(shots))
     return film_shots(shots, stages)
 

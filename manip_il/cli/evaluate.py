@@ -110,7 +110,7 @@ class EvalOptions(Tested, Seeded, Trusting):
             finished_episodes(folder, job, suite)  # raises if they are another policy's
             with Stages(f"finished episodes, in {folder}") as stages, engine:
                 result = measure(engine, job, seeds, name, folder, stages, suite=suite, until_width=width)
-                films = film_outcomes(engine, job, result, self.eval.films, folder / "films", stages)
+                films = film_outcomes(engine, job, result, self.eval.films, stages)
             self._report(result, folder, *films)
         seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
         say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed} --video=replay.mp4")

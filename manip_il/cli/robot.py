@@ -10,7 +10,7 @@ from typing import ClassVar
 from manip_il import checks
 from manip_il.cli.common_options import EngineOptions, env_config
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile, Replacing
+from manip_il.cli.outputs import Output, OutputFile, Replacing
 from manip_il.cli.progress import progress, say
 from manip_il.errors import ManipError, RenderError
 from manip_il.option import Seeded, option
@@ -99,7 +99,6 @@ class RobotCheckOptions:
                 pictures, no_pictures = (), str(error)
             made_by = (command_line("robot check", self), to_plain(self))
             robot_check.check_report(found, pictures, no_pictures, *made_by).write(folder / PAGE)
-        say(robot_check.home_line(found))
         print_table(robot_check.task_table(found))
         say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
         say(f"page: {folder / PAGE}")
@@ -110,7 +109,7 @@ class RobotCheckOptions:
 
 @dataclass(frozen=True)
 class CertifyOptions(Seeded):
-    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json and a report."""
+    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json."""
 
     example: ClassVar[str] = "manip-il robot certify --task.type=stack --output_dir=runs/certificate"
     first: ClassVar[str] = "robot.type task.type cases output_dir"
@@ -131,6 +130,7 @@ class CertifyOptions(Seeded):
             with progress(count, f"certify {env.robot} {env.task}") as bar, self.engine.open() as engine:
                 certificate = certify(engine, env, self.cases, self.seed, lambda _: bar.step())
             write_json(folder / FILE_NAME, certificate.to_json(), indent=None)
-            certificate.report(command_line("robot certify", self), to_plain(self)).write(folder / REPORT_FILE)
         print_table(certificate.table(), empty="-")
-        say(*certificate.facts(), f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+        if certificate.mu is not None:
+            say(f"u of Ross et al. (2011) is at least {certificate.mu} steps")
+        say(f"result: {folder / FILE_NAME}")

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -24,10 +24,8 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.errors import ManipError
-from manip_il.evaluation.figures import Bar, rates_figure
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
-from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, INTERVAL, Table
+from manip_il.evaluation.tables import INTERVAL, Table
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
@@ -38,11 +36,9 @@ from manip_il.tasks.table import get_task
 FILE_NAME = "certificate.json"
 NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
 Group = Literal["start", "state", "action"]
-_COLOURS: dict[Group, str] = {"start": EXPERT, "state": DAGGER, "action": CLONING}
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
+class Case(NamedTuple):
     """One episode. moment: the control step from which the expert is judged.
 
     steps: control steps from there until solved; None if not solved within the horizon. undisturbed: the same without
@@ -91,7 +87,7 @@ class Row:
         found = {"group": self.group, "kind": self.kind, "words": self.words, "n": len(self.cases)}
         found |= {"left_out": self.left_out, "mean_steps": self.mean_steps}
         found |= self.success.to_json() if self.success else {"success_rate": None, "interval": None}
-        return found | {"cases": [[one.seed, one.moment, one.steps, one.undisturbed] for one in self.cases]}
+        return found | {"cases": [list(case) for case in self.cases]}
 
 
 @dataclass(frozen=True)
@@ -142,38 +138,7 @@ class Certificate:
             costs = (f"{np.mean(gaps):.1f}", str(max(gaps))) if gaps else ("", "")
             rows.append((row.words, str(row.success or ""), steps, *costs, str(len(row.cases)), str(row.left_out)))
         head = ("the expert continues from", f"solved {INTERVAL}", "mean steps", "mean cost", "largest cost")
-        colours = tuple(_COLOURS[row.group] for row in self._with_pooled)
-        return Table((*head, "cases", "left out"), tuple(rows), colours)
-
-    def facts(self) -> list[str]:
-        """Return a sentence on the largest cost, if there is one."""
-        if self.mu is None:
-            return []
-        return [f"mu (the u of Ross et al. 2011) is at least {self._in_seconds(self.mu)}."]
-
-    def report(self, command: str, config: Mapping[str, Any]) -> Report:
-        """Return the HTML report."""
-        states = self.pooled("state")
-        changed = f"{states.success} of {len(states.cases):,} changed states" if states.success else "no changed state"
-        bars = [Bar(row.words, (row.success,), _COLOURS[row.group]) for row in self.rows if row.success]
-        note = (
-            "An episode is perturbed once, at a step drawn from those of the undisturbed one; the expert then has "
-            f"{self._in_seconds(self.settings['horizon'])}. Left out: the perturbation changed nothing, or found no "
-            "place. Cost of a wrong action: control steps until solved after it, less those of the undisturbed episode."
-        )
-        return Report(
-            title=f"Certificate of the expert: {self.robot} {self.task}",
-            verdict=f"The expert on {self.robot} {self.task} recovers from {changed}.",
-            facts=tuple(self.facts()),
-            command=command,
-            sections=(Section("Results", figures=(rates_figure(bars),), tables=(self.table(),), notes=(note,)),),
-            config=config,
-            fingerprint=self.fingerprint,
-        )
-
-    def _in_seconds(self, steps: int) -> str:
-        """Return `100 steps (5 s)`."""
-        return f"{steps} steps ({steps / self.settings['control_hz']:.3g} s)"
+        return Table((*head, "cases", "left out"), tuple(rows))
 
 
 def count_episodes(env: EnvConfig, cases: int) -> int:

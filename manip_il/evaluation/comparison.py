@@ -49,15 +49,7 @@ class Comparison:
 
     @classmethod
     def of(cls, left: Arm, right: Arm) -> Comparison:
-        """Compare two arms. Also raises `ManipError` unless all their policies have run the same episodes."""
-        members = [*left.members, *right.members]
-        ours, *others = ({episode.seed for episode in one.test.episodes} for one in members)
-        for other, theirs in zip(members[1:], others, strict=True):
-            if ours != theirs:
-                raise ManipError(
-                    f"test episodes differ: {members[0].name} has {len(ours)}, {other.name} {len(theirs)}, of which "
-                    f"{len(ours & theirs)} are the same; evaluate both with the same --seed and --eval.n_episodes"
-                )
+        """Compare two arms, seed by seed."""
         pairs = zip(left.members, right.members, strict=True)
         return cls(left.name, right.name, tuple((one.test, other.test) for one, other in pairs))
 

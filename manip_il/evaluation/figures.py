@@ -205,31 +205,26 @@ def failure_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
 
     Shows at most the first `MAX_MARKS` failed and solved episodes each.
     """
-    known = [(one, one.place("start"), one.place("goal")) for one in episodes]
-    found = [(one, start[:2], goal[:2]) for one, start, goal in known if start is not None and goal is not None]
-    if not found:
+    places = [(one.success, [one.place("start"), one.place("goal"), one.place("end")]) for one in episodes]
+    known = [(success, own) for success, own in places if None not in own]
+    if not known:
         return ()
-    points = np.array([place for _, *both in found for place in both])
+    points = np.array([own[:2] for _, own in known])[:, :, :2].reshape(-1, 2)  # starts and goals
     middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, 0.55 * float(np.ptp(points, axis=0).max()) + 0.01
-    counts: list[str] = []
     with drawing(1, size=(_PANEL[0], 4.6)) as (drawn, axes):
         axis = axes[0, 0]
         for name, success, colour in (("solved", True, BASELINE), ("failed, from start to goal", False, CLONING)):
-            own = [every for every in found if every[0].success == success]
-            counts.append(f"{len(own)} {name}")
-            if not own:
-                continue
-            starts, goals = (np.array([every[which] for every in own[:MAX_MARKS]]) for which in (1, 2))
-            style = {"color": colour, "ls": "", "ms": 4, "alpha": 0.5 if success else 0.9}
+            marks = np.array([own for outcome, own in known if outcome == success][:MAX_MARKS]).reshape(-1, 3, 3)
+            starts, goals, ends = marks[:, :, :2].transpose(1, 2, 0)
+            style: dict[str, Any] = {"color": colour, "ls": "", "ms": 4, "alpha": 0.5 if success else 0.9}
             style["fillstyle"] = "none" if success else "full"
-            axis.plot(*starts.T, marker="o", label=name, **style)
-            axis.plot(*goals.T, marker="s", **style)
+            axis.plot(*starts, marker="o", label=name, **style)
+            axis.plot(*goals, marker="s", **style)
             if not success:
-                axis.plot(*np.stack([starts, goals]).T, color=colour, lw=0.7, alpha=0.3)
-                ends = np.array([end[:2] for one, *_ in own[:MAX_MARKS] if (end := one.place("end")) is not None])
-                axis.plot(*ends.reshape(-1, 2).T, "x", color=INK, ms=4, mew=0.9, alpha=0.6)
+                axis.plot(*np.stack([starts, goals], axis=1), color=colour, lw=0.7, alpha=0.3)
+                axis.plot(*ends, "x", color=INK, ms=4, mew=0.9, alpha=0.6)
         # The view covers starts and goals, however far an object rolled away.
         axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
         axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]")
         drawn.legend(loc="outside lower left")
-        return (to_figure(drawn, f"Starts and goals seen from above: {', '.join(counts)}"),)
+        return (to_figure(drawn, "Starts, goals and ends of failed episodes, seen from above"),)

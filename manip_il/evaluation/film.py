@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import io
 import logging
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -21,9 +19,8 @@ from manip_il.collect.edits import render_states
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.atomic import write_file
 from manip_il.errors import RenderError
-from manip_il.evaluation.report import Film, Still
+from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import Progress
 from manip_il.mdp import Episode
@@ -42,13 +39,12 @@ def run_states(job: RolloutJob, seed: int) -> Episode:
 
 @dataclass(frozen=True)
 class Shot:
-    """One episode to film. title, caption: shown beside the film. stills: number of frames also shown as pictures."""
+    """One episode to film. title, caption: shown beside the film."""
 
     job: RolloutJob
     episode: Episode
     title: str = ""
     caption: str = ""
-    stills: int = 0
 
     def film(self) -> Film:
         """Return the film, with its last frame as poster. Raises `RenderError` without off-screen OpenGL."""
@@ -57,9 +53,7 @@ class Shot:
         camera = next(iter(STOCK[env.robot].cameras if env.robot in STOCK else ()), "front")
         pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
         frames = list(pictures[schema.IMAGES + camera])
-        chosen = np.unique(np.linspace(0, len(frames) - 1, self.stills).round().astype(int)) if self.stills else []
-        stills = tuple(Still(f"{one / fps:.1f} s", encode_jpeg(frames[one])) for one in chosen)
-        return Film(self.title, encode_mp4(frames, fps), self.caption, encode_jpeg(frames[-1]), stills)
+        return Film(self.title, encode_mp4(frames, fps), self.caption, encode_jpeg(frames[-1]))
 
 
 def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], str]:
@@ -78,44 +72,42 @@ def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], s
 
 
 def film_outcomes(
-    engine: Engine, job: RolloutJob, result: EvalResult, most: int, folder: Path, progress: Progress
+    engine: Engine, job: RolloutJob, result: EvalResult, most: int, progress: Progress
 ) -> tuple[list[Film], str]:
-    """Rerun up to `most` failures and as many successes of an evaluation and film them; also save them in `folder`.
+    """Rerun up to `most` failures and as many successes of an evaluation and film them; returns what `film_shots` does.
 
-    Returns what `film_shots` does.
+    most: 0 for no films.
     """
     shown = [one for good in (False, True) for one in [e for e in result.episodes if e.success == good][:most]]
     if not shown:
         return [], ""
     progress.start("films", len(shown))
     episodes = {episode.seed: episode for episode in engine.run(job, [one.seed for one in shown])}
-    shots: dict[str, Shot] = {}
-    for one in shown:
-        outcome, caption = "success" if one.success else "failure", f"seed {one.seed}, {one.condition}".rstrip(", ")
-        shot = Shot(job, episodes[one.seed], outcome.capitalize(), caption)
-        shots[f"seed_{one.seed}_{outcome}.mp4"] = shot
-    films, why = film_shots(shots.values(), progress)
-    for film, name in zip(films, shots, strict=False):  # without OpenGL there are no films
-        folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / name, film.mp4)
-    return films, why
+    shots = (
+        Shot(
+            job,
+            episodes[one.seed],
+            "Success" if one.success else "Failure",
+            f"seed {one.seed}, {one.condition}".rstrip(", "),
+        )
+        for one in shown
+    )
+    return film_shots(shots, progress)
 
 
 def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
-    """Return an MP4 that browsers can stream: H.264, 4:2:0, index at the front.
+    """Return an MP4 that browsers play: H.264, 4:2:0.
 
     frames: at least one, uint8 (height, width, 3), both even, as 4:2:0 requires.
     """
-    height, width = frames[0].shape[:2]
-    with tempfile.TemporaryDirectory() as folder:  # moving the index to the front needs a file that can be read again
-        path = Path(folder) / "film.mp4"
-        with av.open(path, "w", options={"movflags": "faststart"}) as container:
-            stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": "24", "preset": "medium"})
-            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            for picture in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
-            container.mux(stream.encode())
-        return path.read_bytes()
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": "24", "preset": "medium"})
+        stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
+        for picture in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+        container.mux(stream.encode())
+    return buffer.getvalue()
 
 
 def encode_jpeg(picture: NDArray[np.uint8]) -> bytes:

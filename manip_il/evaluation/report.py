@@ -23,25 +23,20 @@ _INTERVAL = re.compile(r"(.*?) ([\[(].*)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Still:
-    """A picture with its caption. media_type: for example `image/jpeg`."""
+    """A JPEG with its caption."""
 
     caption: str
     content: bytes
-    media_type: str = "image/jpeg"
 
 
 @dataclass(frozen=True)
 class Film:
-    """One episode as an MP4 (H.264). title: in bold before the caption. poster: a JPEG shown until it plays.
-
-    stills: some of its frames, for viewers that play no film, each with its time as caption.
-    """
+    """One episode as an MP4 (H.264). title: in bold before the caption. poster: a JPEG shown until it plays."""
 
     title: str
     mp4: bytes
     caption: str = ""
     poster: bytes = b""
-    stills: tuple[Still, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -20,15 +20,13 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.evaluation.tables import CLONING, EXPERT, Table
-from manip_il.robots.geometry import Pair, meeting_at
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import FILM
-from manip_il.sim.render import Overview, framed_picture
-from manip_il.sim.scene import PREFIX
+from manip_il.sim.render import framed_picture
 from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
@@ -73,14 +71,13 @@ class TaskCheck:
 class RobotCheck:
     """Measurements of a robot. name: as given by the user.
 
-    opening: largest opening of the gripper [m]. overlaps: pairs of links that overlap at home and in every posture.
-    table: share of points on the table of the workspace that the hand reaches while pointing down.
+    opening: largest opening of the gripper [m]. table: share of the points of the workspace on the table that the hand
+    reaches while pointing down.
     """
 
     name: str
     robot: Robot
     opening: float
-    overlaps: tuple[Pair, ...]
     table: float
     tasks: tuple[TaskCheck, ...]
 
@@ -95,7 +92,6 @@ class RobotCheck:
             "robot": self.name,
             "hand": self.robot.hand,
             "gripper": {"joints": self.robot.gripper.joints, "opening": self.opening},
-            "home_overlaps": self.overlaps,
             "reach": {"table": self.table},
             "tasks": [task.to_json() for task in self.tasks],
         }
@@ -109,7 +105,6 @@ def check_robot(
     on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
     """
     robot, scene = get_robot(name), scene_of(name, "reach")
-    overlaps = tuple(meeting_at(robot, scene.model, PREFIX, np.asarray(robot.home)))
     checked = [check_starts(name, task) for task in tasks]
     for place, task in enumerate(checked):
         if episodes and not task.refused:
@@ -119,14 +114,8 @@ def check_robot(
                 seeds = stream_seeds("validation", episodes)
                 found.append(evaluate(engine, job, seeds, "expert", on_result, suite=condition.name))
             checked[place] = replace(task, clean=found[0], noisy=found[1])
-    return RobotCheck(
-        name,
-        robot,
-        scene.gripper.most,
-        overlaps,
-        float(np.mean(_reached(robot, robot.workspace.half_width, 41))),
-        tuple(checked),
-    )
+    table = float(np.mean(_reached(robot, robot.workspace.half_width, 41)))
+    return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
 
 
 def check_starts(name: str, task: str) -> TaskCheck:
@@ -158,7 +147,10 @@ def check_report(
         f"Starts: of {STARTS} that are drawn, how many find a place within reach before one does not. Random actions: "
         "a tenth of the control steps, the gripper's too. Intervals are Wilson's score intervals."
     )
-    home = "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue."
+    home = (
+        "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue. "
+        f"The gripper opens to {1000 * check.opening:.1f} mm."
+    )
     reach = (
         f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table: where "
         "it is green."
@@ -171,7 +163,7 @@ def check_report(
         config=config,
         sections=(
             Section("Tasks", tables=(task_table(check),), notes=(tasks,)),
-            Section("At home in its scene", lead, stills=tuple(pictures), notes=(home, home_line(check))),
+            Section("At home in its scene", lead, stills=tuple(pictures), notes=(home,)),
             Section("Where it reaches", figures=(_reach_figure(check.robot),), notes=(reach,)),
         ),
     )
@@ -198,15 +190,6 @@ def task_table(check: RobotCheck) -> Table:
         tests = (str(one.success) if one else "" for one in (task.clean, task.noisy))
         rows.append((task.name, f"{task.starts} of {STARTS}", *tests))
     return Table(columns, tuple(rows), tuple(EXPERT if task.done else CLONING for task in check.tasks))
-
-
-def home_line(check: RobotCheck) -> str:
-    """Return sentences on how wide the gripper opens, and whether the robot is free of overlaps at home."""
-    opens = f"The gripper opens to {1000 * check.opening:.1f} mm."
-    if not check.overlaps:
-        return f"{opens} At home no part of the robot touches another or the table."
-    pairs = ", ".join(f"{one} and {other}" for one, other in check.overlaps)
-    return f"{opens} At home these overlap, as in every posture: {pairs}; take one of their contacts out of the model."
 
 
 def _reach_figure(robot: Robot) -> Figure:
@@ -257,11 +240,12 @@ def looks(name: str) -> tuple[Still, ...]:
     (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
     corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]
     points = np.vstack([data.xpos[1:], corners])
-    points = points[np.abs(points).max(axis=1) < 3]  # without objects that are parked out of sight
     low, high = points.min(axis=0), points.max(axis=0)
-    distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
-    views: tuple[tuple[str | Overview, str], ...] = (
-        (Overview((low + high) / 2, distance, 55.0, -20.0), "from outside"),
+    outside = mujoco.MjvCamera()
+    outside.lookat[:], outside.azimuth, outside.elevation = (low + high) / 2, 55.0, -20.0
+    outside.distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
+    views: tuple[tuple[str | mujoco.MjvCamera, str], ...] = (
+        (outside, "from outside"),
         ("front", "what camera front sees"),
         ("wrist", "what camera wrist sees"),
     )

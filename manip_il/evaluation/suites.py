@@ -10,7 +10,6 @@ import manip_il
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.sim.conditions import Condition, merged
-from manip_il.sim.shape import draws_shape
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
@@ -75,17 +74,12 @@ def read_condition(name: str) -> Condition:
 
 def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
     """Return the part of a condition that affects an environment, see `Condition.for_world`."""
-    from manip_il.sim.task import TakesShape
     from manip_il.tasks.table import get_task  # imported here, as a wrong name is found without the simulator
 
     if env.robot in STOCK:  # stock environments take no ranges
         return None if condition.ranges else condition
     task = get_task(env.task, env.object)
-    if "shape" in condition.ranges and isinstance(task, TakesShape) and not draws_shape(env.object):
-        raise UsageError(
-            f"{condition.name}: shape is drawn if --task.object is any, not {env.object or 'a cube'}; say so"
-        )
-    return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes, shape=env.object)
+    return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes)
 
 
 def _suites_folder() -> Path:

@@ -19,7 +19,6 @@ INTERVAL = f"[{CONFIDENCE:.0%} interval]".replace("%", " %")  # part of a column
 DAGGER, CLONING, EXPERT, BASELINE = "#0072b2", "#d55e00", "#00835f", "#868e98"
 NO_CONDITION = "without a condition"
 _PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at
-_ROOMY = 112  # terminal width in columns below which intervals go under their rates
 
 
 @dataclass(frozen=True)
@@ -44,17 +43,16 @@ def print_table(table: Table, console: Console | None = None, empty: str = "") -
     """Print the non-empty columns: in colour on a terminal, else as plain text. empty: text for an empty cell."""
     console = console or Console(highlight=False)
     terminal = console.is_terminal
-    gap = "\n" if terminal and console.width < _ROOMY else " "
     if not terminal:
         console = Console(file=console.file, width=_PLAIN_WIDTH, color_system=None, highlight=False)
     table = table.filled()
     drawn = RichTable(box=box.SIMPLE_HEAD if terminal else box.ASCII2, pad_edge=False)
     for index, name in enumerate(table.columns):
-        drawn.add_column(Text(name.replace(" ", gap, 1)), justify="right" if index else "left")
+        drawn.add_column(Text(name), justify="right" if index else "left")
     for index, row in enumerate(table.rows):
         style = table.colours[index] if terminal and table.colours else None
         # Text objects, as Rich would parse the brackets of an interval as markup
-        drawn.add_row(*(Text(printable(cell or empty).replace(" [", f"{gap}[")) for cell in row), style=style)
+        drawn.add_row(*(Text(printable(cell or empty)) for cell in row), style=style)
     console.print(drawn)
 
 

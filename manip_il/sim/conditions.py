@@ -45,14 +45,12 @@ _BOUNDS: dict[str, Range] = {
     "clutter": (0, 12),
     "picture_delay": (0, 100),
 }
-_NAMES = {"shape": KINDS}  # ranges that are lists of these names
-_KNOWN = (*_NAMES, *_BOUNDS)
-_WHOLE = ("knock_step", "delay", "picture_delay")
+_WHOLE = ("knock_step", "delay", "picture_delay", "clutter")
 _SEEDS = 2**31  # seeds of clutter, which a state holds exactly
 _KNOCK_STEP = (5, 24)  # default for a condition with a knock
 _BODY = ("mass", "size", "friction")  # the object's physics
-_MODEL = ("shape", *_BODY, "joint_damping", "actuator_gain")
-_OBJECT = ("knock", "colour", "shape", *_BODY)
+_MODEL = (*_BODY, "joint_damping", "actuator_gain")
+_OBJECT = ("knock", "colour", *_BODY)
 PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # pictures only
 _SEEN = (*PICTURED, "picture_delay")
 
@@ -65,38 +63,37 @@ class Condition:
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
     knock: distance by which the object is moved once [m], at a control step from knock_step, by default 5 to 24.
     joint_noise [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position
-    in a policy's observations. delay: control steps by which those are late. shape: names of shapes, if the task's
-    object may have any; mass [kg], size (edge or width [m]) and sliding friction of the object; colour: each of its
-    red, green and blue; table: of the table's. joint_damping: factor on the damping of every arm joint; actuator_gain:
-    factor on its actuators' kp, its root on kv. posture: largest offset of every joint from home at the start [rad].
-    camera_shift [m], camera_turn [deg]: of every camera, in a random direction. brightness: factor on every lamp;
-    light_turn: of the lamps about the vertical [deg]. clutter: number of things around the workspace that touch
-    nothing. picture_delay: control steps by which pictures alone are late.
+    in a policy's observations. delay: control steps by which those are late. mass [kg], size (edge or width [m]) and
+    sliding friction of the object. colour: each of its red, green and blue; table: of the table's. joint_damping:
+    factor on the damping of every arm joint; actuator_gain: factor on its actuators' kp, and its square root on kv.
+    posture: largest offset of every joint from home at the start [rad]. camera_shift [m], camera_turn [deg]: of every
+    camera, in a random direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
+    clutter: number of things around the workspace that touch nothing. picture_delay: control steps by which pictures
+    alone are late.
 
     Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds, `ManipError` for a name
     that cannot name a file.
     """
 
     name: str
-    ranges: Mapping[str, Any] = field(hash=False)
+    ranges: Mapping[str, Range] = field(hash=False)
 
     def __init__(self, name: str = "nominal", **ranges: Any):
         checks.name("a condition's name", name)
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
         ranges = {one: _range(name, one, range_) for one, range_ in ranges.items()}
-        kept = {one: ranges[one] for one in _KNOWN if one in ranges and (one != "knock_step" or "knock" in ranges)}
+        kept = {one: ranges[one] for one in _BOUNDS if one in ranges and (one != "knock_step" or "knock" in ranges)}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
-    def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None, shape: str = "") -> Condition | None:
+    def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
         """Return the condition without the ranges that have no effect; None if none is left.
 
         has_object, sees: whether the task has an object, the policy cameras. sizes: object sizes that the task can
-        take [m]; None: only its own. shape: the object's, as in `EnvConfig.object`.
+        take [m]; None: only its own.
         Raises `UsageError` if none of the condition's sizes is among them.
         """
         dropped = {*(() if has_object else _OBJECT), *(() if sees else _SEEN), *(() if sizes else ("size",))}
-        dropped |= set() if draws_shape(shape) else {"shape"}
         kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
         if "size" in kept and sizes is not None:
             kept["size"] = _overlap(self.name, kept["size"], sizes)
@@ -139,30 +136,24 @@ def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
 def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> dict[str, Any]:
     """Return what the episode of a seed draws from the condition whose turn it is.
 
-    shape: the object's, as in `EnvConfig.object`; if it is `any`, a shape is drawn, from all unless the condition
-    limits them, and otherwise none.
+    shape: the object's, as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn.
     """
     drawn = turn_of(conditions, seed).draw(seed)
-    if draws_shape(shape):
-        return _ANY_SHAPE.draw(seed) | drawn
-    return {name: value for name, value in drawn.items() if name != "shape"}
+    if not draws_shape(shape):
+        return drawn
+    return {"shape": KINDS[int(rng_for(seed, "condition shape").integers(len(KINDS)))]} | drawn
 
 
-def words(range_: Sequence[Any]) -> str:
-    """Return a range as people read it: `0.03 to 0.07`, `box or sphere`."""
-    if isinstance(range_[0], str):
-        return " or ".join(range_)
+def words(range_: Range) -> str:
+    """Return a range as people read it: `0.03 to 0.07`."""
     low, high = range_
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def _draw(name: str, range_: Any, rng: np.random.Generator) -> Any:
-    if name in _NAMES:
-        return range_[int(rng.integers(len(range_)))]
+def _draw(name: str, range_: Range, rng: np.random.Generator) -> Any:
     if name in _WHOLE:
-        return int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True))
-    if name == "clutter":
-        return [int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True)), int(rng.integers(_SEEDS))]
+        count = int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True))
+        return [count, int(rng.integers(_SEEDS))] if name == "clutter" else count
     if name in ("colour", "table"):
         return [float(value) for value in rng.uniform(range_[0], range_[1], 3)]
     if name in ("camera_shift", "camera_turn"):
@@ -176,26 +167,19 @@ def _vector(rng: np.random.Generator, lengths: Range) -> list[float]:
     return [float(value) for value in rng.uniform(*lengths) * direction / np.linalg.norm(direction)]
 
 
-def _range(condition: str, name: str, given: Any) -> Any:
-    """A range as a tuple, from what Python or YAML gives: a pair or a number, names or one name."""
-    if name not in _KNOWN:
-        raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], _KNOWN)
-    what, several = f"{condition}: {name}", list(given) if isinstance(given, list | tuple) else [given]
-    if name in _NAMES:
-        for one in several:
-            if one not in _NAMES[name]:
-                raise UnknownName(f"{name} in {condition}:", str(one)[: checks.LONGEST_NAME], _NAMES[name])
-        if not several or len(set(several)) < len(several):
-            raise UsageError(f"{what} is {checks.shorten(given)}; expected names, each once")
-        return tuple(several)
+def _range(condition: str, name: str, given: Any) -> Range:
+    """A range as a tuple, from what Python or YAML gives: a pair or a number."""
+    if name not in _BOUNDS:
+        raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], _BOUNDS)
+    what, ends = f"{condition}: {name}", given if isinstance(given, list | tuple) else (given, given)
     try:
-        low, high = (checks.number(what, end) for end in (several if len(several) > 1 else 2 * several))
+        low, high = (checks.number(what, end) for end in ends)
     except (ManipError, ValueError):
         raise UsageError(f"{what} is {checks.shorten(given)}; expected a number, or [low, high]") from None
     least, most = _BOUNDS[name]
     if not least <= low <= high <= most:
         raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {least} to {most}")
-    if name in (*_WHOLE, "clutter") and (low % 1 or high % 1):
+    if name in _WHOLE and (low % 1 or high % 1):
         raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
     return given if isinstance(given, tuple) else (low, high)
 
@@ -210,4 +194,3 @@ def _overlap(name: str, asked: Range, sizes: Range) -> Range:
 
 
 NOMINAL = Condition()
-_ANY_SHAPE = Condition("any", shape=KINDS)

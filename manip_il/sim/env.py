@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError, UnknownName
+from manip_il.errors import UnknownName
 from manip_il.mdp import Observation, State
 from manip_il.robots.robot import Robot
 from manip_il.seeding import rng_for
@@ -23,7 +23,7 @@ from manip_il.sim.points import points_in
 from manip_il.sim.render import Picture, pictures, projections
 from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.shape import ANY
-from manip_il.sim.task import Task, ask, instruction_in
+from manip_il.sim.task import Task, instruction_in
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.window import Window, require_display
 from manip_il.sim.world import Scene, World
@@ -82,15 +82,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Draw a start. The same seed gives the same start, bit for bit.
-
-        options: `instruction` in place of the drawn one. Raises `UsageError` for one that the task does not have.
-        """
+        """Draw a start. The same seed gives the same start, bit for bit."""
         super().reset(seed=seed)
         self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
-        if options and "instruction" in options:
-            ask(self._task, self.world, str(options["instruction"]))
-            self.world.update()
         if self.render_mode == "human":
             self.render()
         return self._observation(), self._info()
@@ -210,7 +204,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         It has pictures only if the environment has cameras.
         """
         world = self._measured()
-        self._pictured.append((self._pictures(self._view), self._keypoints(self._view)) if self._view else ({}, {}))
+        seen: tuple[dict[str, Picture], dict[str, F32]] = {}, {}
+        if self._view:
+            points = np.stack([*points_in(self.world).values()])
+            seen = self._pictures(self._view), projections(self.scene, self._view, points)
+        self._pictured.append(seen)
         (images, keypoints), text = self._pictured[0], self.task_description
         self._observed.append(Observation(joint_state(world), environment_state(world), images, text, keypoints))
         return self._observed[0]
@@ -251,10 +249,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
         return pictures(self.scene, self.data, cameras, self.world.variation)
 
-    def _keypoints(self, cameras: CameraConfig) -> dict[str, F32]:
-        points = np.stack([*points_in(self.world).values()])
-        return projections(self.scene, cameras, points)
-
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}
 
@@ -284,29 +278,18 @@ def joint_state(world: World) -> F32:
 
 
 def environment_state(world: World) -> F32:
-    """Return the numbers that the task observes, float32 (k,). Raises `ManipError` if their names have changed."""
+    """Return the numbers that the task observes, float32 (k,)."""
     numbers: list[float] = []  # for few entries a list is faster than numpy
-    observed = world.scene.task.observe(world)
-    if tuple(observed) != tuple(_observed(world.scene)):
-        names = ", ".join(_observed(world.scene))
-        raise ManipError(f"{world.scene.name}: observed {', '.join(observed)}, and before {names}; expected the same")
-    for value in observed.values():
+    for value in world.scene.task.observe(world).values():
         numbers += value.tolist() if isinstance(value, np.ndarray) and value.ndim else [float(value)]
     return np.array(numbers, np.float32)
 
 
 @lru_cache(SCENES_KEPT)
-def _observed(scene: Scene) -> dict[str, F64 | float]:
-    """What the task observes of the model as compiled."""
-    world = World(scene)
-    world.update()
-    return dict(scene.task.observe(world))
-
-
-@lru_cache(SCENES_KEPT)
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of the k entries of `environment_state`; lengths in [m]."""
-    names: list[str] = []
-    for name, value in _observed(scene).items():
+    world, names = World(scene), list[str]()
+    world.update()
+    for name, value in scene.task.observe(world).items():
         names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
     return tuple(names)

@@ -22,10 +22,9 @@ F64 = NDArray[np.float64]
 Change = Callable[[World, np.random.Generator], object]
 WrongAction = Callable[[F64, World, np.random.Generator], F64]
 
-JOLT = 0.2  # largest jolt of every arm joint [rad]
-SHIFT = (0.0, 0.1)  # range of the object's sideways shift [m]
-DROP = 0.1  # height to drop the object from [m]
-NOTICEABLE = 1e-3  # a perturbation that moves nothing by this much is undone [rad or m]
+_JOLT = 0.2  # largest displacement of every arm joint [rad]
+_SHIFT, _DROP = (0.0, 0.1), 0.1  # sideways shift and height of a dropped object [m]
+_NOTICEABLE = 1e-3  # a perturbation that moves nothing by this much is undone [rad or m]
 _MAX_DRAWS = 100
 _OVERLAP = -0.004  # contact distance below which a moved object overlaps something [m]
 
@@ -37,7 +36,7 @@ class Kind:
     words: str
     change: Change | None = None
     wrong: WrongAction | None = None
-    needs_object: bool = True
+    needs_object: bool = False
 
 
 def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> F64:
@@ -57,13 +56,10 @@ def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
 
 def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
     """Return the joint step of `action` (n,) mirrored about the measured joints, and the opposite gripper command."""
-    mirrored = 2 * _measured(world) - action
-    return np.where(world.scene.actions.relative, mirrored, _opposite_end(action, world))
-
-
-def wrong_gripper(action: F64, world: World, rng: np.random.Generator) -> F64:
-    """Return `action` (n,) with the opposite gripper command."""
-    return np.where(world.scene.actions.relative, action, _opposite_end(action, world))
+    actions = world.scene.actions
+    low, high = actions.low[actions.gripper], actions.high[actions.gripper]
+    opposite = high if action[actions.gripper] < (low + high) / 2 else low
+    return np.where(actions.relative, 2 * _measured(world) - action, opposite)
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
@@ -90,73 +86,63 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
     _place(world, name, start)
 
 
-def jolt_joints(world: World, rng: np.random.Generator, largest: float) -> None:
-    """Turn every arm joint at random by up to `largest` [rad] such that nothing overlaps.
-
-    An object between the fingers moves with the hand.
-    """
-    before = world.data.qpos.copy()
-
-    def put(q: F64) -> None:
-        _move_arm(world, before, q)
-        world.data.qvel[:] = 0.0
-        _settle(world)
-
-    _turn_arm(world, rng, largest, put, lambda: all(contact.dist > _OVERLAP for contact in world.data.contact))
-
-
 def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None:
-    """Turn every arm joint and its command at random by up to `largest` [rad].
+    """Turn every arm joint and its command at random by up to `largest` [rad]; an object in the hand stays behind.
 
-    The arm then touches nothing that it did not touch before, and the hand is where it can point down.
+    The arm then touches nothing that it did not touch before, and the hand is where it can point down. The arm stays
+    where it is if no such posture is found.
     """
     scene, data = world.scene, world.data
+    low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
+    before = data.qpos[scene.arm_q].copy()
 
-    def put(q: F64) -> None:
+    def contacts_at(q: F64) -> set[tuple[int, int, bool]]:
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = q
         world.update()
         mujoco.mj_collision(world.model, data)
+        return arm_contacts(world)
 
-    put(data.qpos[scene.arm_q].copy())
-    touching = arm_contacts(world)
-    _turn_arm(world, rng, largest, put, lambda: arm_contacts(world) <= touching and world.reach.has(world.ee.position))
+    touching = contacts_at(before)
+    for _ in range(_MAX_DRAWS):
+        q = np.clip(before + rng.uniform(-largest, largest, len(before)), low, high)
+        if contacts_at(q) <= touching and world.reach.has(world.ee.position):
+            return
+    contacts_at(before)
 
 
-def arm_contacts(world: World) -> set[tuple[int, int]]:
-    """Return the pairs of geoms in contact of which at least one is the robot's."""
-    model = world.scene.model
+def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
+    """Return the pairs of geoms that touch, one of them the robot's; those that overlap also with True behind them."""
+    model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
     roots = model.body_rootid[model.geom_bodyid]
-    return {(int(a), int(b)) for a, b in world.data.contact.geom if robot in (roots[a], roots[b])}
+    touching = [(int(a), int(b), dist) for (a, b), dist in zip(contact.geom, contact.dist, strict=True)]
+    return {
+        (a, b, deep) for a, b, dist in touching if robot in (roots[a], roots[b]) for deep in {False, dist < _OVERLAP}
+    }
 
 
-def set_fingers(world: World, opening: float) -> None:
-    """Command an opening [m] and put the gripper there, unless the object is in the way."""
+def open_gripper(world: World) -> None:
+    """Command the gripper to open, and put its fingers there."""
     gripper, data = world.scene.gripper, world.data
-    before = data.qpos[gripper.q].copy()
-    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(opening)
+    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
     _settle(world)
-    if any(contact.dist <= _OVERLAP for contact in data.contact):
-        data.qpos[gripper.q] = before
-        _settle(world)
 
 
 KINDS: dict[str, Kind] = {
-    "jolt": Kind(
-        "joints off by up to 0.2 rad", change=lambda world, rng: jolt_joints(world, rng, JOLT), needs_object=False
+    "jolt": Kind("joints off by up to 0.2 rad", change=lambda world, rng: draw_posture(world, rng, _JOLT)),
+    "dropped": Kind(
+        "object dropped from 10 cm",
+        change=lambda world, rng: move_object(world, rng, _SHIFT, _DROP),
+        needs_object=True,
     ),
-    "moved": Kind("object moved up to 10 cm", change=lambda world, rng: move_object(world, rng, SHIFT)),
-    "dropped": Kind("object dropped from 10 cm", change=lambda world, rng: move_object(world, rng, SHIFT, DROP)),
-    "closed": Kind("gripper wrongly closed", change=lambda world, rng: set_fingers(world, 0.0)),
-    "open": Kind("gripper wrongly open", change=lambda world, rng: set_fingers(world, world.gripper.most)),
-    "random": Kind("random action", wrong=random_action, needs_object=False),
-    "opposite": Kind("opposite action", wrong=opposite_action, needs_object=False),
-    "gripper": Kind("right arm, opposite gripper", wrong=wrong_gripper),
+    "open": Kind("gripper wrongly open", change=lambda world, _: open_gripper(world), needs_object=True),
+    "random": Kind("random action", wrong=random_action),
+    "opposite": Kind("opposite action", wrong=opposite_action),
 }
 
 
 def kinds_for(task: Task) -> dict[str, Kind]:
-    """Return the entries of `KINDS` that apply to a task: without an object, those of the gripper do not."""
+    """Return the entries of `KINDS` that apply to a task."""
     return {name: kind for name, kind in KINDS.items() if task.objects or not kind.needs_object}
 
 
@@ -218,7 +204,7 @@ class Events:
             return False
         before, qpos = world.physics(), world.data.qpos.copy()
         self._kind.change(world, self._kind_rng)
-        if np.abs(world.data.qpos - qpos).max() >= NOTICEABLE:
+        if np.abs(world.data.qpos - qpos).max() >= _NOTICEABLE:
             return True
         world.restore(before, world.variation)
         return False
@@ -241,58 +227,10 @@ def _measured(world: World) -> F64:
     return world.scene.actions.join(world.data.qpos[world.scene.arm_q], world.opening)
 
 
-def _opposite_end(action: F64, world: World) -> float:
-    """The end of the gripper's range farther from the command in `action`, in the units of actions."""
-    actions = world.scene.actions
-    low, high = actions.low[actions.gripper], actions.high[actions.gripper]
-    return high if action[actions.gripper] < (low + high) / 2 else low
-
-
 def _settle(world: World) -> None:
     """Compute everything that depends on positions, contacts included."""
     world.update()
     mujoco.mj_forward(world.model, world.data)
-
-
-def _turn_arm(
-    world: World,
-    rng: np.random.Generator,
-    largest: float,
-    put: Callable[[F64], None],
-    is_free: Callable[[], bool],
-) -> None:
-    """Turn the arm's joints at random by up to `largest` [rad], drawing until it is free; else restore them."""
-    scene = world.scene
-    low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
-    before = world.data.qpos[scene.arm_q].copy()
-    for _ in range(_MAX_DRAWS):
-        put(np.clip(before + rng.uniform(-largest, largest, len(before)), low, high))
-        if is_free():
-            return
-    put(before)
-
-
-def _move_arm(world: World, before: F64, q: F64) -> None:
-    """Put the arm at `q` [rad], and move what was between the fingers at `before` (qpos) with it."""
-    scene, data = world.scene, world.data
-    data.qpos[:] = before
-    world.update()
-    ee, rotation = world.ee.position.copy(), world.ee.rotation.copy()
-    held = [
-        one
-        for one in scene.objects.values()
-        if np.abs(rotation.T @ (before[one.q : one.q + 3] - ee)).max() <= max(world.extents(one.name)) / 2
-    ]
-    data.qpos[scene.arm_q] = q
-    world.update()
-    turned = world.ee.rotation
-    for one in held:
-        start = before[one.q : one.q + 7]
-        turn, quat = np.empty(4), np.empty(4)
-        mujoco.mju_mat2Quat(turn, (turned @ rotation.T).ravel())
-        mujoco.mju_mulQuat(quat, turn, start[3:])
-        at = world.ee.position + turned @ (rotation.T @ (start[:3] - ee))
-        data.qpos[one.q : one.q + 7] = [*at, *quat]
 
 
 def _is_on_table(world: World, pose: F64) -> bool:

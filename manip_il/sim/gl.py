@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any
 
 PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
+REMEDY = f"unset MUJOCO_GL if it is set; on Debian: apt-get install -y {PACKAGES}"  # if no picture can be rendered
 
 
 def choose_backend() -> None:
@@ -20,11 +21,3 @@ def context_class() -> Any:
     """Return mujoco's class of off-screen contexts for the backend, even if mujoco was imported before us."""
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
     return import_module(f"mujoco.{backend if backend in ('egl', 'osmesa') else 'glfw'}").GLContext
-
-
-def remedy() -> str:
-    """Return what to do if no picture can be drawn: leave the choice to this program, else install OpenGL."""
-    backend = os.environ.get("MUJOCO_GL", "")
-    if backend.lower().strip() not in ("", "egl") and ctypes.util.find_library("EGL"):
-        return f"unset MUJOCO_GL={backend}"
-    return f"on Debian: apt-get install -y {PACKAGES}"

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import UsageError, shorten
 
-MOST_FACES = 200_000  # MuJoCo's limit
 _LARGEST = 256 * 1024**2  # largest file [bytes]
 _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P<length>:\d*\.?\d+)?", re.DOTALL)
 
@@ -101,11 +100,7 @@ def _solid(name: str, content: bytes, suffix: str) -> Any:
         solid = trimesh.Trimesh(found.vertices, found.faces)
     except Exception as error:
         raise UsageError(f"{name} is no mesh that can be read: {checks.one_line(error)}") from error
-    if len(solid.faces) > MOST_FACES:
-        raise UsageError(f"{name} has {len(solid.faces):,} faces; expected at most {MOST_FACES:,}: simplify it first")
     if not solid.is_watertight:
         raise UsageError(f"{name} is not closed; close its holes in a mesh editor")
     solid.fix_normals(multibody=False)
-    if not solid.volume > 1e-9 * solid.extents.max() ** 3:
-        raise UsageError(f"{name} has a volume of {solid.volume:g}; expected a solid")
     return solid

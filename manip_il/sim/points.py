@@ -14,6 +14,7 @@ from manip_il.sim.world import Scene, World
 
 F64 = NDArray[np.float64]
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # signs of a box's corners
+_NAMED = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_SITE)
 _CORNERS = 4  # a box's upper corners, which cameras see
 
 
@@ -23,10 +24,14 @@ def points_in(world: World) -> dict[str, F64]:
     What a task observes is a position if it has the name of something in the scene. Corners of a box are numbered by
     their direction from its centre.
     """
-    observed, named = world.scene.task.observe(world), _named(world.scene)
-    found = {name: np.asarray(value) for name, value in observed.items() if name in named}
+    model = world.scene.model
+    found = {
+        name: np.asarray(value)
+        for name, value in world.scene.task.observe(world).items()
+        if any(mujoco.mj_name2id(model, kind, name) >= 0 for kind in _NAMED)
+    }
     for name, one in world.scene.objects.items():
-        if world.scene.model.geom_type[one.geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        if model.geom_type[one.geom] == mujoco.mjtGeom.mjGEOM_BOX:
             found |= {f"{name}.corner_{number}": at for number, at in enumerate(_upper_corners(world, name))}
     return found
 
@@ -37,17 +42,6 @@ def point_names(scene: Scene) -> tuple[str, ...]:
     world = World(scene)
     world.update()
     return tuple(points_in(world))
-
-
-@lru_cache(SCENES_KEPT)
-def _named(scene: Scene) -> frozenset[str]:
-    """Names of bodies, geoms and sites."""
-    model = scene.model
-    return frozenset(
-        one(number).name
-        for one, count in ((model.body, model.nbody), (model.geom, model.ngeom), (model.site, model.nsite))
-        for number in range(count)
-    )
 
 
 def _upper_corners(world: World, name: str) -> F64:

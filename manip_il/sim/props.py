@@ -50,11 +50,9 @@ class Prop(NamedTuple):
 
 
 def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
-    """Return the visual things of a scene's world.
+    """Return the visual things of a scene's world; poses of mocap bodies and joints in `data` must be up to date.
 
     clutter: (2,) number of things, and the seed of their kinds and places.
-
-    Poses of mocap bodies and joints in `data` must be up to date.
     """
     return [*_stand(scene, data), *_clutter(scene, data, int(clutter[0]), int(clutter[1]))]
 
@@ -98,17 +96,13 @@ def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[P
 
 def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
     """A box, cylinder or ball of any colour, turned about the vertical; its radius from above, half its height [m]."""
-    kind = int(_KINDS[int(rng.integers(len(_KINDS)))])
+    number = int(rng.integers(len(_KINDS)))
     x, y, z = (rng.uniform(*_HALF, 3) * min(1.0, scene.robot.workspace.half_width / _USUAL)).tolist()
-    size, radius, height = {
-        int(mujoco.mjtGeom.mjGEOM_BOX): ((x, y, z), math.hypot(x, y), z),
-        int(mujoco.mjtGeom.mjGEOM_CYLINDER): ((x, z, 0.0), x, z),
-        int(mujoco.mjtGeom.mjGEOM_SPHERE): ((x, 0.0, 0.0), x, x),
-    }[kind]
+    size, radius, height = (((x, y, z), math.hypot(x, y), z), ((x, z, 0.0), x, z), ((x, 0.0, 0.0), x, x))[number]
     yaw, (red, green, blue) = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
     c, s = math.cos(yaw), math.sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    prop = Prop(kind, np.array(size), np.zeros(3), turn, (float(red), float(green), float(blue), 1.0))
+    prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn, (float(red), float(green), float(blue), 1.0))
     return prop, radius, height
 
 

@@ -6,7 +6,7 @@ import atexit
 import math
 import os
 from functools import cache, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.sim.gl import context_class, remedy
+from manip_il.sim.gl import REMEDY, context_class
 from manip_il.sim.props import Prop, props
 from manip_il.sim.scene import camera_id
 from manip_il.sim.variation import part
@@ -27,15 +27,6 @@ _FINER = 2  # supersampling each way: cheaper than OpenGL's antialiasing, which 
 _MAX_GEOMS = 1_000
 _EE = 4  # group of the site `ee`, the robot's only one
 _AXES = 0.06, 0.006  # length and thickness of its axes [m]
-
-
-class Overview(NamedTuple):
-    """A free camera: the point that it looks at (3,) [m], its distance [m], azimuth and elevation [deg]."""
-
-    at: NDArray[np.float64]
-    distance: float
-    azimuth: float
-    elevation: float
 
 
 def pictures(
@@ -63,9 +54,9 @@ def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]
 
 
 def framed_picture(
-    scene: Scene, data: mujoco.MjData, camera: str | Overview, size: tuple[int, int], look: Look
+    scene: Scene, data: mujoco.MjData, camera: str | mujoco.MjvCamera, size: tuple[int, int], look: Look
 ) -> Picture:
-    """Return what a fixed or free camera sees of the physics in `data`, with the axes of `ee` drawn in.
+    """Return what a scene's or a free camera sees of the physics in `data`, with the axes of `ee` drawn in.
 
     x is red, y green, z blue. size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures`
     raises.
@@ -93,7 +84,7 @@ def _renderer(scene: Scene, look: Look) -> _Renderer:
             gl.make_current()
             return _prepared(scene, look)
     except Exception as error:  # mujoco raises many kinds, from ImportError to its own
-        raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {remedy()}") from error
+        raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}") from error
     raise RenderError("OpenGL does not survive a fork; start processes that make pictures by 'spawn'")
 
 
@@ -139,15 +130,15 @@ class _Renderer:
         mujoco.mj_camlight(self._model, self._data)
         self._props = props(self._of, self._data, part(variation, "clutter"))
 
-    def picture(self, camera: str | Overview, size: tuple[int, int], *, axes: bool = False) -> Picture:
+    def picture(self, camera: str | mujoco.MjvCamera, size: tuple[int, int], *, axes: bool = False) -> Picture:
         height, width = (_FINER * side for side in size)
         self._make_room(height, width)
-        seen_by = self._camera if isinstance(camera, str) else _free_camera(camera)
         if isinstance(camera, str):
-            seen_by.fixedcamid = self._cameras[camera]
+            self._camera.fixedcamid = self._cameras[camera]
+            camera = self._camera
         everything, frame = mujoco.mjtCatBit.mjCAT_ALL, mujoco.mjtFrame
         self._option.frame, self._option.sitegroup[_EE] = (frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE), axes
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, seen_by, everything, self._scene)
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, camera, everything, self._scene)
         for prop in self._props:
             prop.add_to(self._scene)
         fine = np.empty((height, width, 3), dtype=np.uint8)
@@ -170,14 +161,6 @@ class _Renderer:
         have_height, have_width = self._context.offHeight, self._context.offWidth
         if height > have_height or width > have_width:
             mujoco.mjr_resizeOffscreen(max(width, have_width), max(height, have_height), self._context)
-
-
-def _free_camera(view: Overview) -> mujoco.MjvCamera:
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-    camera.lookat[:] = view.at
-    camera.distance, camera.azimuth, camera.elevation = view.distance, view.azimuth, view.elevation
-    return camera
 
 
 def _coarser(fine: NDArray[np.uint8]) -> Picture:

@@ -19,7 +19,7 @@ from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
-from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
+from manip_il.sim.rests import Hull
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
@@ -152,20 +152,15 @@ def _check_objects(
     gripper: Gripper,
     hulls: Mapping[str, Hull],
 ) -> None:
-    """Raise `UsageError` for an object that the gripper cannot go around."""
+    """Raise `UsageError` for an object that is too wide for the gripper."""
     for name in task.grasped:
-        one = objects[name]
         if name in hulls:
-            lies = hulls[name].rest(0)
-            width = min(width for width, _ in lies.sizes)
-            if lies.tall < LEAST_HEIGHT:
-                raise UsageError(
-                    f"task {task.name}: {name!r} lies {lies.tall:.3f} m high, and fingers need {LEAST_HEIGHT} m; "
-                    "choose a larger one"
-                )
-        else:
-            width = variation.widest_grasp(int(model.geom_type[one.geom]), model.geom_size[one.geom])
-        if width >= gripper.most - (LEAST_ROOM if name in hulls else 0.0):
+            width = min(width for width, _ in hulls[name].rest(0).sizes)
+        else:  # the greatest width between fingers from above, on whichever side it lies
+            kind, size = int(model.geom_type[objects[name].geom]), model.geom_size[objects[name].geom]
+            lengths = variation.extents(kind, size)
+            width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])
+        if width >= gripper.most:
             raise UsageError(
                 f"task {task.name}: {name!r} is {width:.3f} m wide, and the gripper of {robot.name} opens to "
                 f"{gripper.most:.3f} m; choose another object, task or robot"

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import UsageError, nearest, shorten
 from manip_il.robots.robot import Robot
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
@@ -137,34 +136,14 @@ class Instructing(Protocol):
         """Return the objects that the text of a world's episode is about, which the arm must reach."""
         ...
 
-    @property
-    def instructions(self) -> tuple[str, ...]:
-        """Every text that an episode may have."""
-        ...
-
     def instruction_in(self, world: World) -> str:
         """Return the text of a world's episode."""
-        ...
-
-    def ask(self, world: World, instruction: str) -> None:
-        """Change the text of a world's episode to another of the texts."""
         ...
 
 
 def instruction_in(task: Task, world: World) -> str:
     """Return the text of a world's episode: the task's instruction, unless it differs between episodes."""
     return task.instruction_in(world) if _instructs(task) else task.instruction
-
-
-def ask(task: Task, world: World, instruction: str) -> None:
-    """Change the text of a world's episode. Raises `UsageError` for a text that the task does not have."""
-    name, known = task.name, list(task.instructions) if _instructs(task) else [task.instruction]
-    if instruction not in known:
-        others = f" and {len(known) - 1} others" if len(known) > 1 else ""
-        near = nearest(instruction, known)
-        raise UsageError(f"instruction is {shorten(instruction)}; {name} has {known[0]!r}{others}{near}")
-    if _instructs(task):
-        task.ask(world, instruction)
 
 
 def objects_in(task: Task, world: World) -> tuple[str, ...]:

@@ -198,12 +198,6 @@ def extents(kind: int, size: F64) -> F64:
     )
 
 
-def widest_grasp(kind: int, size: F64) -> float:
-    """Return a geom's greatest width between fingers from above, on whichever side it lies [m]."""
-    lengths = np.sort(extents(kind, size))
-    return float(lengths[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else extents(kind, size)[0])
-
-
 def _bound(kind: int, size: F64) -> float:
     """Return the radius of the sphere around a geom [m]."""
     if kind == int(mujoco.mjtGeom.mjGEOM_BOX):

@@ -120,10 +120,12 @@ def _with_few_faces(scene: Scene) -> mujoco.MjModel:
 
 def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
     """Overwrite the start of a mesh's vertices, normals and faces with fewer; the rest is never drawn."""
-    vertices = _rows(model.mesh_vert, model.mesh_vertadr[mesh], model.mesh_vertnum[mesh])
-    normals = _rows(model.mesh_normal, model.mesh_normaladr[mesh], model.mesh_normalnum[mesh])
-    faces = _rows(model.mesh_face, model.mesh_faceadr[mesh], model.mesh_facenum[mesh])
-    face_normals = _rows(model.mesh_facenormal, model.mesh_faceadr[mesh], model.mesh_facenum[mesh])
+    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+    normals = model.mesh_normal[model.mesh_normaladr[mesh] :][: model.mesh_normalnum[mesh]]
+    faces, face_normals = (
+        rows[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
+        for rows in (model.mesh_face, model.mesh_facenormal)
+    )
     normal_of = np.zeros(len(vertices), dtype=np.int64)
     normal_of[faces] = face_normals
     positions, originals, few = cluster(vertices.astype(np.float64), faces, finest)
@@ -135,9 +137,8 @@ def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
 def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple[F64, Indices, Indices]:
     """Merge the vertices (v, 3) in each cell of a grid: positions (c, 3), an original vertex each (c,), faces (f, 3).
 
-    finest: least size of a cell [m].
-
-    The original is the one nearest to the mean of its cell; its normal shades a coarse mesh like the fine one.
+    finest: least size of a cell [m]. The original is the one nearest to the mean of its cell; its normal shades a
+    coarse mesh like the fine one.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = max(float(np.linalg.norm(high - low)) / _CELLS, finest)
@@ -183,7 +184,3 @@ def _sums(groups: Indices, values: F64, count: int) -> F64:
     sums = np.zeros((count, values.shape[1]))
     np.add.at(sums, groups, values)
     return sums
-
-
-def _rows(array: NDArray[Any], start: int, count: int) -> NDArray[Any]:
-    return array[start : start + count]

@@ -185,16 +185,6 @@ class Sort:
     sizes: tuple[float, float] | None = (0.03, 0.04)
     rungs: tuple[Rung, ...] = _RUNGS
 
-    @property
-    def instructions(self) -> tuple[str, ...]:
-        """Every sentence with every colour."""
-        return tuple(sentence.format(colour=colour) for colour in COLOURS for sentence in SENTENCES)
-
-    def ask(self, world: World, instruction: str) -> None:
-        """Change the sentence of a world's episode."""
-        number, sentence = divmod(self.instructions.index(instruction), len(SENTENCES))
-        world.place(ASKED, np.array([number, 0.0, sentence]), UPRIGHT)
-
     def instruction_in(self, world: World) -> str:
         """Return the sentence of a world's episode."""
         number = round(float(world.pose(ASKED).position[2])) % len(SENTENCES)

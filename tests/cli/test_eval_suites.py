@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from pathlib import Path
 
@@ -191,11 +192,10 @@ def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, caps
 def test_failures_and_successes_are_filmed_and_a_replay_films_one(act, here):
     expert = ["--policy.type=expert", "--task.type=reach", "--robot.type=fetch", "--workers=1", "--eval.n_episodes=2"]
     assert evaluate("good", *expert, "--env.horizon=30", "--eval.films=1") == 0
-    assert [path.name for path in Path("good/films").iterdir()] == ["seed_4000000_success.mp4"]
+    assert Path("good/report.html").read_text().count("<video") == 1
     words = [f"--policy.path={act}", "--suite=object", "--eval.n_episodes=3", *SMALL]
     assert evaluate("bad", *words, "--eval.films=2") == 0
-    names = sorted(path.name for path in Path("bad/films").iterdir())
-    assert names == ["seed_4000000_failure.mp4", "seed_4000001_failure.mp4"]
-    assert Path("bad/report.html").read_text().count("<video") == 2
+    page = Path("bad/report.html").read_text()
+    assert page.count("<video") == 2
     assert main(["eval", "bad", "--replay=4000001", "--video=deep/one.mp4"]) == 0
-    assert Path("deep/one.mp4").read_bytes() == (Path("bad/films") / names[1]).read_bytes()
+    assert base64.b64encode(Path("deep/one.mp4").read_bytes()).decode() in page

@@ -8,7 +8,6 @@ from __future__ import annotations
 import pytest
 
 from manip_il.collect.job import RolloutJob
-from manip_il.data.schema import LABEL_VALID
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import KINDS, Perturbation, kinds_for
@@ -48,12 +47,8 @@ def test_the_expert_solves_a_task_whatever_the_cube(robot: str, task: str, condi
     assert failures(condition, robot, task, 3) == []
 
 
-# Where it leaves the object in no sound state: in a gap beside a laptop that the hand does not fit into.
-UNSOUND = {("panda", "carry", "moved", 6)}
-
-
 @pytest.mark.parametrize(("robot", "task", "kind", "at"), CHANGED)
-def test_the_expert_recovers_or_says_that_it_cannot(robot: str, task: str, kind: str, at: int):
+def test_the_expert_recovers(robot: str, task: str, kind: str, at: int):
     seed = stream_seeds("certificate", 20)[at]
     config, condition = (
         make_config(robot, task, horizon=at + TASKS[task].limits.horizon),
@@ -61,7 +56,4 @@ def test_the_expert_recovers_or_says_that_it_cannot(robot: str, task: str, kind:
     )
     [episode] = RolloutJob(config, hold=0, conditions=(condition,)).run([seed])
     assert len(episode) > at
-    if (robot, task, kind, at) in UNSOUND:
-        assert not episode.columns[LABEL_VALID][at:].any()
-    else:
-        assert episode.success
+    assert episode.success

@@ -16,8 +16,6 @@ from manip_il.sim.events import Perturbation
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env, scene_of
 
-from .page import page_of
-
 HORIZON = 50
 SETTINGS = {"cases": 4, "seed": 0, "horizon": HORIZON, "control_hz": 20, "tolerance": 0.02, "success_steps": 5}
 ACTIONS = (Case(1, 3, 10, 9), Case(2, 0, 30, 10), Case(3, 9, None, 7), Case(4, 2, 8, 9))
@@ -59,18 +57,14 @@ def test_the_file_holds_every_case_and_what_follows_from_them():
     assert (empty["n"], empty["left_out"], empty["success_rate"], empty["interval"]) == (0, 4, None, None)
 
 
-def test_the_table_and_the_page_show_the_numbers():
+def test_the_table_shows_the_numbers():
     many = row("action", tuple(Case(i, 0, i + 2, 1) for i in range(40)))  # gaps of 1 to 40
     made = certificate(row("action", ACTIONS))
     assert certificate(many).table().rows[3][3:5] == ("20.5", "40")
     assert made.table().rows[3][1:] == ("75.0 % [30.1, 95.4]", "16.0", "17.5", "50", "4", "0")
-    page = page_of(made.report("manip-il robot certify", {}))
-    assert "75.0 % [30.1, 95.4]" in page.text
-    assert "at least 50 steps (2.5 s)." in page.text
-    assert len(page.figures) == 1
 
 
-@pytest.mark.parametrize("kind", ["random", "opposite", "gripper"])
+@pytest.mark.parametrize("kind", ["random", "opposite"])
 def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate, kind: str):
     expert = Expert(scene_of("fetch", "pick_place"))
 
@@ -93,9 +87,7 @@ def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate
 
 
 def test_every_kind_has_its_row_and_every_case_its_moment_on_the_experts_way(measured: Certificate):
-    assert [row.kind for row in measured.rows] == [
-        *("start", "jolt", "moved", "dropped", "closed", "open", "random", "opposite", "gripper", "noise")
-    ]
+    assert [row.kind for row in measured.rows] == [*("start", "jolt", "dropped", "open", "random", "opposite", "noise")]
     whole = {case.seed: case.steps or 0 for case in measured.of("start")[0].cases}
     for one in [*measured.of("state"), *measured.of("action")]:
         assert len(one.cases) + one.left_out == 3

@@ -9,7 +9,7 @@ from manip_il.evaluation.arm import Arm
 from manip_il.evaluation.eval_report import compare_report, eval_report, run_report
 from manip_il.evaluation.figures import Bar, Curve, curve_figures, rates_figure
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.report import Film, Still
+from manip_il.evaluation.report import Film
 from manip_il.evaluation.rounds import history
 from manip_il.evaluation.tables import CLONING, PolicyRow
 
@@ -58,14 +58,13 @@ def test_if_nothing_or_everything_failed_the_page_says_so():
 def test_a_run_has_its_policies_their_curves_and_how_it_was_made():
     rows = [PolicyRow("DAgger", RESULT, 1234, RESULT), PolicyRow("cloning", RESULT, 400, colour=CLONING)]
     beside = Curve("cloning", (RUN[:1],), CLONING, ("labels",))
-    film = Film("DAgger", MP4, stills=(Still("0.4 s", JPEG),))
     page = page_of(
         run_report(
-            rows, [film], curves=[Curve("DAgger", (RUN,)), beside], title="t", verdict="DAgger wins.", command="c",
+            rows, FILMS, curves=[Curve("DAgger", (RUN,)), beside], title="t", verdict="DAgger wins.", command="c",
             config={"policy": {"hidden": 256, "name": None}}, timings={"training": 200.0},
         )
     )  # fmt: skip
-    for words in ("1,234", "policy.hidden 256 policy.name none", "training 3 min 20 s", "0.4 s"):
+    for words in ("1,234", "policy.hidden 256 policy.name none", "training 3 min 20 s"):
         assert words in page.text
     curves = [words for words in page.figures if "Validation" in words]
     assert curves[0] == "Validation success over labels: DAgger, cloning"

@@ -51,17 +51,11 @@ def test_what_nobody_notices_is_left_out():
     assert VIEW.for_world(has_object=False, sees=True, sizes=(0.03, 0.07)) == VIEW
 
 
-ROUND = Condition("round", shape=("sphere", "cylinder"), size=(0.02, 0.06))
-
-
-def test_an_object_of_any_shape_has_one_of_the_conditions_shapes_or_of_all():
-    for conditions, shapes in (([ROUND], ROUND.ranges["shape"]), ([OBJECT], KINDS), ([], KINDS)):
-        assert {draw(conditions, seed, "any")["shape"] for seed in range(40)} == set(shapes)
-    assert draw([OBJECT], 3, "any").items() >= draw([OBJECT], 3).items()
-    assert "shape" not in draw([ROUND], 3, "sphere:0.04")
-    assert "shape" not in ROUND.for_world(has_object=True, sees=True, sizes=(0.02, 0.07)).ranges
-    assert ROUND.for_world(has_object=True, sees=True, sizes=(0.02, 0.07), shape="any:0.05") == ROUND
-    assert str(ROUND) == "round (shape sphere or cylinder, size 0.02 to 0.06)"
+def test_an_object_of_any_shape_has_one_of_all_shapes():
+    for conditions in ([OBJECT], []):
+        assert {draw(conditions, seed, "any")["shape"] for seed in range(40)} == set(KINDS)
+    assert draw([OBJECT], 3, "any:0.04").items() >= draw([OBJECT], 3).items()
+    assert "shape" not in draw([OBJECT], 3, "sphere:0.04")
 
 
 def test_sizes_are_those_that_a_task_can_take():
@@ -72,5 +66,5 @@ def test_sizes_are_those_that_a_task_can_take():
 
 
 def test_a_condition_is_its_json_again():
-    for condition in (NOMINAL, KNOCKED, OBJECT, VIEW, ROUND):
+    for condition in (NOMINAL, KNOCKED, OBJECT, VIEW):
         assert Condition(**json.loads(json.dumps(condition.to_json()))) == condition

@@ -17,7 +17,7 @@ from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.gl import remedy
+from manip_il.sim.gl import REMEDY
 from manip_il.tasks.stock.aloha.ladder import Scene
 from manip_il.tasks.stock.base import WHOLE, StockBase
 from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
@@ -138,7 +138,7 @@ class AlohaEnv(StockBase):
         try:
             return {name: painter.draw(height=height, width=width, camera_id=name) for name in self._cameras.names}
         except Exception as error:  # what OpenGL and its bindings raise
-            raise RenderError(f"{ALOHA} cannot be drawn ({error}); {remedy()}") from error
+            raise RenderError(f"{ALOHA} cannot be drawn ({error}); {REMEDY}") from error
 
 
 @cache
