@@ -7,13 +7,15 @@ mujoco reads MUJOCO_GL only when it is imported.
 
 from __future__ import annotations
 
+import ctypes.util
+import os
 from importlib import import_module
 from typing import Any
 
-from manip_il.sim.gl import choose_backend
 from manip_il.tasks.register import register_envs
 
-choose_backend()
+if not os.environ.get("MUJOCO_GL") and ctypes.util.find_library("EGL"):
+    os.environ["MUJOCO_GL"] = "egl"
 register_envs()
 
 __version__ = "0.1.0"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.sim.gl import PACKAGES
+from manip_il.sim.render import PACKAGES
 
 from .conftest import IMPORTED_ONCE, LONG
 

@@ -151,7 +151,7 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
 
 
 def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, *films: Any, **parts: Any) -> None:
-    """Write the report in `folder` on the policies of `run`: their table, success over costs, and times.
+    """Write the report in `folder` on the policies of `run`: their table, and success over costs.
 
     kind: the algorithm's name. films, parts: see `run_report`.
     """
@@ -160,9 +160,8 @@ def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, *films
     from manip_il.evaluation.rounds import history
 
     records = read_lines(run / METRICS_FILE)
-    timings = {f"round {one['round']}, {stage}": took for one in records for stage, took in one["seconds"].items()}
     curve = Curve(kind, (history(records, str(run)),))
     fingerprint = rows[-1].result.fingerprint
     shown, why_none = films or ((), "")
-    page = run_report(rows, shown, why_none, [curve], fingerprint=fingerprint, timings=timings, **parts)
+    page = run_report(rows, shown, why_none, [curve], fingerprint=fingerprint, **parts)
     page.write(folder / REPORT_FILE)

@@ -121,7 +121,9 @@ def require_pair(left: Arm, right: Arm) -> None:
     Two single policies can be compared whatever their seeds.
     """
     if len({member.result is None for arm in (left, right) for member in arm.members}) > 1:
-        raise UsageError(f"{left.name} and {right.name}: one is evaluated already; give two eval.json, or two policies")
+        raise UsageError(
+            f"{left.name} and {right.name}: only one of them is an evaluation; give two eval.json, or two policies"
+        )
     ours, theirs = ([member.training_seed for member in arm.members] for arm in (left, right))
     if len(ours) != len(theirs) or (len(ours) > 1 and ours != theirs):
         raise UsageError(f"training seeds differ: {left.name} has {ours}, {right.name} {theirs}; give the same ones")

@@ -49,7 +49,13 @@ class Comparison:
 
     @classmethod
     def of(cls, left: Arm, right: Arm) -> Comparison:
-        """Compare two arms, seed by seed."""
+        """Compare two arms. Also raises `ManipError` unless all their policies have run the same episodes."""
+        members = (*left.members, *right.members)
+        if len({frozenset(episode.seed for episode in one.test.episodes) for one in members}) > 1:
+            raise ManipError(
+                f"test episodes of {left.name} and {right.name} differ; evaluate both with the same --seed and "
+                "--eval.n_episodes"
+            )
         pairs = zip(left.members, right.members, strict=True)
         return cls(left.name, right.name, tuple((one.test, other.test) for one, other in pairs))
 
@@ -224,7 +230,7 @@ class Study:
         rows: list[tuple[str, ...]] = []
         for arm in self.arms:
             first = self._reached(arm)
-            missed = f"not in {first.count(None)} of {len(first)} seeds"
+            missed = f"not reached in {first.count(None)} of {len(first)} seeds"
             rows.append((arm.name, *(missed if None in first else _mean_cost(cost, first) for cost in self._costs)))
         head = (f"{_head(cost)} to {100 * self.target:g} %" for cost in self._costs)
         return Table(("arm, validation", *head), tuple(rows))

@@ -78,7 +78,7 @@ def compare_report(study: Study, title: str, command: str, config: Mapping[str, 
     results, costs = replace(results, colours=of_arms), [replace(one, colours=of_arms) for one in study.cost_tables()]
     bars = [Bar(arm.name, tuple(one.test.success for one in arm.members), colours[arm.name]) for arm in study.arms]
     same = "the same " if study.baseline is not None else ""
-    note = f"Every policy ran {same}{first.success.n:,} test episodes, on which nothing was chosen."
+    note = f"Every policy ran {same}{first.success.n:,} test episodes, which were used for no choice."
     note += disturbed_note(first)
     if len(bars[0].successes) > 1:
         note += " In brackets and as dots: each training seed; the bar is their mean."
@@ -183,7 +183,7 @@ def _conditions(result: EvalResult) -> Section:
     ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
     intervals = "Intervals are Wilson's score intervals."
     if result.until_width is not None:
-        intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
+        intervals = "Intervals are from a confidence sequence, which is valid whenever the evaluation stops."
     note = (
         f"{result.success.n:,} episodes of at most {settings.horizon:,} control steps. Success: an error of at most "
         f"{100 * settings.tolerance:g} cm for {settings.success_steps} control steps in a row{ends}. {intervals}"

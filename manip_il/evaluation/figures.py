@@ -32,7 +32,7 @@ _DPI = 96
 MAX_MARKS = 200  # number shown on a map per outcome; more would hide each other
 MAP_NOTE = (
     "Circles: starts, squares: goals, crosses: where failed episodes ended. "
-    f"Of each outcome the first {MAX_MARKS} episodes are drawn at most."
+    f"At most the first {MAX_MARKS} episodes of each outcome are drawn."
 )
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same whatever fonts a machine has

@@ -15,7 +15,6 @@ from markupsafe import Markup, escape
 
 from manip_il.data.atomic import write_file
 from manip_il.evaluation.figures import Figure
-from manip_il.evaluation.rounds import format_seconds
 from manip_il.evaluation.tables import Table
 
 _INTERVAL = re.compile(r"(.*?) ([\[(].*)", re.DOTALL)
@@ -57,7 +56,7 @@ class Section:
 class Report:
     """A page: the verdict (a first sentence with its numbers), further facts, sections, and how it was made.
 
-    command: the command that made it. timings: by name [s]. config, fingerprint: nested mappings.
+    command: the command that made it. config, fingerprint: nested mappings.
     """
 
     title: str
@@ -67,7 +66,6 @@ class Report:
     facts: tuple[str, ...] = ()
     config: Mapping[str, Any] = field(default_factory=dict[str, Any])
     fingerprint: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    timings: Mapping[str, float] = field(default_factory=dict[str, float])
 
     def render(self) -> str:
         """Return the page as one string of HTML."""
@@ -124,7 +122,6 @@ def _environment() -> Environment:
         "heading": lambda column: column if "/" in column else column[:1].upper() + column[1:],
         "split_interval": _split_interval,
         "base64": lambda content: base64.b64encode(content).decode("ascii"),
-        "durations": lambda timings: {name: format_seconds(seconds) for name, seconds in timings.items()},
         "flatten": flatten,
     }
     environment.filters.update(filters)

@@ -144,16 +144,16 @@ def check_report(
     """Return the HTML report of a check. no_pictures: the reason if there are none."""
     lead = () if pictures else (f"No pictures: {no_pictures}",)
     tasks = (
-        f"Starts: of {STARTS} that are drawn, how many find a place within reach before one does not. Random actions: "
-        "a tenth of the control steps, the gripper's too. Intervals are Wilson's score intervals."
+        f"Starts: how many of {STARTS} were drawn before one found no place within reach. Random actions: a tenth of "
+        "the actions, the gripper's included. Intervals are Wilson's score intervals."
     )
     home = (
         "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue. "
         f"The gripper opens to {1000 * check.opening:.1f} mm."
     )
     reach = (
-        f"The hand, pointing down, gets to {100 * check.table:.0f} % of the workspace (the frame) on the table: where "
-        "it is green."
+        f"Pointing down, the hand reaches {100 * check.table:.0f} % of the workspace on the table (the frame). Points "
+        "that it reaches are green."
     )
     return Report(
         title=f"{check.robot.name}: robot check",
@@ -173,12 +173,12 @@ def verdict(check: RobotCheck) -> str:
     """Return a sentence on which tasks a robot can do."""
     count, cannot = len(check.tasks), ", ".join(task.name for task in check.failed)
     asked = any(task.clean is not None for task in check.tasks)
-    can, end = ("can do", "") if asked else ("has starts for", "; the expert was not asked")
+    can, end = ("can do", "") if asked else ("has starts for", "; the expert was not run")
     words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} task{'s' if count > 1 else ''}{end}"
     words += f"; it cannot do {cannot}" if cannot else ""
     shaken = [(task.name, task.noisy.success) for task in check.tasks if task.done and task.noisy is not None]
     if poor := [f"{one} in {success.successes} of {success.n}" for one, success in shaken if success.rate < SOLVES]:
-        words += f"; with a tenth of the steps random the expert solves {', '.join(poor)} episodes"
+        words += f"; with a tenth of its actions random the expert solves {', '.join(poor)} episodes"
     return f"{words}."
 
 
@@ -212,9 +212,9 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     if check.table < ENOUGH:
         x, y = space.centre
         lines.append(
-            f"The hand gets to {100 * check.table:.0f} % of the workspace on the table: take a smaller half_width than "
-            f"{space.half_width:g}, or move workspace.centre, ({x:g}, {y:g}), to where the map is green; if it is "
-            "nowhere, turn the gripper on the hand by gripper.quaternion."
+            f"The hand reaches {100 * check.table:.0f} % of the workspace on the table: reduce workspace.half_width "
+            f"(now {space.half_width:g}), or move workspace.centre (now {x:g}, {y:g}) to where the map is green; if it "
+            "is green nowhere, turn the gripper on the hand by gripper.quaternion."
         )
     for task in check.failed:
         if task.refused and check.table:  # otherwise the advice on the whole workspace covers it

@@ -105,7 +105,7 @@ class Rule:
             rounds = tuple(one for one in rounds if one.amount(self.at) <= self.limit)
             if not rounds:
                 reached, most = format_amount(self.at, first), format_amount(self.at, self.limit)
-                raise UsageError(f"--at={self.at}: the first round of {name} took {reached}, another run had {most}")
+                raise UsageError(f"--at={self.at}: the first round of {name} ended at {reached}, another run at {most}")
         if self.checkpoint == "last":
             return rounds[-1]
         return max(rounds, key=lambda one: (one.validation.rate, one.round))
@@ -114,10 +114,10 @@ class Rule:
     def fact(self) -> str:
         """A sentence that states the rule."""
         which = "last round" if self.checkpoint == "last" else "round that was best on validation"
-        words = f"Of every run the {which}, chosen before the test"
+        words = f"Of each run the {which} was tested, chosen before the test"
         if self.at == "end" or self.limit is None:
             return f"{words}."
-        return f"{words}, within {format_amount(self.at, self.limit)}, the most that every run reached."
+        return f"{words} among those within {format_amount(self.at, self.limit)}, which every run reached."
 
 
 def format_seconds(seconds: float) -> str:

@@ -57,7 +57,7 @@ def require_suite(suite: str) -> None:
     """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; reads no file."""
     if suite.endswith(_YAML):
         if not Path(suite).is_file():
-            raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")
+            raise UsageError(f"--suite={suite}: no such file; expected a YAML file of ranges")
     elif suite not in (*SUITES, *CONDITIONS):
         raise UnknownName("suite", suite, [*SUITES, *CONDITIONS[1:]])
 

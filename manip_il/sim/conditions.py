@@ -1,6 +1,6 @@
-"""Conditions: ranges by name from which each episode draws how it differs from the nominal world, by its seed alone.
+"""Conditions: named ranges from which each episode draws, by its seed alone, how it differs from the nominal world.
 
-Their values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
+The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
 `env.py`, and during the episode by `events.py`.
 """
 
@@ -21,7 +21,7 @@ from manip_il.sim.shape import KINDS, draws_shape
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]
-# Least and greatest values; a range beyond these is a mistake.
+# Limits of each range.
 _BOUNDS: dict[str, Range] = {
     "action_noise": (0, 1),
     "random_actions": (0, 1),
@@ -57,9 +57,9 @@ _SEEN = (*PICTURED, "picture_delay")
 
 @dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high), both ends included, or single numbers; what has no range is nominal.
+    """Ranges (low, high), both ends included, or single numbers; quantities without a range are nominal.
 
-    action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
+    action_noise: standard deviation of Gaussian noise on every executed action, as a share of its full range.
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
     knock: distance by which the object is moved once [m], at a control step from knock_step, by default 5 to 24.
     joint_noise [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position
@@ -178,7 +178,7 @@ def _range(condition: str, name: str, given: Any) -> Range:
         raise UsageError(f"{what} is {checks.shorten(given)}; expected a number, or [low, high]") from None
     least, most = _BOUNDS[name]
     if not least <= low <= high <= most:
-        raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {least} to {most}")
+        raise UsageError(f"{what} is [{low}, {high}]; expected low <= high, both from {least} to {most}")
     if name in _WHOLE and (low % 1 or high % 1):
         raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
     return given if isinstance(given, tuple) else (low, high)
@@ -189,7 +189,7 @@ def _overlap(name: str, asked: Range, sizes: Range) -> Range:
     low, high = max(asked[0], sizes[0]), min(asked[1], sizes[1])
     if low > high:
         takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"
-        raise UsageError(f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose others")
+        raise UsageError(f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose other sizes")
     return low, high
 
 

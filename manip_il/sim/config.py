@@ -15,12 +15,12 @@ MOST_HZ = round(1 / DT_SIM)
 class Episodes:
     """Timing, solving and ending of an environment's episodes. 0 means the robot's or task's own value."""
 
-    control_hz: int = option(0, "control steps a second; 0: the robot's own, 30 of so101, 20 of others")
+    control_hz: int = option(0, "control steps per second; 0: the robot's own (so101: 30, others: 20)")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
     success_steps: int = option(
         0, "consecutive control steps within the tolerance that count as success; 0: the task's own"
     )
-    horizon: int = option(0, "control steps in an episode; 0: the task's own")
+    horizon: int = option(0, "length of an episode [control steps]; 0: the task's own")
 
     @property
     def physics_steps(self) -> int:
@@ -44,13 +44,13 @@ class Look:
     """Light of a scene; part of a dataset's fingerprint, and what re-rendering may vary.
 
     shadows: of the main lamp; a picture then takes two to six times as long. brightness: factor on every lamp.
-    light_turn: turn of the lamps about the vertical through the world's origin, -180 to 180 [deg].
+    light_turn: rotation of the lamps about the vertical through the world's origin, -180 to 180 [deg].
     Raises `UsageError` for a value out of range.
     """
 
-    shadows: bool = option(False, "cast shadows; rendering then takes two to six times as long")
-    brightness: float = option(1.0, "factor on every lamp, 0.1 to 2")
-    light_turn: float = option(0.0, "turn the lamps about the vertical, -180 to 180 [deg]")
+    shadows: bool = option(False, "draw shadows; rendering then takes two to six times as long")
+    brightness: float = option(1.0, "factor on the brightness of every lamp, 0.1 to 2")
+    light_turn: float = option(0.0, "rotation of the lamps about the vertical, -180 to 180 [deg]")
 
     def __post_init__(self) -> None:
         low, high = _BRIGHTNESS
@@ -81,10 +81,10 @@ class CameraConfig:
             if name not in (*CAMERAS, *OTHERS):
                 raise UnknownName("camera", name, CAMERAS)
         if not self.names or len(set(self.names)) < len(self.names):
-            raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, each once")
+            raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, and none twice")
         if any(side % 2 or not MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             raise UsageError(
-                f"pictures of height {self.height} and width {self.width}; "
+                f"pictures have height {self.height} and width {self.width}; "
                 f"expected even numbers from {MIN_SIDE} to {MAX_SIDE}"
             )
 

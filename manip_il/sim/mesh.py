@@ -50,7 +50,7 @@ def parse_mesh(text: str) -> Mesh:
     if (found := _TEXT.fullmatch(text)) is None:
         raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
     if found["hash"]:
-        raise UsageError(f"object {text} is a mesh whose name alone is known here; give --task.object={nameable(text)}")
+        raise UsageError(f"object {text}: only the name of the mesh was stored; give --task.object={nameable(text)}")
     return _read(found["path"], float((found["length"] or ":0")[1:]))
 
 
@@ -99,7 +99,7 @@ def _solid(name: str, content: bytes, suffix: str) -> Any:
         )
         solid = trimesh.Trimesh(found.vertices, found.faces)
     except Exception as error:
-        raise UsageError(f"{name} is no mesh that can be read: {checks.one_line(error)}") from error
+        raise UsageError(f"{name} cannot be read as a mesh: {checks.one_line(error)}") from error
     if not solid.is_watertight:
         raise UsageError(f"{name} is not closed; close its holes in a mesh editor")
     solid.fix_normals(multibody=False)

@@ -6,6 +6,7 @@ import atexit
 import math
 import os
 from functools import cache, lru_cache
+from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.sim.gl import REMEDY, context_class
 from manip_il.sim.props import Prop, props
 from manip_il.sim.scene import camera_id
 from manip_il.sim.variation import part
@@ -23,6 +23,8 @@ from manip_il.sim.world import Scene
 
 F64 = NDArray[np.float64]
 Picture = NDArray[np.uint8]
+PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
+REMEDY = f"unset MUJOCO_GL if it is set; on Debian: apt-get install -y {PACKAGES}"  # if no picture can be rendered
 _FINER = 2  # supersampling each way: cheaper than OpenGL's antialiasing, which redraws the meshes
 _MAX_GEOMS = 1_000
 _EE = 4  # group of the site `ee`, the robot's only one
@@ -68,8 +70,8 @@ def framed_picture(
 
 def close() -> None:
     """Free this process's OpenGL context; the next picture makes another."""
-    if _context.cache_info().currsize and _context()[0] == os.getpid():  # a forked child has nothing to free
-        _, gl = _context()
+    if _context.cache_info().currsize:
+        gl = _context()
         gl.make_current()
         _prepared.cache_clear()
         gl.free()
@@ -79,23 +81,21 @@ def close() -> None:
 def _renderer(scene: Scene, look: Look) -> _Renderer:
     """The renderer that was used last, or a new one in its place, in this process's OpenGL context."""
     try:
-        process, gl = _context()
-        if process == os.getpid():
-            gl.make_current()
-            return _prepared(scene, look)
+        _context().make_current()
+        return _prepared(scene, look)
     except Exception as error:  # mujoco raises many kinds, from ImportError to its own
         raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}") from error
-    raise RenderError("OpenGL does not survive a fork; start processes that make pictures by 'spawn'")
 
 
 @cache
-def _context() -> tuple[int, Any]:
-    """The process that made an OpenGL context, and the context."""
-    made_by = context_class()  # without OpenGL even this import fails
+def _context() -> Any:
+    """This process's OpenGL context."""
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()  # also if mujoco was imported before it was set
+    made_by = import_module(f"mujoco.{backend if backend in ('egl', 'osmesa') else 'glfw'}").GLContext
     setattr(made_by, "_context", None)  # noqa: B010 - its destructor needs it even if its constructor failed
     gl = made_by(1, 1)  # any size will do, as pictures have a buffer of their own
     atexit.register(close)
-    return os.getpid(), gl
+    return gl
 
 
 @lru_cache(1)

@@ -51,7 +51,7 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     except ValueError as error:
         why = " ".join(str(error).split())
         raise UsageError(
-            f"robot {robot.name} and task {task.name} make no scene of {robot.files.model}: {why}"
+            f"the scene of robot {robot.name} ({robot.files.model}) and task {task.name} does not compile: {why}"
         ) from None
     return _index(robot, task, model)
 

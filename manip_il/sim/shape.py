@@ -29,7 +29,7 @@ MESH = "mesh"
 LONGEST_MESH = 0.2  # [m]
 SHAPE_HELP = (
     "box, cylinder, sphere, capsule or any (one of these in each episode), with lengths [m] as in "
-    "cylinder:0.04x0.08, box:0.06x0.03x0.03; or a mesh by its file and longest side, mesh:mug.obj:0.1"
+    "cylinder:0.04x0.08, box:0.06x0.03x0.03; or a mesh file with the length of its longest side, mesh:mug.obj:0.1"
 )
 
 
@@ -51,15 +51,15 @@ class Shape:
             if not SHORTEST <= max(self.lengths) <= LONGEST_MESH:
                 raise UsageError(
                     f"{self.mesh.text} is {max(self.lengths):.3g} m long; expected {SHORTEST} to {LONGEST_MESH} m: "
-                    "say how long its longest side is, as in mesh:mug.obj:0.1"
+                    "give the length of its longest side, as in mesh:mug.obj:0.1"
                 )
             return
         for length in self.lengths:
             if not SHORTEST <= length <= LONGEST:
-                raise UsageError(f"a {self.kind} of {length:g} m; expected lengths from {SHORTEST} to {LONGEST} m")
+                raise UsageError(f"{self.kind} has a length of {length:g} m; expected {SHORTEST} to {LONGEST} m")
         if self.kind == "capsule" and self.lengths[2] <= self.lengths[0]:
             raise UsageError(
-                f"a capsule {self.lengths[2]:g} m long and {self.lengths[0]:g} m wide; expected it longer than wide"
+                f"capsule is {self.lengths[2]:g} m long and {self.lengths[0]:g} m wide; it must be longer than wide"
             )
 
     @classmethod
@@ -77,7 +77,7 @@ class Shape:
             numbers = [float(number) for number in size.split("x")] if colon else [DEFAULT_WIDTH]
             return cls(kind, _lengths(kind, *numbers))
         except (ValueError, TypeError):
-            raise UsageError(f"size of {shorten(text)}; expected {kind}:{_SIZES[kind]} [m]") from None
+            raise UsageError(f"object is {shorten(text)}; expected {kind}:{_SIZES[kind]} [m]") from None
 
     @classmethod
     def of_width(cls, kind: str, width: float) -> Shape:

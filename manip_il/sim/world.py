@@ -107,7 +107,7 @@ class World:
         self._shapes: dict[str, tuple[int, tuple[float, ...]]] = {}
 
     def __reduce__(self) -> NoReturn:
-        raise ManipError("an environment cannot be copied or pickled; make another and give it get_state()")
+        raise ManipError("an environment cannot be copied or pickled; make a new one and restore get_state() there")
 
     # Physics
 

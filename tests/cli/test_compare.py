@@ -115,9 +115,9 @@ def sides(here: Path, policy: Path) -> None:
     ("words", "code", "line"),
     [
         (["run", "other_seeds"], 2, "training seeds differ: run has [None], other_seeds [5, 6]"),
-        (["two", "three"], 1, "two has 2, three 3, of which 2 are the same"),
+        (["two", "three"], 1, "test episodes of two and three differ; evaluate both with the same --seed"),
         (["two", "lift"], 1, "task differs: two has reach, lift has lift"),
-        (["three", "run"], 2, "one is evaluated already; give two eval.json, or two policies"),
+        (["three", "run"], 2, "only one of them is an evaluation; give two eval.json, or two policies"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -89,7 +89,7 @@ MISTAKES = {
     "record --robot.type=pandas": "unknown robot 'pandas' (did you mean 'panda'?); known: fetch, panda",
     "record --num_episodes=3": "did you mean '--dataset.num_episodes'?",
     "record --cameras=front,wirst": "unknown camera 'wirst' (did you mean 'wrist'?); known: front, side, wrist",
-    "record --cameras=front --image.height=127": "pictures of height 127 and width 128; expected even numbers",
+    "record --cameras=front --image.height=127": "pictures have height 127 and width 128; expected even numbers",
     "record --dataset.repo_id=../name": "expected a name of letters",
     "dagger --config_path=missing.yaml": "cannot read missing.yaml",
     "dagger --beta=lineal:5": "beta is 'lineal:5'; expected constant:B, linear:ROUNDS",

@@ -43,7 +43,7 @@ def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: N
     out = tmp_path / "out"
     assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=0", f"--output_dir={out}"]) == 0
     said = capsys.readouterr()
-    assert "own has starts for 1 of 1 task; the expert was not asked." in said.out
+    assert "own has starts for 1 of 1 task; the expert was not run." in said.out
     page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
     assert "No pictures: no off-screen OpenGL" in page
     assert "data:image/jpeg" not in page
@@ -58,7 +58,7 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     words = ["--quiet", "robot", "check", str(path), "--tasks=reach,lift", "--episodes=0", f"--output_dir={out}"]
     assert main(words) == 1
     said = capsys.readouterr()
-    assert "narrow has starts for 1 of 2 tasks; the expert was not asked; it cannot do lift." in said.out
+    assert "narrow has starts for 1 of 2 tasks; the expert was not run; it cannot do lift." in said.out
     assert "change: lift: task lift: 'object' is 0.050 m wide" in said.out
     assert "cannot do 1 of 2 tasks: lift" in said.err
     assert (out / "check.html").is_file()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.arm import Arm, Member, require_pair
 from manip_il.evaluation.comparison import Comparison, Study
 from manip_il.evaluation.intervals import Pairs
@@ -79,6 +79,8 @@ def test_random_arms_of_one_quality_are_seldom_called_different():
 def test_what_is_not_paired_is_refused():
     with pytest.raises(UsageError, match=r"training seeds differ: A has \[0, 1\], B \[0, 1, 2\]"):
         require_pair(arm("A", HARD, HARD), arm("B", HARD, HARD, HARD))
+    with pytest.raises(ManipError, match=r"test episodes of A and B differ"):
+        Comparison.of(one("A", HARD), one("B", HARD[:50]))
     with pytest.raises(MismatchError, match=r"robot differs: A has panda, B has fetch"):
         Comparison.of(one("A", HARD), Arm("B", (made_member(HARD, robot="fetch"),)))
     with pytest.raises(MismatchError, match=r"tolerance differs: A has 0\.02, B has 0\.05"):

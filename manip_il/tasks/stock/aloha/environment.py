@@ -17,7 +17,7 @@ from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.gl import REMEDY
+from manip_il.sim.render import REMEDY
 from manip_il.tasks.stock.aloha.ladder import Scene
 from manip_il.tasks.stock.base import WHOLE, StockBase
 from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
