@@ -36,9 +36,9 @@ from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.mdp import Episode
 from manip_il.rewards.methods import METHODS, learn
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-from manip_il.tasks.carry.layout import THINGS, path_features
+from manip_il.tasks.carry.layout import OBSTACLES, path_features
+from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.carry.reward import TASTES, Reward
-from manip_il.tasks.carry.things import EDGE, observed_layout
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.pick_place import OBJECT
@@ -117,7 +117,7 @@ def learnt(root: Path) -> dict[str, Reward]:
 
 def things(episode: Episode, names: Sequence[str]) -> int:
     """Return the number of things in an episode's layout, including the table's edge."""
-    here = [names.index(f"{name}.here") for name in (*THINGS, EDGE)]
+    here = [names.index(f"{name}.here") for name in (*OBSTACLES, EDGE)]
     return int((np.asarray(episode.columns[ENVIRONMENT_STATE], np.float64)[0, here] > 0.5).sum())
 
 
@@ -135,7 +135,7 @@ def _seeds(env: EnvConfig, layouts: int, *, many: bool) -> Iterator[int]:
     """Yield seeds of layouts that are in no demonstration, identified by their first observation."""
     simulated, left = env_of(env), layouts
     names = env_spec(env).environment_state_names
-    here = [names.index(f"{name}.here") for name in (*THINGS, EDGE)]
+    here = [names.index(f"{name}.here") for name in (*OBSTACLES, EDGE)]
     for seed in stream_seeds("held_out", _SPARE * layouts, 0):
         simulated.start(seed)
         if not many or int((simulated.observe().environment_state[here] > 0.5).sum()) > FEW:

@@ -26,9 +26,9 @@ from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
 from manip_il.rewards.paths import Demonstration, cheapest_path, plan
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid
-from manip_il.tasks.carry.layout import THINGS
+from manip_il.tasks.carry.layout import OBSTACLES
+from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.carry.reward import FEATURES
-from manip_il.tasks.carry.things import EDGE, observed_layout
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
@@ -225,7 +225,7 @@ def _draw_cost(axis: Any, one: Carried, weights: F64) -> Any:
     cost = (layout.densities(places) @ weights).reshape(_SIDE, _SIDE)
     image = axis.imshow(cost, origin="lower", extent=(low[0], high[0], low[1], high[1]), cmap="Greens")
     for name, (px, py) in layout.places:
-        half = layout.scale * np.array(THINGS[name].half)
+        half = layout.scale * np.array(OBSTACLES[name].half)
         box_x, box_y = px + half[0] * np.array([-1, 1, 1, -1, -1]), py + half[1] * np.array([-1, -1, 1, 1, -1])
         axis.fill(box_x, box_y, color=SOFT, alpha=0.6, lw=0)
         axis.annotate(name, (px, py), ha="center", va="center", fontsize=6.5)

@@ -30,11 +30,10 @@ from manip_il.sim.shape import Shape, stored
 from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
-from manip_il.tasks.own import source_hash
 from manip_il.tasks.stock.envs import check_cameras, described_stock, make_stock, make_stock_expert
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 from manip_il.tasks.stock.table import get_stock
-from manip_il.tasks.table import TASKS, get_task, is_task
+from manip_il.tasks.table import TASKS, get_task, is_task, source_hash
 
 
 def is_known(robot: str, task: str, shape: str = "") -> bool:

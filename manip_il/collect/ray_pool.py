@@ -24,7 +24,7 @@ from manip_il.data.journal import Journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.sim.mesh import mesh_path, moved
-from manip_il.tasks.own import SUFFIX
+from manip_il.tasks.table import SUFFIX
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
 try:

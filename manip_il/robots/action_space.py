@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import MismatchError, NotFiniteError
-
-F64 = NDArray[np.float64]
+from manip_il.mdp import F64
 
 
 @dataclass(frozen=True, eq=False)

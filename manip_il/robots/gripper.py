@@ -13,14 +13,13 @@ from functools import cache
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.mdp import F64
 from manip_il.robots.geometry import at_tip, distance, nearest
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 
-F64 = NDArray[np.float64]
 Geoms = Sequence[Sequence[int]]  # geom ids of each finger
 TOUCH = 0.0015  # a finger this near to an object touches it [m]
 _COMMANDS = 15  # commands of the sweep from closed to open
@@ -120,9 +119,7 @@ def sweep(robot: Robot) -> Sweep:
     model, data, fingers, shares, poses = _at_rest(robot)
     jaws = _apart(*_at(model, data, poses[-1]), fingers)
     if not all(jaws):
-        raise UsageError(
-            f"robot {robot.name}: the fingers touch where they are open; look at gripper.open and gripper.fingers"
-        )
+        raise UsageError(f"robot {robot.name}: the fingers touch when open; check gripper.open and gripper.fingers")
     tips = _tips(*_at(model, data, poses[-1]), jaws)
     gaps = [_gaps(*_at(model, data, pose), tips) for pose in poses]
     least = [min(float(gap.min()) for gap in one) for one in gaps]
@@ -134,7 +131,7 @@ def sweep(robot: Robot) -> Sweep:
     if openings[-1] - openings[0] < _LEAST_TRAVEL or (np.diff(openings) <= 0).any() or (np.diff(shares) <= 0).any():
         raise UsageError(
             f"robot {robot.name}: the fingers stand {openings[0]:.3f} m apart closed and {openings[-1]:.3f} m open; "
-            "expected them to come apart all the way: look at gripper.joints, closed, open and fingers"
+            "expected the gap to grow all the way: check gripper.joints, closed, open and fingers"
         )
     if np.ptp(middles) < _LOPSIDED:
         middles = np.zeros(len(middles))
@@ -229,5 +226,5 @@ def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = ""
     ]
     for name, geoms in zip(fingers, found, strict=True):
         if not geoms:
-            raise UsageError(f"finger {name!r} has no geom that can touch anything; expected at least one")
+            raise UsageError(f"finger {name!r} has no geom with contacts; expected at least one")
     return found

@@ -9,13 +9,11 @@ import daqp
 import mink
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import rotation_matrix, rotation_vector, yaw_ahead
 from manip_il.robots.spec import arm_model
-
-F64 = NDArray[np.float64]
 
 _POSITION_COST = 1.0  # [1/m]
 _LM_DAMPING = 1e-3
@@ -82,7 +80,7 @@ class ArmIK:
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
         self._data = data = self._program.data  # views that follow the posture
         self._ee, self._ee_flat = data.site_xpos[self._site], data.site_xmat[self._site]
-        self._ee_rotation, self._qpos = self._ee_flat.reshape(3, 3), data.qpos
+        self._qpos = data.qpos
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._jacobian = np.zeros((6, model.nv))
         self._robot, self._shoulder = robot, joints[0].id
@@ -104,14 +102,9 @@ class ArmIK:
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
         """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
-        position, rotation = self._at(q)
-        return position.copy(), rotation.copy()
-
-    def _at(self, q: F64) -> tuple[F64, F64]:
-        """`ee_pose` as views, which the next posture overwrites."""
         self._qpos[self._address] = q
         self._program.update()
-        return self._ee, self._ee_rotation
+        return self._ee.copy(), self._ee_flat.reshape(3, 3).copy()
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
         """Return only the displacement of `step`, (arm,) [rad]; weight: of the rotation, by default as upright."""
@@ -158,7 +151,7 @@ class ArmIK:
         dq = self.displacement(position, rotation, _LARGEST)
         q = self._within(q if dq is None else q + dq)
         for _ in range(_CORRECTIONS):
-            at, turned = self._at(q)
+            at, turned = self.ee_pose(q)
             error = np.append(position - at, rotation_vector(rotation @ turned.T))
             if np.abs(error).max() < _EXACT:
                 break

@@ -20,18 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.checks import without_link
+from manip_il.mdp import F64
 from manip_il.robots import HERE, ROBOTS
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import CLEARANCE, Body
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import angle_off_vertical, hand_down, off_yaw
+from manip_il.robots.rotations import angle_between, angle_off_vertical, hand_down, off_yaw
 from manip_il.robots.spec import arm_spec, model_bytes
 from manip_il.robots.table import get_robot
 
 if TYPE_CHECKING:
     from manip_il.robots.ik import ArmIK
 
-F64 = NDArray[np.float64]
 _CELL = 0.05  # grid spacing [m]
 _BEYOND = 0.3  # how far the map extends around the workspace [m]
 _ABOVE = 0.05  # and above it [m]
@@ -54,11 +54,6 @@ class Reach:
 
     origin: F64
     errors: F64
-
-    @property
-    def cell(self) -> float:
-        """Grid spacing along each axis [m]."""
-        return _CELL
 
     @cached_property
     def arrives(self) -> NDArray[np.bool_]:
@@ -100,6 +95,13 @@ class Reach:
         if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
             return False
         return cells[x][y][z]
+
+    def has_each(self, points: F64) -> NDArray[np.bool_]:
+        """Return `has` of points (N, 3) [m], (N,)."""
+        index = np.floor((points - self.origin) / _CELL).astype(np.int64)
+        last = np.array(self.arrives.shape) - 1
+        inside = ((index >= 0) & (index <= last)).all(axis=1)
+        return inside & self.arrives[tuple(index.clip(0, last).T)]
 
     def nearly(self, position: Sequence[float] | F64) -> bool:
         """Return whether the hand gets near `position` [m], (3,): close enough for a label to make sense."""
@@ -155,7 +157,10 @@ def _solve(robot: Robot) -> Reach:
     """Compute the map: how far from every point of the grid the hand ends."""
     from manip_il.robots.ik import ArmIK  # mink is slow to import, and a stored map does not need it
 
-    (origin, shape), ik, body = _grid(robot), ArmIK(robot), Body(robot)
+    ik, body, space = ArmIK(robot), Body(robot), robot.workspace
+    half = space.half_width + _BEYOND
+    origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
+    shape = tuple(round(size / _CELL) + 1 for size in (2 * half, 2 * half, space.height + _ABOVE))
     errors = np.empty(shape, np.float32)
     for index in np.ndindex(*shape):
         point = origin + _CELL * np.array(index)
@@ -163,14 +168,6 @@ def _solve(robot: Robot) -> Reach:
         miss, q = _miss(robot, ik, point)
         errors[index] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
     return Reach(origin, errors.astype(np.float64))
-
-
-def _grid(robot: Robot) -> tuple[F64, tuple[int, ...]]:
-    """The map's origin (3,) [m], and its number of points along x, y and z."""
-    space = robot.workspace
-    half = space.half_width + _BEYOND
-    origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
-    return origin, tuple(round(size / _CELL) + 1 for size in (2 * half, 2 * half, space.height + _ABOVE))
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
@@ -196,4 +193,4 @@ def _angle_off(robot: Robot, hand: F64, yaw: float, down: F64) -> float:
     """Return how far a hand (3, 3) is from `down` at a yaw [rad]; if the arm leans, up to `_MOST_LEAN` is free."""
     if robot.leans:
         return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
-    return float(np.arccos(min(1.0, max(-1.0, ((down.T @ hand).trace() - 1) / 2))))
+    return angle_between(down, hand)

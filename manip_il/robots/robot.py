@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName
+from manip_il.mdp import F64
 from manip_il.robots.files import ModelFiles, require_lengths
 
-F64 = NDArray[np.float64]
 TABLE_BEYOND = 0.08  # offset of the table's middle from the workspace's, away from the robot [m]
 RATE = 20  # default control steps per second
 _MOST_HZ = 500
@@ -34,17 +33,14 @@ class EndEffector:
     """
 
     body: str
-    position: tuple[float, ...]
-    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     lowest: float = 0.021
-
-    def __post_init__(self) -> None:
-        require_lengths(self, position=3, quaternion=4)
 
 
 @dataclass(frozen=True)
 class GripperConfig:
-    """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch things.
+    """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch objects.
 
     finger_mass: replaces that of every finger [kg]. force: limit of a driven joint, by default 40 N if it slides and
     10 N m if it turns [N or N m]. files: those of a gripper with a model of its own, whose names begin with `gripper/`;
@@ -58,28 +54,27 @@ class GripperConfig:
     finger_mass: float | None = None
     force: float | None = None
     files: ModelFiles | None = None
-    position: tuple[float, ...] = (0.0, 0.0, 0.0)
-    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        require_lengths(self, closed=len(self.joints), open=len(self.joints), position=3, quaternion=4)
+        require_lengths(self, closed=len(self.joints), open=len(self.joints))
         if len(self.fingers) < 2:
-            raise ManipError(f"fingers names {len(self.fingers)}; expected two or more bodies")
+            raise ManipError(f"fingers names {len(self.fingers)} bodies; expected two or more")
         for joint, at, to in zip(self.joints, self.closed, self.open, strict=True):
             if at == to:
-                raise ManipError(f"closed and open are both {at:g} for joint {joint!r}; expected two places")
+                raise ManipError(f"closed and open are both {at:g} for joint {joint!r}; expected two positions")
 
 
 @dataclass(frozen=True)
 class Workspace:
     """Volume in which tasks take place: +- half_width about the centre on the table, up to a height over it [m]."""
 
-    centre: tuple[float, ...]
+    centre: tuple[float, float]
     half_width: float = 0.15
     height: float = 0.45
 
     def __post_init__(self) -> None:
-        require_lengths(self, centre=2)
         if not 0.02 <= min(self.half_width, self.height) <= max(self.half_width, self.height) <= 2:
             raise ManipError(f"half_width is {self.half_width:g}, height {self.height:g}; expected 0.02 to 2 m")
 
@@ -88,11 +83,8 @@ class Workspace:
 class TableTop:
     """Table of a scene: its lengths along x and y, and the height of its top over the floor [m]."""
 
-    size: tuple[float, ...] = (0.9, 1.2)
+    size: tuple[float, float] = (0.9, 1.2)
     height: float = 0.4
-
-    def __post_init__(self) -> None:
-        require_lengths(self, size=2)
 
 
 @dataclass(frozen=True)
@@ -102,12 +94,9 @@ class CameraPose:
     z = 0 is the table's top, x points away from the robot. Looking straight down, x is up in the picture.
     """
 
-    position: tuple[float, ...]
-    target: tuple[float, ...]
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
     fovy: float = 42.0
-
-    def __post_init__(self) -> None:
-        require_lengths(self, position=3, target=3)
 
     @property
     def quaternion(self) -> tuple[float, ...]:
@@ -151,7 +140,7 @@ class LeRobotConfig:
         checks.name("robot_type", self.robot_type)
         checks.whole("fps", self.fps, 1, _MOST_HZ)
         if len(set(self.gripper)) != 2:
-            raise ManipError(f"gripper is {list(self.gripper)}; expected two places, at 0 and at 100 [rad]")
+            raise ManipError(f"gripper is {list(self.gripper)}; expected two positions, at 0 and at 100 [rad]")
 
     def percent(self, joint: F64) -> F64:
         """Return the gripper's numbers, 0 to 100, for positions `joint` of its driven joint [rad]."""
@@ -192,24 +181,22 @@ class Robot:
     workspace: Workspace
     costs: Costs = UPRIGHT
     yaw: str = "world"
-    wrist_camera: tuple[float, ...] | str = WRIST_CAMERA
+    wrist_camera: tuple[float, float, float] | str = WRIST_CAMERA
     cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
     table: TableTop = TABLE
-    base: tuple[float, ...] | None = None
+    base: tuple[float, float, float] | None = None
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     max_joint_step: float = JOINT_STEP
-    colours: Mapping[str, tuple[float, ...]] = field(default_factory=dict, hash=False)
+    colours: Mapping[str, tuple[float, float, float]] = field(default_factory=dict, hash=False)
     lerobot: LeRobotConfig | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joints)
         require_lengths(self, home=count, gains=count, forces=count, armature=count)
-        if not isinstance(self.wrist_camera, str):
-            require_lengths(self, wrist_camera=3)
         if both := set(self.joints) & set(self.gripper.joints):
-            raise ManipError(f"joints and gripper.joints both name {min(both)!r}; expected every joint in one of them")
+            raise ManipError(f"joints and gripper.joints both name {min(both)!r}; expected each in only one")
         if (named := len(self.joint_names)) != count + 1:
-            raise ManipError(f"lerobot.names has {named} names; expected {count + 1}: the arm's joints', the gripper's")
+            raise ManipError(f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the gripper's")
         if self.yaw not in YAWS:
             raise UnknownName("yaw", self.yaw, YAWS)
 

@@ -6,11 +6,9 @@ import math
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.robot import Robot
-
-F64 = NDArray[np.float64]
 
 
 def rotation_vector(rotation: F64) -> F64:

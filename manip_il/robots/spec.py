@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UnknownName
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
 
@@ -87,7 +87,6 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
     spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, camera)
     require(robot.name, "joint", (*robot.joints, *robot.gripper.joints), spec.joints)
     require(robot.name, "body", (robot.hand, robot.ee.body, *robot.gripper.fingers), spec.bodies)
-    _require_moved(robot, spec)
     linked = linkage(spec, robot)
     _fix_joints(robot, spec, linked)
     if linked:
@@ -149,31 +148,6 @@ def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -
     for name in names:
         if name not in known:
             raise UnknownName(f"{kind} in the YAML of robot {robot}:", name, known)
-
-
-def _require_moved(robot: Robot, spec: mujoco.MjSpec) -> None:
-    """Raise `UsageError` for a joint of the arm that does not move `ee`, or one of the gripper's that does."""
-    moving = _above(spec.body(robot.ee.body))
-    if still := [name for name in robot.joints if name not in moving]:
-        raise UsageError(
-            f"robot {robot.name}: joint {still[0]!r} does not move 'ee', which is in body {robot.ee.body!r}; those "
-            f"that do: {', '.join(moving) or 'none'}; look at joints, ee.body and hand"
-        )
-    above = _above(spec.body(robot.hand))
-    if arms := [name for name in robot.gripper.joints if name in above]:
-        raise UsageError(
-            f"robot {robot.name}: {arms[0]!r} of gripper.joints moves the whole hand, {robot.hand!r}; expected the "
-            "joints that drive the fingers"
-        )
-
-
-def _above(body: Any) -> list[str]:
-    """Names of the joints that move a body, from the base on."""
-    names = list[str]()
-    while body.name != "world":
-        names[:0] = [joint.name for joint in body.joints]
-        body = body.parent
-    return names
 
 
 def linkage(spec: mujoco.MjSpec, robot: Robot) -> list[str]:

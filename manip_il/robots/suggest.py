@@ -26,13 +26,13 @@ _REACHES, _HALF = 0.5, 0.18  # the workspace's centre and half width, in lengths
 _WIDEST, _HIGHEST = 0.15, 0.45  # largest half width and height of a workspace [m]
 _ROUND = 0.01  # what lengths are rounded to [m]
 _FIRST_LINE = (
-    "# A first YAML, from what the model shows. Look it over: manip-il view --robot.type=THIS_FILE (docs/robots.md)"
+    "# A first draft, derived from the model. Review it: manip-il view --robot.type=THIS_FILE (docs/robots.md)"
 )
 _NOTES = {
     "hand": "body that carries the gripper",
-    "joints": "what drives the fingers",
-    "closed": "where they are then: [m] where they slide, [rad] where they turn",
-    "fingers": "bodies that touch things",
+    "joints": "joints that drive the fingers",
+    "closed": "their positions when closed, [m] if they slide, [rad] if they turn",
+    "fingers": "bodies that touch objects",
     "centre": "on the table, x away from the base [m]",
 }
 
@@ -52,7 +52,7 @@ def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
     except ValueError as error:
         raise UsageError(f"MuJoCo cannot compile {gripper or model}: {' '.join(str(error).split())}") from None
     if not all((hand.name, palm.name, *fingers)):
-        raise UsageError(f"{gripper or model}: its hand or a finger is a body without a name; name it in the model")
+        raise UsageError(f"{gripper or model}: the body of its hand or of a finger has no name; name it in the model")
     return {
         "hand": hand.name,
         "gripper": {
@@ -88,7 +88,7 @@ def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
     if body.joints and any(word in f"{body.name} {body.joints[0].name}".lower() for word in _JAWS):
         return body.parent, [body]
     raise UsageError(
-        f"{path}: its joints do not part into fingers, and the last body, {body.name!r}, is no jaw by its name;"
+        f"{path}: its joints do not branch into fingers, and its last body, {body.name!r}, is not named like a jaw;"
         " a gripper with a model of its own is given by --gripper=PATH"
     )
 
@@ -118,7 +118,7 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
     driven = slides or motored or in_step or next_to_hand
     if not driven or not all(joint.name and joint.range[0] < joint.range[1] for joint in driven):
         raise UsageError(
-            f"{path}: no joint with a name and a range moves a finger; write the YAML by hand (docs/robots.md)"
+            f"{path}: no joint that has a name and a range moves a finger; write the YAML by hand (docs/robots.md)"
         )
     return driven
 

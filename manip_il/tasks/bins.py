@@ -6,21 +6,20 @@ import math
 from collections.abc import Callable, Sequence
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.sim.task import Rung
+from manip_il.mdp import F64
+from manip_il.robots.rotations import hand_down
+from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
-from manip_il.tasks.ladder import Lift, Place, Which, carry, carry_progress, hand_is_at, held, let_go
+from manip_il.tasks.ladder import LiftProfile, Place, Which, carry, hand_is_at, held, let_go
 from manip_il.tasks.objects import WOOD, add_furniture, add_part
-
-F64 = NDArray[np.float64]
 
 WALL, THIN = 0.05, 0.003  # height of a box, half the thickness of walls and floor [m]
 DROP = 0.02  # height of an object's bottom over a box's floor at release [m]
-OVER_WALL = Lift(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)  # over a box's wall
+OVER_WALL = LiftProfile(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)  # over a box's wall
 OVER = 0.11  # height of the hand over an object on approach [m]
+AWAY = 0.2  # height of the hand over a box once its work there is done [m]
 _AT = (0.035, 0.05)  # the hand is still at an object in a box within this: sideways, above [m]
 _RISE = 0.10  # height of the hand over an object after release [m]
 
@@ -43,7 +42,7 @@ def is_in(world: World, name: str, box: str, inside: tuple[float, float]) -> boo
 
 
 def drop_rungs(
-    which: Which, to: Place, is_done: Callable[[World, str], bool], names: Sequence[str]
+    which: Which, to: Place, is_done: Callable[[World, str], bool], names: Sequence[str], lift: LiftProfile = OVER_WALL
 ) -> tuple[Rung, ...]:
     """Return the rungs that carry the held object over its place in a box and release it there.
 
@@ -60,13 +59,14 @@ def drop_rungs(
 
     return (
         Rung("let_go", at_done, lambda w: let_go(w, nearest(w), _RISE)),
-        Rung("carry", lambda w: held(w, which(w)), lambda w: carry(w, which(w), to(w), OVER_WALL)),
+        Rung("carry", lambda w: held(w, which(w)), lambda w: carry(w, which(w), to(w), lift)),
     )
 
 
-def drop_progress(world: World, name: str, to: F64) -> float:
-    """Return progress of carrying a held object to its release point, (3,) [m]: 0 to 1."""
-    return carry_progress(world, name, to, OVER_WALL)
+def rise_over(world: World, box: str) -> Target:
+    """Rise to a point over a box, fingers open."""
+    at = world.pose(box).position + [0.0, 0.0, AWAY]
+    return Target(at, hand_down(world.ahead(at)), world.gripper.most)
 
 
 def drop_place(world: World, name: str, box: str, offset: Sequence[float] = (0.0, 0.0)) -> F64:

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.mdp import F64
+from manip_il.sim.task import Limits, Observed, Rung, Start
 from manip_il.sim.world import World
-from manip_il.tasks.bins import OVER, add_bin, drop_place, drop_progress, drop_rungs, is_in
-from manip_il.tasks.ladder import grasp_progress, grasp_rungs, held
+from manip_il.tasks.bins import OVER, OVER_WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
+from manip_il.tasks.grasp import once_per_state
+from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_together, draw_yaw
-
-F64 = NDArray[np.float64]
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW, "white": (0.92, 0.92, 0.90)}
 BOX = "box"
@@ -33,21 +30,19 @@ ROOM = 0.03  # reachable margin around a cube at the start [m]
 FROM_BOX = 0.15  # least sideways distance of a cube from the box's middle at the start [m]
 
 
+@once_per_state
 def _left(world: World) -> tuple[str, ...]:
-    """Cubes that are not in the box; computed once per state."""
-    return world.remember("left", lambda: tuple(name for name in COLOURS if not is_in(world, name, BOX, INSIDE)))
+    """Cubes that are not in the box."""
+    return tuple(name for name in COLOURS if not is_in(world, name, BOX, INSIDE))
 
 
 def _inside(world: World, name: str) -> bool:
     return name not in _left(world)
 
 
+@once_per_state
 def current(world: World) -> str:
     """Return the cube that is in the hand, else the first that is not in the box; the last if all are."""
-    return world.remember("current", lambda: _current(world))
-
-
-def _current(world: World) -> str:
     left, ee = _left(world), world.ee.position.tolist()
     nearest = min(left, key=lambda name: math.dist(world.pose(name).position.tolist(), ee), default="")
     if nearest and held(world, nearest):
@@ -62,36 +57,24 @@ def _to(world: World) -> F64:
     return drop_place(world, name, BOX, (SLOT * (1 if slot % 2 else -1), SLOT * (1 if slot // 2 else -1)))
 
 
-def _all_in(world: World) -> bool:
-    return not _left(world)
-
-
-def _rise(world: World) -> Target:
-    """Rise to a point over the box."""
-    at = world.pose(BOX).position + [0.0, 0.0, 0.2]
-    return Target(at, hand_down(world.ahead(at)), world.gripper.most)
-
-
 _LET_GO, _CARRY = drop_rungs(current, _to, _inside, tuple(COLOURS))
-_RUNGS = (
-    _LET_GO,
-    Rung("done", _all_in, _rise),
-    _CARRY,
-    *grasp_rungs(current, OVER),
-)
 
 
-@dataclass(frozen=True)
 class ClearTable:
     """Put all cubes from the table into the box."""
 
-    name: str = "clear_table"
-    instruction: str = "Put all cubes into the box."
-    limits: Limits = Limits(tolerance=0.005, horizon=900)
-    objects: tuple[str, ...] = tuple(COLOURS)
-    grasped: tuple[str, ...] = tuple(COLOURS)
-    sizes: tuple[float, float] | None = (0.03, 0.04)
-    rungs: tuple[Rung, ...] = _RUNGS
+    name = "clear_table"
+    instruction = "Put all cubes into the box."
+    limits = Limits(tolerance=0.005, horizon=900)
+    objects = tuple(COLOURS)
+    grasped = tuple(COLOURS)
+    sizes = (0.03, 0.04)
+    rungs = (
+        _LET_GO,
+        Rung("done", lambda w: not _left(w), lambda w: rise_over(w, BOX)),
+        _CARRY,
+        *grasp_rungs(current, OVER),
+    )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the cubes and the box."""
@@ -139,7 +122,7 @@ class ClearTable:
             return 1.0
         name = current(world)
         if held(world, name):
-            part = 0.5 + 0.4 * drop_progress(world, name, _to(world))
+            part = 0.5 + 0.4 * carry_progress(world, name, _to(world), OVER_WALL)
         else:
             part = 0.45 * grasp_progress(world, name, OVER)
         return (done + part) / len(COLOURS)

@@ -16,12 +16,12 @@ from manip_il.tasks.stock import table as stock
 
 LIMITS_HZ = 20  # control rate of the tasks' limits; at other rates these last equally long [Hz]
 ROBOT_HELP = (
-    f"{', '.join(ROBOTS)}, the path of the YAML of an arm of your own, or {stock.ROBOT} or {stock.ALOHA}: "
-    "gymnasium-robotics' own Fetch and gym_aloha's two arms, unmodified"
+    f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or {stock.ROBOT} or {stock.ALOHA}: gymnasium-robotics' "
+    "Fetch and gym_aloha's two arms, unmodified"
 )
 TASK_HELP = (
-    f"{', '.join((*NAMES, *SEVERAL))}; the path of a Python file with a task of your own; of {stock.ROBOT} "
-    f"{', '.join(stock.STOCK)}; of {stock.ALOHA} {', '.join(stock.ALOHA_TASKS)}"
+    f"{', '.join((*NAMES, *SEVERAL))}, or the path of your own task's Python file; with {stock.ROBOT}, "
+    f"{', '.join(stock.STOCK)}; with {stock.ALOHA}, {', '.join(stock.ALOHA_TASKS)}"
 )
 
 
@@ -38,13 +38,8 @@ class EnvConfig(Episodes):
 
     @property
     def name(self) -> str:
-        """Robot and task as one word, files by their stems."""
-        return scene_name(self.robot, self.task)
-
-
-def scene_name(robot: str, task: str) -> str:
-    """Return robot and task as one word, files by their stems, a task without its argument."""
-    return f"{Path(robot).stem}_{Path(task).stem.partition(':')[0]}"
+        """Robot and task as one word, files by their stems, a task without its argument."""
+        return f"{Path(self.robot).stem}_{Path(self.task).stem.partition(':')[0]}"
 
 
 def make_config(
@@ -64,8 +59,6 @@ def complete(config: EnvConfig) -> EnvConfig:
     config = _of_stock(config) if config.robot in stock.ROBOTS else _with_task(config)
     if not 1 <= config.control_hz <= MOST_HZ:
         raise UsageError(f"control_hz is {config.control_hz}; expected 1 to {MOST_HZ}")
-    if config.robot not in stock.ROBOTS:
-        config = _with_limits(config)
     if not 0 < config.tolerance < 1:
         raise UsageError(f"tolerance is {config.tolerance} m; expected between 0 and 1")
     if config.horizon > LONGEST_EPISODE:
@@ -76,7 +69,7 @@ def complete(config: EnvConfig) -> EnvConfig:
 
 
 def _with_task(config: EnvConfig) -> EnvConfig:
-    """Canonicalise the object (the default becomes "") and the task's argument; fill in the robot's rate."""
+    """Canonicalise the object (the default becomes "") and the task's argument; fill in rate and limits."""
     from manip_il.robots.table import get_robot  # imported here: help needs no robot and no simulator
     from manip_il.sim.task import TakesArgument
     from manip_il.tasks.table import get_task
@@ -85,18 +78,13 @@ def _with_task(config: EnvConfig) -> EnvConfig:
     if isinstance(task, TakesArgument):
         config = replace(config, task=task.name)
     if config.object:
-        shape = Shape.parse(config.object)
-        get_task(config.task, config.object)
+        shape, task = Shape.parse(config.object), get_task(config.task, config.object)
         config = replace(config, object="" if shape == CUBE else str(shape))
-    return replace(config, control_hz=config.control_hz or get_robot(config.robot).fps)
-
-
-def _with_limits(config: EnvConfig) -> EnvConfig:
-    from manip_il.tasks.table import get_task  # imported here: help needs no simulator
-
-    limits, rate = get_task(config.task, config.object).limits, config.control_hz / LIMITS_HZ
+    limits, control_hz = task.limits, config.control_hz or get_robot(config.robot).fps
+    rate = control_hz / LIMITS_HZ
     return replace(
         config,
+        control_hz=control_hz,
         tolerance=config.tolerance or limits.tolerance,
         success_steps=config.success_steps or max(1, round(limits.success_steps * rate)),
         horizon=config.horizon or max(1, round(limits.horizon * rate)),
@@ -108,7 +96,7 @@ def _of_stock(config: EnvConfig) -> EnvConfig:
     robot = stock.ROBOTS[config.robot]
     stock.get_stock(config.task, config.robot)
     if config.object:
-        raise UsageError(f"object is {config.object}; {config.robot} is unmodified, leave --task.object out")
+        raise UsageError(f"object is {config.object}; {config.robot} is unmodified, so omit --task.object")
     for name, value in robot.fixed.items():
         given = getattr(config, name)
         if given not in (0, value):

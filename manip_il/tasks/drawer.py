@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import (
-    Lift,
+    LiftProfile,
     carry,
     carry_progress,
     grasp_progress,
@@ -29,8 +28,6 @@ from manip_il.tasks.objects import GREY, WOOD, add_cube, add_furniture, add_part
 from manip_il.tasks.pick_place import OBJECT, observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
-
-F64 = NDArray[np.float64]
 
 CABINET, TRAY, BAR = "cabinet", "drawer", "handle"
 # The cabinet's frame lies on the table under the handle of the closed drawer, x into the cabinet.
@@ -51,8 +48,8 @@ HOVER, SLOPE = 0.08, 2.0  # height of the hand over the handle on its way there 
 BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # bounds on the object's offset from the closed handle at the start [m]
 DROP = 0.018  # height of the object over the drawer's floor at release [m]
 OVER = 0.13  # height of the hand over the object on approach [m]
-OVER_FRONT = Lift(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # on the way into the drawer
-OVER_TABLE = Lift(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # on the way to a place beside it
+OVER_FRONT = LiftProfile(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # into the drawer
+OVER_TABLE = LiftProfile(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # to a place beside it
 MUCH_NEARER = 2.3  # how much nearer the second yaw at the handle must be to be chosen [rad]
 LEFT = (0.03, 0.06, 0.03)  # offset from the handle beyond which the hand need not rise first: x, y, z [m]
 # In the cabinet's frame [m]: where an object is in the handle's way, x and y; x below which it lies in front of the
@@ -163,10 +160,6 @@ def _hand_is_in(world: World) -> bool:
     return hand_is_at(world, OBJECT, 0.05, 0.07)
 
 
-def _let_go(world: World) -> Target:
-    return let_go(world, OBJECT, HOVER)
-
-
 def _place(world: World) -> F64:
     """Release point of the object's centre in the drawer, (3,) [m]."""
     return middle_of_drawer(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP]
@@ -217,34 +210,30 @@ def _put_aside(world: World) -> Target:
     return carry(world, OBJECT, to, OVER_TABLE)
 
 
-_RUNGS = (
-    Rung("done", lambda w: is_inside(w) and _is_shut(w), _to_bar),
-    Rung("let_go", lambda w: is_inside(w) and _hand_is_in(w), _let_go),
-    Rung("push", lambda w: is_inside(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
-    Rung("to_push", is_inside, _to_bar),
-    Rung("carry", lambda w: held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
-    Rung("set_down", lambda w: held(w, OBJECT) and _is_set_down(w), _let_go),
-    Rung("put_aside", lambda w: held(w, OBJECT), _put_aside),
-    Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
-    Rung("to_make_way", _must_shut, _to_bar),
-    Rung("pull", lambda w: _must_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
-    Rung("to_pull", _must_open, _to_bar),
-    Rung("leave", _is_around_bar, _leave),
-    *grasp_rungs(lambda w: OBJECT, OVER),
-)
-
-
-@dataclass(frozen=True)
 class Drawer:
     """Open a drawer, put a cube in it, close it."""
 
-    name: str = "drawer"
-    instruction: str = "Put the red cube in the drawer and close it."
-    limits: Limits = Limits(tolerance=SHUT, horizon=500)
-    objects: tuple[str, ...] = (OBJECT,)
-    grasped: tuple[str, ...] = (OBJECT,)
-    sizes: tuple[float, float] | None = (0.03, 0.045)
-    rungs: tuple[Rung, ...] = _RUNGS
+    name = "drawer"
+    instruction = "Put the red cube in the drawer and close it."
+    limits = Limits(tolerance=SHUT, horizon=500)
+    objects = (OBJECT,)
+    grasped = (OBJECT,)
+    sizes = (0.03, 0.045)
+    rungs = (
+        Rung("done", lambda w: is_inside(w) and _is_shut(w), _to_bar),
+        Rung("let_go", lambda w: is_inside(w) and _hand_is_in(w), lambda w: let_go(w, OBJECT, HOVER)),
+        Rung("push", lambda w: is_inside(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+        Rung("to_push", is_inside, _to_bar),
+        Rung("carry", lambda w: held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
+        Rung("set_down", lambda w: held(w, OBJECT) and _is_set_down(w), lambda w: let_go(w, OBJECT, HOVER)),
+        Rung("put_aside", lambda w: held(w, OBJECT), _put_aside),
+        Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+        Rung("to_make_way", _must_shut, _to_bar),
+        Rung("pull", lambda w: _must_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
+        Rung("to_pull", _must_open, _to_bar),
+        Rung("leave", _is_around_bar, _leave),
+        *grasp_rungs(lambda w: OBJECT, OVER),
+    )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the cube, and a cabinet with a drawer."""

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Concatenate, NamedTuple
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
+from manip_il.robots.rotations import angle_off_vertical
 from manip_il.sim.rests import DEEPEST, LEAST_ROOM, Hull
 from manip_il.sim.world import World
-
-F64 = NDArray[np.float64]
 
 HOVER = 0.055  # clearance above the object's top before the hand is over it [m]
 FUNNEL_RADIUS = 0.010  # misalignment up to which the hand may be all the way down [m]
@@ -52,7 +50,7 @@ class Lie(NamedTuple):
     [m], and the vector from its centre to the middle between them, (3,) [m]. tall: its height [m]. tilt: angle to its
     nearest resting pose [rad]. folds: number of its yaws that look alike, 0 if all do. level: the grasps whose fingers
     meet upright sides. above: height of its top over the middle between the fingers, by default half `tall` [m].
-    fits: whether the gripper goes around it, if that was checked.
+    fits: whether the gripper can close around it, if that was checked.
     """
 
     grasps: tuple[tuple[float, float, float, Way], ...]
@@ -97,27 +95,31 @@ class Grasp(NamedTuple):
     lean: float
 
 
-def grasp_of(world: World, name: str) -> Grasp:
-    """Return the pose of an object relative to the hand; computed once per state."""
-    return world.remember(("grasp", name), partial(_grasp, world, name))
-
-
 def is_cube(world: World, name: str) -> bool:
     """Return whether an object is a box with equal edges."""
     return world.kind(name) == _BOX and len(set(world.extents(name))) == 1
 
 
+def once_per_state[T, **P](compute: Callable[Concatenate[World, P], T]) -> Callable[Concatenate[World, P], T]:
+    """Return a function of a world, and of names in it, whose result is kept until the world changes."""
+
+    @wraps(compute)
+    def read(world: World, *args: P.args, **kwargs: P.kwargs) -> T:
+        return world.remember((compute, *args, *kwargs.values()), lambda: compute(world, *args, **kwargs))
+
+    return read
+
+
+@once_per_state
 def lie_of(world: World, name: str) -> Lie:
-    """Return how an object lies; computed once per state."""
-    return world.remember(("lie", name), partial(_lie_in, world, name))
-
-
-def _lie_in(world: World, name: str) -> Lie:
+    """Return how an object lies."""
     rotation, hull = world.pose(name).rotation, world.hull(name)
     return _lie(world.kind(name), rotation, world.extents(name)) if hull is None else _hull_lie(hull, rotation)
 
 
-def _grasp(world: World, name: str) -> Grasp:
+@once_per_state
+def grasp_of(world: World, name: str) -> Grasp:
+    """Return the pose of an object relative to the hand."""
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
     neighbours = world.neighbours(name)
     yaw, width, length, (off_x, off_y, off_z) = _nearest(
@@ -282,8 +284,7 @@ def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
     """Return a hand's angle from pointing down [rad], less what the hand (3, 3) may lean."""
     if not lean:
         return angle
-    tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))
-    free = min(tilt, lean * LEAN)
+    free = min(angle_off_vertical(hand), lean * LEAN)
     return math.sqrt(max(0.0, angle * angle - free * free))
 
 

@@ -8,20 +8,31 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.robots.rotations import angle_between
+from manip_il.mdp import F64
+from manip_il.robots.rotations import angle_across, angle_ahead, angle_between, angle_off_vertical
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import lie_of
+from manip_il.tasks.grasp import lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part
-from manip_il.tasks.peg import HOLE, PEG, azimuth, held, lower_end, upper_axis
+from manip_il.tasks.peg import (
+    HOLE,
+    LIFT,
+    LIFT_SLOPE,
+    PEG,
+    PEG_RUNGS,
+    Way,
+    hangs,
+    held,
+    lower_end,
+    move,
+    peg_progress,
+    upper_axis,
+    way_to,
+)
 from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.set_up import LIFT, LIFT_SLOPE, PEG_RUNGS, Way, hangs, move, peg_progress, way_to
-from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw
-
-F64 = NDArray[np.float64]
+from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw, product, turn_left
 
 SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # peg [m], [m], [kg]
 DEPTH, WALL = 0.03, 0.018  # depth of the hole, and thickness of the walls around it [m]
@@ -42,13 +53,9 @@ def is_in(world: World) -> bool:
     return math.dist(lower_end(world), world.pose(HOLE).position) < IN
 
 
+@once_per_state
 def to_hole(world: World) -> Way:
-    """Return the remaining motion of a peg that hangs from the hand; computed once per state."""
-    return world.remember("to hole", lambda: _to_hole(world))
-
-
-def _to_hole(world: World) -> Way:
-    """Choose the easiest of the four hand rotations at which the held peg fits the hole."""
+    """Return the remaining motion of a peg that hangs from the hand, by the easiest of four rotations that fit."""
     peg, hole, hand = world.pose(PEG), world.pose(HOLE), world.ee.rotation
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
@@ -59,7 +66,7 @@ def _to_hole(world: World) -> Way:
 
 def _strain(hand: F64) -> float:
     """Cost of a hand's yaw, in radians of turning: a tilted hand should point neither ahead nor backwards."""
-    tilt, yaw = math.acos(min(1.0, max(-1.0, -hand.item(2, 2)))), abs(azimuth(hand))
+    tilt, yaw = angle_off_vertical(hand), abs(angle_across(hand))
     tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
     return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
 
@@ -98,14 +105,6 @@ def _hold(world: World) -> Target:
     return Target(world.ee.position.copy(), world.ee.rotation.copy(), CLOSED)
 
 
-_RUNGS = (
-    Rung("inserted", is_in, _hold),
-    Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
-    Rung("carry", hangs, _bring),
-    *PEG_RUNGS,
-)
-
-
 @dataclass(frozen=True)
 class Insert:
     """Put a peg into a hole that it fits. play: how much wider the hole is than the peg [m]."""
@@ -117,7 +116,12 @@ class Insert:
     limits: Limits = field(default=Limits(tolerance=0.004, horizon=600))
     objects: tuple[str, ...] = (PEG,)
     grasped: tuple[str, ...] = (PEG,)
-    rungs: tuple[Rung, ...] = _RUNGS
+    rungs: tuple[Rung, ...] = (
+        Rung("inserted", is_in, _hold),
+        Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
+        Rung("carry", hangs, _bring),
+        *PEG_RUNGS,
+    )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the peg, and four walls around the hole."""
@@ -147,13 +151,13 @@ class Insert:
         peg = draw_until(lambda: draw_resting_place(rng, world, PEG, height), fits, world, PEG)
         turn = draw_yaw(rng, np.pi)
         if lies:
-            mujoco.mju_mulQuat(turn, turn.copy(), np.array([math.cos(_QUARTER / 2), 0.0, math.sin(_QUARTER / 2), 0.0]))
+            turn = product(turn, np.array([math.cos(_QUARTER / 2), 0.0, math.sin(_QUARTER / 2), 0.0]))
         return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
         """Return hand, peg, hole, the vectors between them, and the turn of the hand that makes the peg fit."""
         peg, hole, lie = world.pose(PEG).position, world.pose(HOLE), lie_of(world, PEG)
-        yaw = math.atan2(hole.rotation[1, 0], hole.rotation[0, 0])
+        yaw = angle_ahead(hole.rotation)
         way = to_hole(world)
         return {
             **observe_hand(world),
@@ -198,14 +202,9 @@ def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
     out, thick = inner + WALL / 2, CHAMFER / 2
     half = (WALL / 2, inner + WALL, height / 2)
     add_part(hole, name, half, (c * out, s * out, height / 2), GREY)
-    hole.geoms[-1].quat = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+    hole.geoms[-1].quat = turn_left(yaw)
     out, up = inner + CHAMFER / 2 + thick * math.sin(steep), height + CHAMFER / 2 - thick * math.cos(steep)
     add_part(hole, f"{name} edge", (CHAMFER / math.sqrt(2), inner + WALL, thick), (c * out, s * out, up), GREY)
     edge = hole.geoms[-1]
-    turn = np.empty(4)
-    mujoco.mju_mulQuat(
-        turn,
-        np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]),
-        np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]),
-    )
+    turn = product(turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]))
     edge.quat, edge.friction, edge.priority = turn, [SLIPPERY, 0.005, 0.0001], 1

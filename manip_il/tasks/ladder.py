@@ -12,14 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside, lie_of
 
-F64 = NDArray[np.float64]
 Which = Callable[[World], str]  # the current object
 Place = Callable[[World], F64]  # target of its centre, (3,) [m]
 
@@ -38,7 +37,7 @@ _HALFWAY = 0.2  # distance left at which half of a part's progress is made [m]
 _GRASPED = 0.5  # progress of an object that is held
 
 
-class Lift(NamedTuple):
+class LiftProfile(NamedTuple):
     """Height of a carried object over its goal, by the horizontal distance still to go [m].
 
     most: height far from the goal [m]. slope: height per distance beyond `free`. free: distance without height [m].
@@ -56,7 +55,7 @@ class Lift(NamedTuple):
         return min(self.most, self.slope * max(0.0, distance - self.free))
 
 
-CARRY = Lift()  # to a goal with nothing around it
+CARRY = LiftProfile()  # to a goal with nothing around it
 
 
 def held(world: World, name: str) -> bool:
@@ -121,7 +120,7 @@ def close_on(world: World, name: str) -> Target:
     return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
 
 
-def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:
+def carry(world: World, name: str, to: F64, lift: LiftProfile = CARRY) -> Target:
     """Carry the held object's centre to a point (3,) [m], above it first and then down."""
     x, y, z = (to - world.pose(name).position).tolist()
     off = math.hypot(x, y)
@@ -151,7 +150,9 @@ def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
     return math.hypot(x, y) < aside and z < above
 
 
-def grasp_rungs(which: Which, hover: float = 0.0) -> tuple[Rung, ...]:
+def grasp_rungs(
+    which: Which, hover: float = 0.0, approach: Callable[[World, str, float], Target] = approach
+) -> tuple[Rung, ...]:
     """Return the ladder that gets the fingers around an object and closes them; hover: see `approach`."""
 
     def near(world: World) -> bool:
@@ -200,7 +201,7 @@ def pick_progress(world: World, name: str) -> float:
     return 0.9 * _GRASPED * grasp_progress(world, name)
 
 
-def carry_progress(world: World, name: str, to: F64, lift: Lift = CARRY) -> float:
+def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = CARRY) -> float:
     """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the distance left on `carry`'s path.
 
     That path goes up, sideways, and down.

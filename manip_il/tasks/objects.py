@@ -7,14 +7,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.sim.mesh import Mesh
 from manip_il.sim.shape import ANY, MESH, contact
 from manip_il.sim.variation import GEOMS
 from manip_il.sim.world import GOAL
 
-F64 = NDArray[np.float64]
 CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
 MOST_HULL = 500  # vertices of a mesh's collision hull: finer ones take seconds to compile

@@ -1,26 +1,27 @@
-"""Grips of a peg that stands, lies or is held, as pure geometry of a world."""
+"""A peg: grip it, set it upright, release and catch it, and move it; ladder and progress of tasks with one."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.reach import ARRIVES, reach_of
-from manip_il.robots.rotations import angle_between
+from manip_il.robots.rotations import angle_across, angle_between, rotation_matrix, rotation_vector
+from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.grasp import OPEN_SLACK, lie_of
-
-F64 = NDArray[np.float64]
+from manip_il.tasks.grasp import OPEN_SLACK, lie_of, once_per_state
+from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 
 PEG, HOLE = "peg", "hole"
 _OPEN_SHARE = 0.85  # share of the gripper's opening beyond the peg, if that is less than the slack
 FROM_END = 0.04  # distance of the grip from the peg's upper end [m]
 LOWEST = 0.024  # least height of the hand over the table at a lying peg [m]
-BACK = 0.05  # distance behind the hand of a point: the peg's end that is nearer to it is the upper one [m]
+BACK = 0.05  # distance of a point behind the hand; the peg's end nearer to that point is the upper one [m]
 STANDS = 0.4  # tilt below which the peg stands and is grasped from above [rad]
 LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
 LEAN_BY_ROOM = 3.0  # limit of that lean per spare reach, as the wrist is farther out [rad/m]
@@ -29,6 +30,20 @@ AT_ANGLE = 0.25  # [rad]
 OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # height over the grip on approach [m]; per error; tolerated error [m]
 BARE = 0.012  # how far a hand that holds the peg may be from its faces and ends [m]
 ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
+LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m]; height per error
+ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
+SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
+FARTHER = 1.5  # factor on the distance that an exact move aims for, as the arm's weight stops it short
+TURN = 0.15  # largest lead of the target's rotation over the hand's, which need not wait for it to move [rad]
+LET_GO, RELEASE = 0.012, 0.03  # opening beyond the peg's width at which it is free, and to command [m]
+CLEAR = 0.03  # clearance of the hand over the peg after release [m]
+ASIDE = (math.radians(55), math.radians(70))  # range of yaw, to either side, at which the hand sets the peg up [rad]
+NEAR_MIDDLE = 0.05  # largest distance from the workspace's middle along x at which the peg is set up [m]
+FROM_HOLE = 0.11  # least distance from the hole at which the peg is set up [m]
+OVER_WALLS = 0.03  # how much higher the peg is carried beside the hole [m]
+SET_DOWN = 0.010  # error at which the peg is down on the table [m]
+ON_TABLE = 0.004  # height of the lower end over the table at which the peg stands [m]
+IN_AIR, BESIDE = 0.006, 0.045  # least height of a falling peg; largest distance of its axis from the hand [m]
 
 
 class Grip(NamedTuple):
@@ -55,11 +70,6 @@ def hand_at(yaw: float, pitch: float) -> F64:
     return np.array([x, [s, -c, 0.0], z]).T
 
 
-def azimuth(rotation: F64) -> float:
-    """Return the `hand_at` yaw of a hand (3, 3) whose fingers move level, whatever its pitch [rad]."""
-    return math.atan2(rotation[0, 1], -rotation[1, 1])
-
-
 def lower_end(world: World) -> F64:
     """Return the middle of the peg's lower end, (3,) [m]."""
     peg = world.pose(PEG)
@@ -67,13 +77,12 @@ def lower_end(world: World) -> F64:
     return peg.position - math.copysign(world.extents(PEG)[2] / 2, axis[2]) * axis
 
 
+@once_per_state
 def upper_axis(world: World) -> F64:
-    """Return the direction along the peg to its intended upper end, (3,)."""
-    return world.remember("upper", lambda: _upper_axis(world))
+    """Return the direction along the peg to its intended upper end, (3,).
 
-
-def _upper_axis(world: World) -> F64:
-    """Upper end of a held peg: the one that the hand points away from; of a lying peg: the one away from the robot."""
+    Of a held peg that is the end that the hand points away from; of a lying peg the one away from the robot.
+    """
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
     if stands(world):
@@ -81,7 +90,7 @@ def _upper_axis(world: World) -> F64:
     if held(world):
         from_peg = ee.position - peg.position - BACK * ee.rotation[:, 2]
         return math.copysign(1.0, float(axis @ from_peg)) * axis
-    at = azimuth(ee.rotation)
+    at = angle_across(ee.rotation)
     return min((axis, -axis), key=lambda a: _far_turn(math.atan2(a[1], a[0]), at))
 
 
@@ -95,12 +104,11 @@ def stands(world: World) -> bool:
     return abs(world.pose(PEG).rotation[2, 2]) > math.cos(STANDS)
 
 
+@once_per_state
 def held(world: World) -> bool:
     """Return whether both fingers touch the peg, and the hand is between its faces and its ends."""
-    return world.remember("held", lambda: world.touched(PEG) and _around(world))
-
-
-def _around(world: World) -> bool:
+    if not world.touched(PEG):
+        return False
     peg = world.pose(PEG)
     x, y, z = np.abs(peg.rotation.T @ (world.ee.position - peg.position)).tolist()
     side, _, length = world.extents(PEG)
@@ -112,18 +120,15 @@ def is_aslant(world: World) -> bool:
     return -float(upper_axis(world) @ world.ee.rotation[:, 2]) < math.cos(ASLANT)
 
 
+@once_per_state
 def grip_of(world: World) -> Grip:
-    """Return how the hand grips the peg as it lies or stands; computed once per state."""
-    return world.remember("grip", lambda: _grip(world))
-
-
-def _grip(world: World) -> Grip:
+    """Return how the hand grips the peg as it lies or stands."""
     ee, peg = world.ee, world.pose(PEG)
     width, _, length = world.extents(PEG)
     axis = upper_axis(world)
     position = peg.position + (length / 2 - FROM_END) * axis
     if stands(world):
-        at = azimuth(ee.rotation)
+        at = angle_across(ee.rotation)
         yaw = min((grasp[0] for grasp in lie_of(world, PEG).grasps), key=lambda yaw: _far_turn(yaw, at))
         rotation = hand_at(yaw, 0.0)
     else:
@@ -145,3 +150,191 @@ def _farthest(scene: Scene) -> float:
     while reach_of(scene.robot).error((x + 0.01, y, 0.0)) < ARRIVES:
         x += 0.01
     return x
+
+
+class Way(NamedTuple):
+    """Remaining motion of a held peg.
+
+    rotation: the hand's once the peg is upright, and aligned if it is for the hole, (3, 3); turn: rotation vector to
+    it, (3,) [rad]. off: horizontal offset left [m], (2,). error: both together [m]. low: height of the peg's lower end
+    over the table once it is upright [m].
+    """
+
+    rotation: F64
+    turn: F64
+    off: F64
+    error: float
+    low: float
+
+    @property
+    def angle(self) -> float:
+        """Angle left for the hand to turn [rad]."""
+        return math.hypot(*self.turn)
+
+
+@once_per_state
+def to_stand(world: World) -> Way:
+    """Return the remaining motion of a held peg that must stand on the table first.
+
+    It turns the peg upright by the smallest rotation and the hand to one side, near the middle but not at the hole.
+    """
+    hand, axis = world.ee.rotation, upper_axis(world)
+    upright = _upright(axis) @ hand
+    y, at = float(world.ee.position[1]) - world.scene.robot.workspace.centre[1], angle_across(hand)
+    least, most = ASIDE
+    yaw = min(
+        (math.copysign(min(most, max(least, side * at)), side) for side in (1.0, -1.0)),
+        key=lambda yaw: abs(yaw - at) + 8.0 * max(0.0, math.copysign(y, yaw * y)),
+    )
+    turn = yaw - angle_across(upright)
+    c, s = math.cos(turn), math.sin(turn)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ upright
+    return way_to(world, rotation, _free_place)
+
+
+def _upright(axis: F64) -> F64:
+    """The smallest rotation that turns an axis up, (3, 3)."""
+    x, y, z = axis.tolist()
+    if z < -0.99:
+        return np.diag([1.0, -1.0, -1.0])
+    k = 1 / (1 + z)
+    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
+
+
+def _free_place(world: World, end: F64) -> F64:
+    """Place on the table to set up a peg, nearest to where its lower end (3,) would be, (3,) [m]."""
+    x, y, _ = end.tolist()
+    middle = world.scene.robot.workspace.centre[0]
+    at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])
+    from_hole = at - world.pose(HOLE).position
+    distance = math.hypot(from_hole[0], from_hole[1])
+    return at + max(0.0, FROM_HOLE / max(distance, 1e-6) - 1) * from_hole
+
+
+def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
+    """Return the remaining motion if the hand turns with the peg to a rotation (3, 3).
+
+    to: target of the upright peg's lower end, given where that would be, (3,) [m].
+    """
+    ee, peg = world.ee, world.pose(PEG)
+    turn = rotation_vector(rotation @ ee.rotation.T)
+    end = peg.position - world.extents(PEG)[2] / 2 * upper_axis(world)
+    turned = ee.position + rotation @ (ee.rotation.T @ (end - ee.position))  # the lower end, once the peg is upright
+    off = (to(world, turned) - turned)[:2]
+    error = math.hypot(*off) + ANGLE_AS_LENGTH * math.hypot(*turn)
+    return Way(rotation, turn, off, error, float(turned[2]))
+
+
+def _set_up(world: World) -> Target:
+    """Lift the peg and turn it upright over a free place, then lower it to the table."""
+    way = to_stand(world)
+    return move(world, way, _set_up_height(world, way) - way.low, sideways_at=0.03)
+
+
+def _set_up_height(world: World, way: Way) -> float:
+    """Height of the lower end over the table, and over the walls if beside the hole [m]."""
+    room = math.dist(world.pose(PEG).position[:2], world.pose(HOLE).position[:2]) - FROM_HOLE
+    most = LIFT + OVER_WALLS * min(1.0, max(0.0, 1 - room / OVER_WALLS))
+    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # not the hand's yaw, which may be out of reach
+    error = math.hypot(*way.off) + ANGLE_AS_LENGTH * tilt
+    return min(most, LIFT_SLOPE * max(0.0, error - SET_DOWN)) - 0.001
+
+
+def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
+    """Return the target that moves the peg with the hand.
+
+    missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m].
+    """
+    sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
+    turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
+    rotation = way.rotation
+    if exact:
+        sideways, rotation = FARTHER * sideways, rotation_matrix((FARTHER - 1) * way.turn) @ rotation
+    position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
+    step = min(FAST, SLOW + max(0.0, way.error - 0.02))
+    return Target(position, rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
+
+
+def is_up(world: World) -> bool:
+    """Return whether the peg stands on the table, with an oblique hand around it or just above it."""
+    x, y, z = (world.ee.position - lower_end(world)).tolist()
+    up = float(upper_axis(world)[2]) > math.cos(0.15) and lower_end(world)[2] < ON_TABLE
+    return up and is_aslant(world) and math.hypot(x, y) < 0.03 and z < world.extents(PEG)[2] + CLEAR
+
+
+def _let_stand(world: World) -> Target:
+    """Open the fingers, then rise straight up."""
+    ee, width = world.ee, world.extents(PEG)[0]
+    free = world.opening > width + LET_GO and not world.touched(PEG)
+    up = 0.1 if free else 0.0
+    return Target(
+        ee.position + [0.0, 0.0, up], ee.rotation.copy(), min(width + RELEASE, world.gripper.most), max_step=0.04
+    )
+
+
+def _falls(world: World) -> bool:
+    """Whether the peg, between the fingers or just under their tips, neither stands nor lies."""
+    peg, ee = world.pose(PEG), world.ee
+    way = ee.position - peg.position
+    along = float(peg.rotation[:, 2] @ way)
+    beside = ee.rotation.T @ (way - along * peg.rotation[:, 2])
+    between = abs(beside[1]) < world.opening / 2 and math.hypot(*beside) < BESIDE
+    if not between or abs(along) > world.extents(PEG)[2] / 2:
+        return False
+    return lie_of(world, PEG).tilt > 0.06 or float(peg.position[2]) - lie_of(world, PEG).tall / 2 > IN_AIR
+
+
+def _catch(world: World) -> Target:
+    """Close the fingers and follow the peg."""
+    peg, ee = world.pose(PEG), world.ee
+    axis = upper_axis(world)
+    along = float(axis @ (ee.position - peg.position))
+    down = (world.extents(PEG)[2] / 2 - FROM_END - along) * axis
+    return Target(ee.position + down, ee.rotation.copy(), CLOSED)
+
+
+def _at_grip(world: World) -> bool:
+    grip = grip_of(world)
+    box = AT_GRIP if grip.open_enough else CLOSING
+    offset = np.abs(grip.rotation.T @ (world.ee.position - grip.position))
+    return bool((offset < box).all()) and grip.angle < AT_ANGLE
+
+
+def _approach(world: World) -> Target:
+    """Move over the grip and down to it, fingers open; straight up if too low beside it."""
+    grip = grip_of(world)
+    x, y, z = grip.position
+    height = grip.height if grip.open_enough else max(grip.height, OVER)
+    at = rise_first(world.ee.position, (x, y, z + height))
+    return Target(at, grip.rotation, world.gripper.most, max_turn=TURN)
+
+
+def hangs(world: World) -> bool:
+    """Return whether the peg hangs from a hand that points along it, more or less."""
+    return held(world) and not is_aslant(world) and stands(world)
+
+
+def peg_progress(world: World) -> float:
+    """Return progress of gripping a peg from above, 0 to 1, after setting it up if it lies."""
+    grip = grip_of(world)
+    above = float(world.ee.position[2] - grip.position[2])
+    if is_up(world):
+        return 0.55 + 0.11 * min(1.0, max(0.0, above / (FROM_END + CLEAR)))
+    if held(world):
+        way = to_stand(world)
+        height = _set_up_height(world, way)
+        rest = math.hypot(*way.off) + abs(height - way.low) + height + 0.25 * way.angle
+        return 0.33 + 0.2 * nearness(rest)
+    near = nearness(grip.off + abs(above - grip.height) + grip.height)
+    return 0.68 + 0.31 * near if stands(world) else 0.3 * near
+
+
+PEG_RUNGS = (
+    Rung("let_stand", is_up, _let_stand),
+    Rung("set_up", held, _set_up),
+    Rung("catch", _falls, _catch),
+    Rung("grasp", _at_grip, lambda w: Target(grip_of(w).position, grip_of(w).rotation, CLOSED)),
+    Rung("open", lambda w: not grip_of(w).open_enough, _approach),
+    Rung("descend", lambda w: grip_of(w).height < OVER, _approach),
+    Rung("approach", lambda w: True, _approach),
+)

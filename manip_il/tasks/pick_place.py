@@ -8,8 +8,8 @@ from typing import Self
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.sim.rests import LEAST_HEIGHT
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
@@ -19,8 +19,6 @@ from manip_il.tasks.ladder import held, pick_progress, pick_rungs
 from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
-
-F64 = NDArray[np.float64]
 
 OBJECT = "object"
 UNDER = np.array([0.0, 0.0, -1.0])  # out of any hand's reach [m]
@@ -83,7 +81,7 @@ class PickPlace:
         if lie.tall < LEAST_HEIGHT:
             return f"{OBJECT} lies on a side on which it is {lie.tall:.3f} m high, too low for the fingers"
         width = min(width for _, width, _, _ in lie.grasps)
-        return f"{OBJECT} lies on a side on which it is {width:.3f} m wide, more than the gripper goes around"
+        return f"{OBJECT} lies on a side on which it is {width:.3f} m wide, too wide for the gripper"
 
     def progress(self, world: World) -> float:
         """Return progress by the distance left along the ladder's path."""
@@ -125,15 +123,14 @@ def observe_object(world: World, name: str) -> Observed:
     position, lie = world.pose(name).position, lie_of(world, name)
     if world.scene.draws_shape or not is_cube(world, name):
         seen = _observe_lie(name, lie, mesh=world.hull(name) is not None)
-        return {name: position, **seen, f"{name}_from_ee": position - world.ee.position}
-    return {
-        name: position,
-        f"{name}.cos4yaw": math.cos(4 * lie.yaw),
-        f"{name}.sin4yaw": math.sin(4 * lie.yaw),
-        f"{name}.tilt": lie.tilt,
-        f"{name}.width": world.extents(name)[0],
-        f"{name}_from_ee": position - world.ee.position,
-    }
+    else:
+        seen = {
+            f"{name}.cos4yaw": math.cos(4 * lie.yaw),
+            f"{name}.sin4yaw": math.sin(4 * lie.yaw),
+            f"{name}.tilt": lie.tilt,
+            f"{name}.width": world.extents(name)[0],
+        }
+    return {name: position, **seen, f"{name}_from_ee": position - world.ee.position}
 
 
 def _observe_lie(name: str, lie: Lie, *, mesh: bool) -> Observed:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
@@ -16,8 +15,6 @@ from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import draw_resting_place, draw_yaw
-
-F64 = NDArray[np.float64]
 
 BUTTON, CAP = "button", "cap"
 TRAVEL = 0.015  # travel of the cap [m]
@@ -56,24 +53,20 @@ def _is_down(world: World) -> bool:
     return TRAVEL - pressed(world) < STOPPED
 
 
-_RUNGS = (
-    Rung("pressed", _is_down, _aim),
-    Rung("press", lambda w: _off(w) < OVER, _aim),
-    Rung("approach", lambda w: True, _aim),
-)
-
-
-@dataclass(frozen=True)
 class Press:
     """Press a button to its stop against its spring, and keep it there for a moment."""
 
-    name: str = "press"
-    instruction: str = "Press the red button."
-    limits: Limits = Limits(tolerance=STOPPED)
-    objects: tuple[str, ...] = ()
-    grasped: tuple[str, ...] = ()
-    sizes: tuple[float, float] | None = None
-    rungs: tuple[Rung, ...] = _RUNGS
+    name = "press"
+    instruction = "Press the red button."
+    limits = Limits(tolerance=STOPPED)
+    objects = ()
+    grasped = ()
+    sizes = None
+    rungs = (
+        Rung("pressed", _is_down, _aim),
+        Rung("press", lambda w: _off(w) < OVER, _aim),
+        Rung("approach", lambda w: True, _aim),
+    )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the button: a housing, and a cap on a spring."""

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.ladder import AT_GOAL, nearness, rise_first
 from manip_il.tasks.objects import RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, resting_height
-
-F64 = NDArray[np.float64]
+from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_xy, resting_height
 
 PUCK = "puck"
 PUCK_SIZE = (0.03, 0.02)  # radius, half its height [m]
@@ -34,7 +31,7 @@ FAR = 0.08  # least distance of the goal from the puck at the start [m]
 ROOM = 0.06  # reachable margin behind the puck at the start [m]
 
 
-class Hand(NamedTuple):
+class PushStyle(NamedTuple):
     """Dimensions of a pushing hand. behind: distance at which it starts behind the puck's middle [m].
 
     opening: of the fingers, across the push, so that the puck rests against both [m]. touching: distance behind the
@@ -47,12 +44,12 @@ class Hand(NamedTuple):
     lower: float
 
 
-UPRIGHT_HAND = Hand(0.05, 0.04, 0.0, LOW_ENOUGH)
-LEANING_HAND = Hand(0.065, 0.02, 0.045, 0.006)  # for a weak arm, which would ride on the puck on its way down
+UPRIGHT_STYLE = PushStyle(0.05, 0.04, 0.0, LOW_ENOUGH)
+LEANING_STYLE = PushStyle(0.065, 0.02, 0.045, 0.006)  # for a weak arm, which would ride on the puck on its way down
 
 
-def _style(world: World) -> Hand:
-    return LEANING_HAND if world.robot.leans else UPRIGHT_HAND
+def _style(world: World) -> PushStyle:
+    return LEANING_STYLE if world.robot.leans else UPRIGHT_STYLE
 
 
 def _way(world: World) -> tuple[F64, float]:
@@ -112,6 +109,11 @@ def _low_enough(world: World, behind: float) -> float:
     return world.robot.ee.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
 
 
+def _place_behind(world: World) -> F64:
+    """Place of a hand that starts to push, (2,) [m]."""
+    return world.pose(PUCK).position[:2] - _way(world)[0] * _style(world).behind
+
+
 def _push(world: World) -> Target:
     direction, distance = _way(world)
     behind, _ = _behind(world)
@@ -122,39 +124,31 @@ def _push(world: World) -> Target:
 
 def _around(world: World) -> Target:
     """Move behind the puck: over it, and lower as the hand gets nearer; straight up if too low beside it."""
-    direction, _ = _way(world)
-    hand = _hand(world)
-    to = world.pose(PUCK).position[:2] - direction * _style(world).behind
+    hand, to = _hand(world), _place_behind(world)
     off = math.hypot(*(to - hand[:2]))
     height = world.robot.ee.lowest + LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))
-    return _to(world, rise_first(hand, (*to, height)), direction)
+    return _to(world, rise_first(hand, (*to, height)), _way(world)[0])
 
 
 def _near(world: World) -> bool:
-    direction, _ = _way(world)
-    to = world.pose(PUCK).position[:2] - direction * _style(world).behind
-    return math.hypot(*(to - _hand(world)[:2])) < ABOVE / SLOPE
+    return math.hypot(*(_place_behind(world) - _hand(world)[:2])) < ABOVE / SLOPE
 
 
-_RUNGS = (
-    Rung("at_goal", _at_goal, _stay),
-    Rung("push", _pushes, _push),
-    Rung("descend", _near, _around),
-    Rung("approach", lambda w: True, _around),
-)
-
-
-@dataclass(frozen=True)
 class Push:
     """Push a puck to a goal. The goal is flat, and the puck is moved by contact alone."""
 
-    name: str = "push"
-    instruction: str = "Push the puck to the green goal."
-    limits: Limits = Limits(horizon=200)
-    objects: tuple[str, ...] = (PUCK,)
-    grasped: tuple[str, ...] = ()
-    sizes: tuple[float, float] | None = (0.055, 0.07)
-    rungs: tuple[Rung, ...] = _RUNGS
+    name = "push"
+    instruction = "Push the puck to the green goal."
+    limits = Limits(horizon=200)
+    objects = (PUCK,)
+    grasped = ()
+    sizes = (0.055, 0.07)
+    rungs = (
+        Rung("at_goal", _at_goal, _stay),
+        Rung("push", _pushes, _push),
+        Rung("descend", _near, _around),
+        Rung("approach", lambda w: True, _around),
+    )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the puck and the goal."""
@@ -164,30 +158,20 @@ class Push:
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the puck, and a goal some way off such that the hand reaches behind the puck."""
         at, height = draw_resting(rng, world, PUCK, ROOM + 0.02), resting_height(world, PUCK)
-        space = world.scene.robot.workspace
 
         def fits(goal: F64) -> bool:
             way = goal - at
             distance = math.hypot(way[0], way[1])
             return distance > FAR and world.reach.has(goal) and world.reach.has(at - ROOM / distance * way)
 
-        goal = draw_until(
-            lambda: np.append(np.array(space.centre) + rng.uniform(-1, 1, 2) * space.half_width, height),
-            fits, world, "the goal",
-        )  # fmt: skip
+        goal = draw_until(lambda: np.append(draw_xy(rng, world), height), fits, world, "the goal")
         return Start({PUCK: (at, UPRIGHT), GOAL: (np.append(goal[:2], 0.001), UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
         """Return hand, goal and puck, and the vectors between them."""
-        puck, ee, goal = world.pose(PUCK).position, world.ee.position, world.goal
-        way = goal - puck
-        return {
-            **observe_hand(world),
-            "goal": goal,
-            PUCK: puck,
-            "puck_from_ee": puck - ee,
-            "goal_from_puck": way,
-        }
+        puck, goal = world.pose(PUCK).position, world.goal
+        seen = {"goal": goal, PUCK: puck, "puck_from_ee": puck - world.ee.position, "goal_from_puck": goal - puck}
+        return {**observe_hand(world), **seen}
 
     def destination(self, world: World) -> F64:
         """Return the goal, (3,) [m]."""
@@ -199,8 +183,7 @@ class Push:
 
     def progress(self, world: World) -> float:
         """Return progress by the distances left for hand and puck."""
-        direction, distance = _way(world)
         if _at_goal(world) or _pushes(world):
-            return 0.5 + 0.5 * nearness(distance)
-        to = np.append(world.pose(PUCK).position[:2] - direction * _style(world).behind, world.robot.ee.lowest + LOW)
+            return 0.5 + 0.5 * nearness(self.error(world))
+        to = np.append(_place_behind(world), world.robot.ee.lowest + LOW)
         return 0.45 * nearness(math.dist(to, _hand(world)))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
@@ -16,30 +15,24 @@ from manip_il.tasks.ladder import AT_GOAL, CLOSED, nearness
 from manip_il.tasks.objects import CUBE_HALF, add_goal
 from manip_il.tasks.starts import UPRIGHT, draw_goal
 
-F64 = NDArray[np.float64]
-
 
 def _to_goal(world: World) -> Target:
     return Target(world.goal.copy(), hand_down(world.ahead(world.goal)), CLOSED)
 
 
-_RUNGS = (
-    Rung("at_goal", lambda w: math.dist(w.goal, w.ee.position) < AT_GOAL, _to_goal),
-    Rung("carry", lambda w: True, _to_goal),
-)
-
-
-@dataclass(frozen=True)
 class ReachGoal:
     """Bring `ee` to the goal."""
 
-    name: str = "reach"
-    instruction: str = "Move the hand to the green goal."
-    limits: Limits = Limits()
-    objects: tuple[str, ...] = ()
-    grasped: tuple[str, ...] = ()
-    sizes: tuple[float, float] | None = None
-    rungs: tuple[Rung, ...] = _RUNGS
+    name = "reach"
+    instruction = "Move the hand to the green goal."
+    limits = Limits()
+    objects = ()
+    grasped = ()
+    sizes = None
+    rungs = (
+        Rung("at_goal", lambda w: math.dist(w.goal, w.ee.position) < AT_GOAL, _to_goal),
+        Rung("carry", lambda w: True, _to_goal),
+    )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the goal."""

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.robots.rotations import angle_from_down, hand_down
+from manip_il.mdp import F64
+from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
-from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in
-from manip_il.tasks.grasp import grasp_of, lie_of
+from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
+from manip_il.tasks.grasp import grasp_of, lie_of, once_per_state
 from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
 from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, resting_height
-
-F64 = NDArray[np.float64]
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
 BINS = {name: f"{name}_bin" for name in COLOURS}
@@ -46,18 +43,14 @@ SLOPE = 5.0  # slope of the path around other bins: distance from the row per di
 NEAR_WALL, BY_WALL = 0.045, 0.065  # distance from a wall, in a bin and beside it, at which a finger has no room [m]
 NARROW = 0.024  # opening beyond the width of a cube near a bin's wall [m]
 TURNED = 0.3  # angle to such a grasp above which the hand stays over the cube [rad]
-AWAY = 0.2  # height of the hand over the bin once the cube is in it [m]
 _HIGH = 0.04  # clearance of a cube that is carried across a bin's walls [m]
 _WRONG = 0.1  # error for each other cube in a bin [m]
 
 
+@once_per_state
 def asked(world: World) -> str:
     """Return the name of the cube that the instruction names."""
-    return world.remember(ASKED, lambda: _named(round(float(world.pose(ASKED).position[0]))))
-
-
-def _named(number: int) -> str:
-    return list(COLOURS)[min(max(number, 0), len(COLOURS) - 1)]
+    return list(COLOURS)[round(float(world.pose(ASKED).position[0]))]
 
 
 def _is_sorted(world: World, name: str) -> bool:
@@ -112,8 +105,7 @@ def _put_back(world: World) -> Target:
 
 def _free_yaw(world: World) -> float | None:
     """Yaw at which walls leave room for the fingers, modulo half a turn [rad]; None if there is room all around."""
-    name = asked(world)
-    x, y = world.pose(name).position[:2].tolist()
+    x, y = world.pose(asked(world)).position[:2].tolist()
     row = [world.pose(one).position for one in BINS.values()]
     off = abs(y - row[0][1])
     beyond = max(min(float(at[0]) for at in row) - x, x - max(float(at[0]) for at in row)) - PITCH / 2
@@ -122,14 +114,14 @@ def _free_yaw(world: World) -> float | None:
     return 0.0 if beyond > 0.0 or off < INSIDE[1] - NEAR_WALL else math.pi / 2
 
 
-def _approach(world: World) -> Target:
+def _approach(world: World, name: str, hover: float) -> Target:
     """Approach as for any cube, but with the fingers where no wall is in their way."""
-    target, free = approach(world, asked(world), OVER), _free_yaw(world)
+    target, free = approach(world, name, hover), _free_yaw(world)
     if free is None:
         return target
-    ee, g = world.ee, grasp_of(world, asked(world))
-    hand = math.atan2(ee.rotation[1, 0], ee.rotation[0, 0])
-    yaw = min((one for one, _, _, _ in lie_of(world, asked(world)).grasps),
+    ee, g = world.ee, grasp_of(world, name)
+    hand = angle_ahead(ee.rotation)
+    yaw = min((one for one, _, _, _ in lie_of(world, name).grasps),
               key=lambda one: (round(abs(math.sin(one - free)), 6), abs(one - hand)))  # fmt: skip
     low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
     position = np.array([*target.position[:2], max(target.position[2], low)])
@@ -156,34 +148,25 @@ def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) 
     return np.array([x + along, y + across, resting_height(world, name)])
 
 
-def _rise(world: World) -> Target:
-    return Target(world.pose(BINS[asked(world)]).position + [0.0, 0.0, AWAY], hand_down(0.0), world.gripper.most)
+_LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS), OVER_WALL._replace(max_step=STEP))
 
 
-_LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS))
-_GRASP, *_APPROACH = grasp_rungs(asked, OVER)
-_RUNGS = (
-    _LET_GO,
-    Rung("done", lambda w: _is_sorted(w, asked(w)), _rise),
-    replace(_CARRY, target=lambda w: _CARRY.target(w)._replace(max_step=STEP)),
-    Rung("put_back", lambda w: bool(_other_held(w)), _put_back),
-    _GRASP,
-    *(replace(rung, target=_approach) for rung in _APPROACH),
-)
-_LIMITS = Limits(tolerance=0.005, horizon=250)
-
-
-@dataclass(frozen=True)
 class Sort:
     """Put the cube that the instruction names into the bin of its colour, and leave the others on the table."""
 
-    name: str = "sort"
-    instruction: str = "Put the cube that is named into the bin of its colour."
-    limits: Limits = _LIMITS
-    objects: tuple[str, ...] = tuple(COLOURS)
-    grasped: tuple[str, ...] = tuple(COLOURS)
-    sizes: tuple[float, float] | None = (0.03, 0.04)
-    rungs: tuple[Rung, ...] = _RUNGS
+    name = "sort"
+    instruction = "Put the cube that is named into the bin of its colour."
+    limits = Limits(tolerance=0.005, horizon=250)
+    objects = tuple(COLOURS)
+    grasped = tuple(COLOURS)
+    sizes = (0.03, 0.04)
+    rungs = (
+        _LET_GO,
+        Rung("done", lambda w: _is_sorted(w, asked(w)), lambda w: rise_over(w, BINS[asked(w)])),
+        _CARRY,
+        Rung("put_back", lambda w: bool(_other_held(w)), _put_back),
+        *grasp_rungs(asked, OVER, _approach),
+    )
 
     def instruction_in(self, world: World) -> str:
         """Return the sentence of a world's episode."""

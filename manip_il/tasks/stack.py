@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import grasp_of, lie_of
-from manip_il.tasks.ladder import Lift, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go
+from manip_il.tasks.ladder import LiftProfile, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go
 from manip_il.tasks.objects import BLUE, RED, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import draw_resting, draw_until, draw_yaw
 
-F64 = NDArray[np.float64]
-
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
 ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # tolerances on the base: sideways, in height [m]; tilt [rad]
 LEANS_Z, LEANS = 0.008, 0.3  # the same for a cube in a leaning hand: in height [m]; tilt [rad]
-OVER_BASE = Lift(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # carried cube over its place
-PRESS = 0.01  # how far below the base's top the cube is aimed, so that it surely comes down [m]
+OVER_BASE = LiftProfile(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # carried cube over its place
+PRESS = 0.01  # how far below the base's top the cube is aimed, so that it makes contact [m]
 AWAY, AWAY_ENOUGH = 0.06, 0.035  # height of the hand over the stack after release, and at which it is away [m]
 APART = 0.09  # least distance between cubes at the start [m]
 ROOM = 0.05  # reachable margin around each cube at the start [m]
@@ -49,10 +46,6 @@ def _rests(world: World) -> bool:
     return world.robot.leans and math.hypot(x, y) < ON_XY and abs(z) < LEANS_Z and lie_of(world, TOP).tilt < LEANS
 
 
-def _may_let_go(world: World) -> bool:
-    return stands(world) or _rests(world)
-
-
 def _hand_is_away(world: World) -> bool:
     g = grasp_of(world, TOP)
     return bool(world.ee.position[2] > world.pose(TOP).position[2] + g.half + AWAY_ENOUGH)
@@ -66,29 +59,21 @@ def _carry(world: World) -> Target:
     return carry(world, TOP, place_on_base(world) - [0.0, 0.0, PRESS], OVER_BASE)
 
 
-def _is_done(world: World) -> bool:
-    return stands(world) and _hand_is_away(world)
-
-
-_RUNGS = (
-    Rung("done", _is_done, _let_go),
-    Rung("let_go", _may_let_go, _let_go),
-    Rung("carry", lambda w: held(w, TOP), _carry),
-    *grasp_rungs(lambda w: TOP),
-)
-
-
-@dataclass(frozen=True)
 class Stack:
     """Put the red cube on the blue one and let go: it must stand by itself for a second."""
 
-    name: str = "stack"
-    instruction: str = "Stack the red cube on the blue cube."
-    limits: Limits = Limits(success_steps=20, horizon=400)
-    objects: tuple[str, ...] = (TOP, BASE)
-    grasped: tuple[str, ...] = (TOP,)
-    sizes: tuple[float, float] | None = (0.03, 0.07)
-    rungs: tuple[Rung, ...] = _RUNGS
+    name = "stack"
+    instruction = "Stack the red cube on the blue cube."
+    limits = Limits(success_steps=20, horizon=400)
+    objects = (TOP, BASE)
+    grasped = (TOP,)
+    sizes = (0.03, 0.07)
+    rungs = (
+        Rung("done", lambda w: stands(w) and _hand_is_away(w), _let_go),
+        Rung("let_go", lambda w: stands(w) or _rests(w), _let_go),
+        Rung("carry", lambda w: held(w, TOP), _carry),
+        *grasp_rungs(lambda w: TOP),
+    )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the cubes."""

@@ -7,17 +7,16 @@ from collections.abc import Callable, Iterable, Sequence
 import mujoco
 import numpy as np
 from mujoco import mjtGeom
-from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.mdp import F64
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import is_cube
 
-F64 = NDArray[np.float64]
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
 FROM_HAND = 0.1  # least horizontal distance from hand to object, as in gymnasium-robotics' FetchPickAndPlace [m]
-LIFT_HEIGHT = 0.45  # workspace height for the full `LIFT`, which is less in lower ones [m]
 FROM_HAND_SHARE = 0.75  # the same as a share of the workspace's half width, if that is less
+LIFT_HEIGHT = 0.45  # workspace height for the full `LIFT`, which is less in lower ones [m]
 IN_AIR = 0.5  # share of goals above the table, as in FetchPickAndPlace
 LIFT = (0.1, 0.25)  # height of a goal above the object's start [m]
 FEW_DRAWS = 50  # draws of one place before all are drawn again
@@ -35,18 +34,14 @@ def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, 
     """
     lengths = world.extents(name)
     if (hull := world.hull(name)) is not None:
-        turn, upright = np.empty(4), _upright(hull.downs[0])
         at = draw_resting_place(rng, world, name, hull.rest(0).height)
-        mujoco.mju_mulQuat(turn, draw_yaw(rng, np.pi), upright)
-        return at, turn
+        return at, product(draw_yaw(rng, np.pi), _upright(hull.downs[0]))
     if is_cube(world, name):
         return draw_resting(rng, world, name), draw_yaw(rng)
     sides = _sides(world.kind(name), lengths)
     up = sides[int(rng.integers(len(sides)))]
     at = draw_resting_place(rng, world, name, lengths[up] / 2)
-    turn = np.empty(4)
-    mujoco.mju_mulQuat(turn, draw_yaw(rng, np.pi), _UPWARDS[up])
-    return at, turn
+    return at, product(draw_yaw(rng, np.pi), _UPWARDS[up])
 
 
 def _upright(down: F64) -> F64:
@@ -75,7 +70,7 @@ def draw_resting_place(rng: np.random.Generator, world: World, name: str, height
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
     def draw() -> F64:
-        return np.append(_xy(rng, world), height)
+        return np.append(draw_xy(rng, world), height)
 
     def fits(at: F64) -> bool:
         return bool(np.linalg.norm(at[:2] - centre) >= apart) and has_room(world, at, room)
@@ -96,14 +91,25 @@ def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: flo
     """Draw a goal at `height` over the table or, with probability `in_air`, anywhere above that; (3,) [m]."""
     top = world.scene.robot.workspace.height if rng.uniform() < in_air else 0.0
     return draw_until(
-        lambda: np.append(_xy(rng, world), height + rng.uniform(0, top)), world.reach.has, world, "the goal"
+        lambda: np.append(draw_xy(rng, world), height + rng.uniform(0, top)), world.reach.has, world, "the goal"
     )
 
 
 def draw_yaw(rng: np.random.Generator, widest: float = np.pi / 4) -> F64:
     """Draw a turn about the vertical within +-`widest` [rad]: a quaternion, wxyz."""
-    yaw = rng.uniform(-widest, widest)
+    return turn_left(rng.uniform(-widest, widest))
+
+
+def turn_left(yaw: float) -> F64:
+    """Return the quaternion, wxyz (4,), of a turn about the vertical [rad]."""
     return np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+
+
+def product(first: F64, second: F64) -> F64:
+    """Return the product of two quaternions, wxyz (4,)."""
+    turn = np.empty(4)
+    mujoco.mju_mulQuat(turn, first, second)
+    return turn
 
 
 def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: World, what: str) -> F64:
@@ -147,6 +153,7 @@ def resting_height(world: World, name: str) -> float:
     return world.extents(name)[2] / 2
 
 
-def _xy(rng: np.random.Generator, world: World) -> F64:
+def draw_xy(rng: np.random.Generator, world: World) -> F64:
+    """Draw x and y in the workspace, (2,) [m]."""
     space = world.scene.robot.workspace
     return np.array(space.centre) + rng.uniform(-1, 1, 2) * space.half_width

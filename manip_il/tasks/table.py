@@ -1,18 +1,28 @@
-"""The tasks by name."""
+"""Tasks by name: those that ship, a user's Python file, or a name that an installed package provides.
+
+A file runs only if the user gives its path, never because a dataset, a checkpoint or a result names its task.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import importlib.util
+import inspect
+import sys
 from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il import checks
+from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.sim.shape import Shape
 from manip_il.sim.task import TakesArgument, TakesShape, Task
 from manip_il.tasks.carry.task import Carry
 from manip_il.tasks.clear_table import ClearTable
 from manip_il.tasks.drawer import Drawer
 from manip_il.tasks.insert import Insert
-from manip_il.tasks.own import GROUP, SUFFIX, packaged, packaged_task, read_task
 from manip_il.tasks.pick_place import Lift, PickPlace
 from manip_il.tasks.press import Press
 from manip_il.tasks.push import Push
@@ -20,6 +30,12 @@ from manip_il.tasks.reach import ReachGoal
 from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
 
+SUFFIX = ".py"
+GROUP = "manip_il.tasks"  # entry points: a name, and a class that is a task
+_MEMBERS = (
+    *("name", "instruction", "limits", "objects", "grasped", "sizes", "rungs"),
+    *("build", "draw", "observe", "destination", "error", "progress"),
+)
 TASKS: dict[str, Task] = {
     "reach": ReachGoal(),
     "lift": Lift(),
@@ -43,16 +59,16 @@ def get_task(name: str, shape: str = "") -> Task:
     argument or a shape that is invalid or that the task does not take.
     """
     if name.endswith(SUFFIX):
-        task = _of_file(name)
+        task = _of_file(Path(name).absolute())
     else:
         base, colon, argument = name.partition(":")
         task = _named(base)
         if colon:
             if not isinstance(task, TakesArgument):
-                raise UsageError(f"task is {name!r}, but {base} takes no colon; {_who(TakesArgument)} does")
+                raise UsageError(f"task is {name!r}, but only {_who(TakesArgument)} takes an argument after a colon")
             task = task.with_argument(argument)
     if shape and not isinstance(task, TakesShape):
-        raise UsageError(f"object is {shape!r}, but {name} has objects of its own; it is for {_who(TakesShape)}")
+        raise UsageError(f"object is {shape!r}, but the objects of {name} are fixed; only {_who(TakesShape)} take one")
     return _shaped(task, shape) if shape else task
 
 
@@ -64,22 +80,75 @@ def _shaped(task: TakesShape, shape: str) -> Task:
 def is_task(name: str) -> bool:
     """Return whether a task ships or an installed package provides it, without running anything."""
     base = name.partition(":")[0]
-    return base in TASKS or packaged(GROUP, base) is not None
+    return base in TASKS or _entry_point(base) is not None
 
 
-def _of_file(path: str) -> Task:
-    task = read_task(Path(path).absolute())
-    if task.name in TASKS:
-        raise UsageError(f"{path}: its task is called {task.name!r}, as one that ships; choose another name")
-    return task
+def source_hash(task: Task) -> str:
+    """Return the SHA-256 of a task's source file."""
+    return hashlib.sha256(Path(inspect.getfile(type(task))).read_bytes()).hexdigest()
 
 
+@cache
 def _named(name: str) -> Task:
     if name in TASKS:
         return TASKS[name]
-    if (task := packaged_task(name)) is not None:
-        return task
-    raise UnknownName("task", name, TASKS, f"known: {', '.join(sorted(TASKS))}, or the path of a Python file")
+    entry = _entry_point(name)
+    if entry is None:
+        raise UnknownName("task", name, TASKS, f"known: {', '.join(sorted(TASKS))}, or the path of a Python file")
+    try:
+        cls = entry.load()
+    except Exception as error:
+        raise UsageError(f"{name} of {entry.value} cannot be imported: {checks.one_line(error)}") from error
+    return _made(f"task {name} of {entry.value}", cls)
+
+
+def _entry_point(name: str) -> EntryPoint | None:
+    return next(iter(entry_points(group=GROUP, name=name)), None)
+
+
+@cache
+def _of_file(path: Path) -> Task:
+    """Run a file and return its one task."""
+    if not path.is_file():
+        raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
+    module = _run(path)
+    own = [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == module.__name__]
+    tasks = [one for one in own if hasattr(one, "rungs") and not one.__name__.startswith("_")]
+    if len(tasks) != 1:
+        found = ", ".join(one.__name__ for one in tasks) or "none"
+        raise UsageError(f"{path} has the tasks {found}; expected exactly one class with `rungs` (docs/new-task.md)")
+    task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
+    if task.name in TASKS:
+        raise UsageError(f"{path}: its task has a built-in task's name, {task.name!r}; choose another")
+    return task
+
+
+def _run(path: Path) -> ModuleType:
+    name = f"manip_il_own_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise UsageError(f"{path} cannot be read as Python")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look it up there
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        line = getattr(error, "lineno", None) if isinstance(error, SyntaxError) else None
+        place = f", line {line}" if line else ""
+        raise UsageError(f"{path}{place} cannot be run: {type(error).__name__}: {checks.one_line(error)}") from error
+    return module
+
+
+def _made(what: str, cls: Any) -> Task:
+    """The task of a class, checked as far as is possible without a robot."""
+    if lacks := [name for name in _MEMBERS if not hasattr(cls, name)]:
+        raise UsageError(f"{what} lacks {', '.join(lacks)}; docs/new-task.md says what each is for")
+    try:
+        task: Any = cls() if inspect.isclass(cls) else cls
+        checks.name(f"{what}: its name", task.name)
+    except (ManipError, TypeError) as error:
+        raise UsageError(str(error) if what in str(error) else f"{what}: {checks.one_line(error)}") from error
+    return task
 
 
 def _who(protocol: type) -> str:

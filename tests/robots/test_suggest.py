@@ -52,7 +52,7 @@ def test_a_gripper_of_its_own_goes_onto_the_last_body(tmp_path: Path):
 def test_an_arm_without_fingers_is_refused_in_one_line(tmp_path: Path):
     path = tmp_path / "arm.xml"
     path.write_text(ARM.replace("FINGERS", ""))
-    with pytest.raises(UsageError, match=r"arm\.xml.*no jaw by its name.*--gripper=PATH"):
+    with pytest.raises(UsageError, match=r"arm\.xml.*not named like a jaw.*--gripper=PATH"):
         suggest(path)
 
 

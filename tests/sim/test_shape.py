@@ -64,7 +64,7 @@ def test_what_is_wider_than_the_gripper_opens_is_refused_with_both_numbers():
 
 
 def test_a_task_with_objects_of_its_own_takes_no_other():
-    with pytest.raises(UsageError, match=r"'sphere:0[.]04', but stack has objects of its own; it is for lift"):
+    with pytest.raises(UsageError, match=r"'sphere:0[.]04', but the objects of stack are fixed; only lift"):
         make_config(task="stack", object="sphere:0.04")
 
 

@@ -23,7 +23,7 @@ from manip_il.tasks.ladder import (
     AT_GOAL,
     AT_GRASP_ANGLE,
     CLEAR,
-    Lift,
+    LiftProfile,
     carry,
     carry_progress,
     let_go,
@@ -261,15 +261,15 @@ def test_the_fingers_go_down_where_no_neighbour_stands(way: tuple[float, float],
 
 def test_what_has_to_rise_first_does_so_without_moving_sideways():
     world, to = held((0, 0, 0)), np.array([0.3, 0.1, 0.15])
-    low = carry(world, "object", to, Lift(most=0.05, slope=1.0, free=0.01, rise_first=0.03))
+    low = carry(world, "object", to, LiftProfile(most=0.05, slope=1.0, free=0.01, rise_first=0.03))
     np.testing.assert_allclose(low.position - world.ee.position, [0, 0, 0.05])
     np.testing.assert_allclose(carry(world, "object", to).position - world.ee.position, [-0.2, 0, 0.05])
 
 
 @given(st.floats(0, 0.3), st.floats(0, 0.3))
 def test_the_farther_the_higher_an_object_is_carried(one: float, other: float):
-    near, far = (Lift().over(distance) for distance in sorted((one, other)))
-    assert 0 <= near <= far <= Lift().most
+    near, far = (LiftProfile().over(distance) for distance in sorted((one, other)))
+    assert 0 <= near <= far <= LiftProfile().most
 
 
 def test_carrying_is_done_where_the_object_is_to_go_and_nowhere_else():

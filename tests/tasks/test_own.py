@@ -19,7 +19,7 @@ from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
-from manip_il.tasks import own
+from manip_il.tasks import table
 from manip_il.tasks.config import make_config
 from manip_il.tasks.table import get_task
 
@@ -131,8 +131,8 @@ def test_a_package_brings_names(touch, monkeypatch):
         def load(self) -> type:
             return cls
 
-    monkeypatch.setattr(own, "entry_points", lambda group, name: [Entry()] if name == "touch" else [])
-    own.packaged_task.cache_clear()
+    monkeypatch.setattr(table, "entry_points", lambda group, name: [Entry()] if name == "touch" else [])
+    table._named.cache_clear()
     assert get_task("touch").instruction == "Touch the top of the cube."
     with pytest.raises(UnknownName, match="or the path of a Python file"):
         get_task("tuch")

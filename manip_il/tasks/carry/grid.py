@@ -14,13 +14,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.tasks.carry.layout import Layout
 from manip_il.tasks.carry.reward import Reward
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+I64 = NDArray[np.int64]
 CELL = 0.02  # grid spacing, at full scale [m]
 BEYOND = 0.09  # how far the grid extends beyond the workspace's half width, at full scale [m]
 TOP = 0.32  # height of the grid over the table, at full scale [m]
@@ -34,15 +35,6 @@ _QUARTERS = np.array([0.25, 0.5, 0.75])  # shares of a line at which its room an
 _LOOK = 24  # most points of a snapped path, a quarter cell apart, that one edge may replace
 _SLACK = 0.003  # tolerated lack of room on the way from beside a node that has none to spare [m]
 _WORSE = 1e-4  # how much less room than at the start is tolerated on the way out of a tight place [m]
-
-
-def reaches(robot: Robot, points: F64) -> NDArray[np.bool_]:
-    """Return whether a robot's hand reaches points (N, 3) [m], (N,)."""
-    reach = reach_of(robot)
-    index = np.floor((points - reach.origin) / reach.cell).astype(np.int64)
-    last = np.array(reach.arrives.shape) - 1
-    inside = ((index >= 0) & (index <= last)).all(axis=1)
-    return inside & reach.arrives[tuple(index.clip(0, last).T)]
 
 
 class _Links(NamedTuple):
@@ -97,11 +89,11 @@ class Grid:
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
-        """Whether an object may be at each node, (S,): within reach, clear of things, and lifted."""
+        """Whether an object may be at each node, (S,): within reach, clear of obstacles, and lifted."""
         layout, points = self.layout, self.points
         off = np.hypot(*(points[:, :2] - np.array(layout.goal[:2])).T)
         low = (points[:, 2] < layout.half + LIFTED - 1e-9) & (off > DOWN * layout.scale)
-        found = reaches(self._robot, points) & (layout.room(points) >= 0) & ~low
+        found = reach_of(self._robot).has_each(points) & (layout.room(points) >= 0) & ~low
         found[self.goal] |= bool(layout.room(points[[self.goal]])[0] >= 0)
         return found
 
@@ -252,7 +244,7 @@ class Descent:
         shares = np.exp(-(totals + late - (totals + late).min()) / (_STEEP * layout.scale * price))
         shares *= np.clip((radius - off) / self.grid.cell, 0.0, 1.0) + 1e-6
         mean = shares @ ends / shares.sum()
-        if layout.free(position[None], mean[None], spare)[0]:
+        if layout.is_free(position, mean, spare):
             return mean
         return ends[int(np.argmin(totals + late))]
 

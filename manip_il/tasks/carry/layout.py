@@ -6,36 +6,35 @@ a path of points and an edge of the grid have their line integrals.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.tasks.carry.reward import FEATURES
 
-F64 = NDArray[np.float64]
 
-
-class Thing(NamedTuple):
-    """Half lengths along x and y, and height of a thing [m], for an arm whose workspace is 30 cm wide."""
+class Obstacle(NamedTuple):
+    """Half lengths along x and y, and height of an obstacle [m], for an arm whose workspace is 30 cm wide."""
 
     half: tuple[float, float]
     height: float
 
 
-THINGS = {
-    "vase": Thing((0.032, 0.032), 0.13),
-    "laptop": Thing((0.065, 0.048), 0.03),
-    "candle": Thing((0.016, 0.016), 0.11),
+OBSTACLES = {
+    "vase": Obstacle((0.032, 0.032), 0.13),
+    "laptop": Obstacle((0.065, 0.048), 0.03),
+    "candle": Obstacle((0.016, 0.016), 0.11),
 }
-FULL = 0.15  # half width of a workspace in which things have these sizes [m]
-ASIDE, ABOVE = 0.012, 0.012  # clearance between a thing and what is carried past it, beside and over it [m]
+FULL = 0.15  # half width of a workspace in which obstacles have these sizes [m]
+ASIDE, ABOVE = 0.012, 0.012  # clearance between an obstacle and what is carried past it, beside and over it [m]
 HEIGHT = 0.1  # unit of the feature `height` [m]
-OVER = 0.015  # standard deviation of the `above` features beside a thing [m]
-NEAR = 0.08  # standard deviation of the `near` features of things [m]
+OVER = 0.015  # standard deviation of the `above` features beside an obstacle [m]
+NEAR = 0.08  # standard deviation of the `near` features of obstacles [m]
 NEAR_EDGE = 0.05  # standard deviation of `near_edge` [m]
 STEP = 0.005  # longest quadrature step along a path [m]
 
@@ -59,7 +58,7 @@ class Layout:
     """What stands on the table in one episode.
 
     scale: of all lengths, 1 for a workspace of `FULL`. goal: target of the object's centre [m]. places: (x, y) [m] of
-    the things present, by name. edge: None if none is near. half: half the object's height [m]. parts: of object and
+    the obstacles present, by name. edge: None if none is near. half: half the object's height [m]. parts: of object and
     hand, relative to the object's centre.
     """
 
@@ -72,15 +71,15 @@ class Layout:
 
     @cached_property
     def boxes(self) -> tuple[tuple[str, F64, F64, float], ...]:
-        """Name, middle (2,), half lengths (2,) and height of every thing present [m]."""
+        """Name, middle (2,), half lengths (2,) and height of every obstacle present [m]."""
         return tuple(
-            (name, np.array(place), self.scale * np.array(THINGS[name].half), self.scale * THINGS[name].height)
+            (name, np.array(place), self.scale * np.array(OBSTACLES[name].half), self.scale * OBSTACLES[name].height)
             for name, place in self.places
         )
 
     @cached_property
     def meeting(self) -> bool:
-        """Whether two things overlap."""
+        """Whether two obstacles overlap."""
         return any(
             bool((np.abs(middle - other) < half + its).all())
             for (_, middle, half, _), (_, other, its, _) in combinations(self.boxes, 2)
@@ -103,7 +102,7 @@ class Layout:
     def room(self, points: F64) -> F64:
         """Return the clearance to spare for an object carried at points (N, 3), (N,) [m].
 
-        If it is negative, object or hand is nearer to a thing than `ASIDE` or `ABOVE`.
+        If it is negative, object or hand is nearer to an obstacle than `ASIDE` or `ABOVE`.
         """
         found = np.full(len(points), np.inf)
         bottoms, radii = self._parts
@@ -119,16 +118,10 @@ class Layout:
         bottoms, radii = np.array(self.parts).T
         return bottoms, radii
 
-    def free(self, starts: F64, ends: F64, spare: float = 0.0) -> NDArray[np.bool_]:
-        """Return whether straight lines from (N, 3) to (N, 3) [m] keep room to spare, (N,)."""
-        shares = np.linspace(0.0, 1.0, _pieces(starts, ends) + 1)
-        points = starts[:, None] + shares[:, None] * (ends - starts)[:, None]
-        return self.room(points.reshape(-1, 3)).reshape(len(starts), -1).min(axis=1) >= spare
-
-
-def _pieces(starts: F64, ends: F64) -> int:
-    longest = float(np.linalg.norm(ends - starts, axis=1).max(initial=0.0))
-    return max(1, int(np.ceil(longest / (2 * STEP))))
+    def is_free(self, start: F64, end: F64, spare: float) -> bool:
+        """Return whether a straight line from (3,) to (3,) [m] keeps room to spare [m]."""
+        pieces = max(1, math.ceil(np.linalg.norm(end - start) / (2 * STEP)))
+        return bool(self.room(start + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end - start)).min() >= spare)
 
 
 def _beside(points: F64, middle: F64, half: F64) -> F64:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from manip_il import checks
-from manip_il.errors import ManipError, UsageError, nearest, shorten
+from manip_il.errors import ManipError, UnknownName, UsageError, shorten
 
 FEATURES = (
     "length",  # 1
@@ -29,66 +28,51 @@ _LARGEST = 1 << 20  # largest file [bytes]
 class Reward:
     """Weights, in the order of `FEATURES`: the costs of a metre of path.
 
-    Raises `UsageError` for weights that are not finite or below 0, and for a `length` of 0: paths without a cost of
-    length could have any.
+    Raises `UsageError` for weights that are not finite or below 0, and for a `length` of 0: paths could otherwise have
+    any length.
     """
 
     weights: tuple[float, ...]
 
     def __post_init__(self) -> None:
         for name, weight in zip(FEATURES, self.weights, strict=True):
-            if not (math.isfinite(weight) and 0 <= weight <= MOST):
-                raise UsageError(f"weight of {name} is {weight:g}; expected a finite number from 0 to {MOST:g}")
+            if not 0 <= weight <= MOST:
+                raise UsageError(f"weight of {name} is {weight:g}; expected 0 to {MOST:g}")
         if not self.weights[0]:
-            raise UsageError("weight of length is 0; expected more than 0: paths would be of any length")
+            raise UsageError("weight of length is 0; expected more, as paths could otherwise have any length")
 
     @classmethod
-    def of(cls, weights: Mapping[str, object]) -> Reward:
-        """Return the reward of weights by name; missing ones are 0.
-
-        Raises `UsageError` for a name that is no feature, and for a value that is no number.
-        """
+    def of(cls, weights: Mapping[str, float]) -> Reward:
+        """Return the reward of weights by name; missing ones are 0. Raises `UnknownName` for any other name."""
         for name in weights:
             if name not in FEATURES:
-                known = ", ".join(FEATURES)
-                raise UsageError(f"unknown feature {shorten(name)}{nearest(name, FEATURES)}; known: {known}")
-        try:
-            return cls(tuple(checks.number(f"weight of {name}", weights.get(name, 0.0)) for name in FEATURES))
-        except ManipError as error:
-            raise UsageError(str(error)) from None
+                raise UnknownName("feature", name, FEATURES)
+        return cls(tuple(weights.get(name, 0.0) for name in FEATURES))
 
     @classmethod
     def parse(cls, text: str) -> Reward:
         """Return the reward that a text describes: a shipped one's name, a `reward.json`, or `NAME=NUMBER,...`.
 
-        Raises `UsageError` for any other text, and for a file that cannot be read or is no reward.
+        Of a file only the lists `names` and `weights` are read. Raises `UsageError` for anything else.
         """
         if text in TASTES:
             return TASTES[text]
-        if text.endswith(".json"):
-            return cls._read(Path(text))
-        if "=" not in text:
-            known = ", ".join(TASTES)
-            near = nearest(text, TASTES)
-            raise UsageError(f"unknown reward {shorten(text)}{near}; expected {known}, reward.json, or NAME=NUMBER,...")
-        weights = dict[str, object]()
-        for word in text.split(","):
-            name, _, value = (part.strip() for part in word.partition("="))
-            try:
-                weights[name] = float(value)
-            except ValueError:
-                raise UsageError(f"weight of {name} is {shorten(value)}; expected a number") from None
-        return cls.of(weights)
-
-    @classmethod
-    def _read(cls, path: Path) -> Reward:
-        """Read the lists `names` and `weights` of a `reward.json`, and ignore the rest."""
+        if not text.endswith(".json") and "=" not in text:
+            raise UnknownName("reward", text, TASTES, f"expected {', '.join(TASTES)}, reward.json or NAME=NUMBER,...")
+        wanted = "NAME=NUMBER,..."
         try:
-            tree = checks.mapping(str(path), checks.read_json(path, "a reward: names and weights", _LARGEST))
-            names, weights = (checks.array(f"{path}: {key}", tree.get(key)) for key in ("names", "weights"))
-            return cls.of(dict(zip(map(str, names), weights, strict=True)))
-        except (ManipError, ValueError) as error:
-            raise UsageError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+            if text.endswith(".json"):
+                wanted = "names, and a number for each in weights"
+                tree = checks.read_json(Path(text), "a reward: names and weights", _LARGEST)
+                pairs = list(zip(tree["names"], tree["weights"], strict=True))
+            else:
+                pairs = [word.split("=") for word in text.split(",")]
+            weights = {str(name).strip(): float(weight) for name, weight in pairs}
+        except ManipError as error:
+            raise UsageError(str(error)) from None
+        except (LookupError, TypeError, ValueError) as error:
+            raise UsageError(f"reward is {shorten(text)}: {checks.one_line(error)}; expected {wanted}") from None
+        return cls.of(weights)
 
     @property
     def numbers(self) -> str:

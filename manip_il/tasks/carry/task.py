@@ -1,4 +1,4 @@
-"""Carry: move the object to the goal past things on the table, on the cheapest path for a reward.
+"""Carry: move the object to the goal past obstacles on the table, on the cheapest path for a reward.
 
 The path is planned for the object's centre, on a grid over the free space of the episode's layout. The reward's weights
 are part of the state, as positions of invisible mocap bodies, so that a label is a function of the state.
@@ -7,47 +7,54 @@ are part of the state, as positions of invisible mocap bodies, so that a label i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.mdp import F64
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
-from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry.grid import Descent, descent, reaches
-from manip_il.tasks.carry.layout import ABOVE, ASIDE, FULL, THINGS
-from manip_il.tasks.carry.reward import DEFAULT, TASTES, Reward
-from manip_il.tasks.carry.starts import draw_names, draw_things
-from manip_il.tasks.carry.things import (
+from manip_il.sim.world import GOAL, Scene, World
+from manip_il.tasks.carry.grid import Descent, descent
+from manip_il.tasks.carry.layout import ABOVE, ASIDE, FULL, OBSTACLES, Layout
+from manip_il.tasks.carry.obstacles import (
+    EDGE,
+    PARKED,
     TASTE_BODIES,
-    add_things,
+    add_obstacles,
     fits,
     hand_of,
     layout_of,
-    observe_things,
+    make_layout,
+    observe_obstacles,
     reward_in,
     scale_of,
 )
-from manip_il.tasks.grasp import grasp_of
+from manip_il.tasks.carry.reward import DEFAULT, TASTES, Reward
+from manip_il.tasks.grasp import grasp_of, once_per_state
 from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
 from manip_il.tasks.pick_place import OBJECT, PickPlace, observe_cube
-from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying
-
-F64 = NDArray[np.float64]
+from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying, draw_xy, turn_left
 
 NAME = "carry"
 APART = 0.22  # least sideways distance of the goal from the object at the start, at full scale [m]
 HIGHEST = 0.2  # greatest height of a goal over the object's resting height, at full scale [m]
 STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
-OVER, STEEP = 0.012, 8.0  # misalignment up to which an empty hand may be down beside things [m]; slope beyond
-_DRAWS, _TOO_MANY = 4_000, 80  # draws of a start; after every so many, one more thing is left out
+OVER, STEEP = 0.012, 8.0  # misalignment up to which an empty hand may be down beside obstacles [m]; slope beyond
+_DRAWS, _TOO_MANY = 4_000, 80  # draws of a start; after every so many, one more obstacle is left out
 _GRASPED = 0.5  # progress of an object that is held
+SPARE = 0.008  # extra clearance at the start and at the goal [m]
+GAP = 0.02  # least gap between two obstacles, at full scale [m]
+BETWEEN, OFF = 0.8, 0.05  # share of obstacles between start and goal, and their standard deviation from that line [m]
+FROM_EDGE = (0.045, 0.09)  # range of the table edge's distance from the nearer of start and goal [m]
+TRIES = 40  # draws of an obstacle's place before the layout is drawn again
+_SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # sides that the edge may be on: away from the robot, left, right
 
 
 def descent_of(world: World) -> Descent:
@@ -55,9 +62,10 @@ def descent_of(world: World) -> Descent:
     return descent(layout_of(world, OBJECT), reward_in(world), world.scene.robot)
 
 
+@once_per_state
 def _look(world: World) -> tuple[float, F64 | None]:
-    """Cost-to-go at the object's position, and the point to head for; computed once per state."""
-    return world.remember("look", lambda: descent_of(world).look(world.pose(OBJECT).position))
+    """Cost-to-go at the object's position, and the point to head for."""
+    return descent_of(world).look(world.pose(OBJECT).position)
 
 
 def _at_goal(world: World) -> bool:
@@ -70,7 +78,7 @@ def _to_goal(world: World) -> Target:
     at, ee = world.pose(OBJECT).position, world.ee.position
     position = ee + (0.0 if heading is None else heading - at)
     position[2] = max(position[2], world.robot.ee.lowest)
-    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # a turning hand would hit a thing
+    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # a turning hand would hit an obstacle
     yaw = world.hand_yaw if beside else world.ahead(position)
     return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
 
@@ -78,39 +86,32 @@ def _to_goal(world: World) -> Target:
 def _safe_height(world: World) -> float:
     """Height of `ee` over the table at which an open hand clears everything on it [m]."""
     layout = layout_of(world, OBJECT)
-    tallest = max((layout.scale * THINGS[name].height for name, _ in layout.places), default=0.0)
+    tallest = max((layout.scale * OBSTACLES[name].height for name, _ in layout.places), default=0.0)
     return tallest + ABOVE - min(part.bottom for part in layout.parts[1:]) if tallest else 0.0
 
 
 def _rise(world: World) -> float:
-    """Return the height over its grasp at which the hand clears the things around, by its misalignment [m]."""
+    """Return the height over its grasp at which the hand clears the obstacles around, by its misalignment [m]."""
     g = grasp_of(world, OBJECT)
     return min(STEEP * max(0.0, g.off - OVER), max(0.0, _safe_height(world) - g.at[2]))
 
 
-def _approach(world: World) -> Target:
-    """Approach as for any object, but above all things until the hand is over it."""
-    return approach(world, OBJECT, rise=_rise(world))
+def _approach(world: World, name: str, hover: float) -> Target:
+    """Approach as for any object, but above all obstacles until the hand is over it."""
+    return approach(world, name, hover, _rise(world))
 
 
 def _hand_fits(world: World) -> bool:
-    """Whether the hand is clear of the things when it grasps the object."""
+    """Whether the hand is clear of the obstacles when it grasps the object."""
     layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
     if layout.room(world.pose(OBJECT).position[None])[0] >= -ASIDE:
         return True
     return fits(hand_of(world.scene), np.array(g.at), g.yaw, layout)
 
 
-_RUNGS = (
-    Rung("at_goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
-    Rung("carry", lambda w: held(w, OBJECT), _to_goal),
-    *(rung if rung.name == "grasp" else replace(rung, target=_approach) for rung in grasp_rungs(lambda world: OBJECT)),
-)
-
-
 @dataclass(frozen=True)
 class Carry(PickPlace):
-    """Carry the object's centre to the goal past the things on the table, as cheaply as possible for a reward.
+    """Carry the object's centre to the goal past the obstacles on the table, as cheaply as possible for a reward.
 
     reward: the one that starts put into the state, where the expert reads it.
     """
@@ -118,7 +119,11 @@ class Carry(PickPlace):
     name: str = NAME
     instruction: str = "Carry the cube past what stands on the table to the green goal."
     limits: Limits = Limits(horizon=200)
-    rungs: tuple[Rung, ...] = _RUNGS
+    rungs: tuple[Rung, ...] = (
+        Rung("at_goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
+        Rung("carry", lambda w: held(w, OBJECT), _to_goal),
+        *grasp_rungs(lambda w: OBJECT, approach=_approach),
+    )
     scale: float = 1.0
     reward: Reward = TASTES[DEFAULT]
 
@@ -132,45 +137,46 @@ class Carry(PickPlace):
         return replace(self, name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}", reward=reward)
 
     def fitted(self, robot: Robot) -> Self:
-        """Return the task with things scaled to a robot's workspace."""
+        """Return the task with obstacles scaled to a robot's workspace."""
         return replace(self, scale=robot.workspace.half_width / FULL)
 
     def build(self, spec: mujoco.MjSpec) -> None:
-        """Add the object and the goal, the things, and the bodies that hold the reward."""
+        """Add the object and the goal, the obstacles, and the bodies that hold the reward."""
         super().build(spec)
-        add_things(spec, self.scale)
+        add_obstacles(spec, self.scale)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw object and goal, one to four things, mostly between the two, and take the task's reward."""
-        names = draw_names(rng)
+        """Draw object and goal, one to four obstacles, mostly between the two, and take the task's reward."""
+        names = rng.permutation([*OBSTACLES, EDGE]).tolist()
+        names = names[: int(rng.integers(1, len(names) + 1))]
         for tried in range(_DRAWS):
             at, turn = draw_lying(rng, world, OBJECT)
             goal = _draw_goal(rng, world, at)
             if not _has_way(world, at, goal):
                 continue
             fewer = names[: max(1, len(names) - tried // _TOO_MANY)]
-            if things := draw_things(rng, world, fewer, at, goal):
+            if obstacles := _draw_obstacles(rng, world, fewer, at, goal):
                 weights = np.reshape(self.reward.weights, (-1, 3))
                 tastes = {name: (three, UPRIGHT) for name, three in zip(TASTE_BODIES, weights, strict=True)}
-                return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT), **things, **tastes})
+                return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT), **obstacles, **tastes})
         raise UsageError(
             f"task {self.name}: none of {_DRAWS:,} layouts drawn fits within reach of {world.scene.robot.name};"
             " choose another task or robot"
         )
 
     def observe(self, world: World) -> Observed:
-        """Return what `pick_place` observes, and every thing's position and presence, but not the reward."""
-        return {**observe_cube(world, OBJECT), **observe_things(world)}
+        """Return what `pick_place` observes, and every obstacle's position and presence, but not the reward."""
+        return {**observe_cube(world, OBJECT), **observe_obstacles(world)}
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label (no room for the hand, or no path to the goal), or ""."""
         layout, at = layout_of(world, OBJECT), world.pose(OBJECT).position
         if layout.meeting:
-            return "a thing stands in another"
+            return "two obstacles overlap"
         if held(world, OBJECT):
             leads = _at_goal(world) or _look(world)[1] is not None
         elif not _hand_fits(world):
-            return "no room for the hand beside a thing"
+            return "no room for the hand beside an obstacle"
         else:
             leads = descent_of(world).leads(at)
         return "" if leads else "no free path to the goal"
@@ -194,18 +200,80 @@ class Carry(PickPlace):
 
 def _draw_goal(rng: np.random.Generator, world: World, at: F64) -> F64:
     """Draw a goal, half of the time on the table, (3,) [m]."""
-    space = world.scene.robot.workspace
-    x, y = np.array(space.centre) + rng.uniform(-1, 1, 2) * space.half_width
+    x, y = draw_xy(rng, world)
     up = rng.uniform(0, HIGHEST * scale_of(world.scene)) if rng.uniform() < IN_AIR else 0.0
     return np.array([x, y, at[2] + up])
 
 
 def _has_way(world: World, at: F64, goal: F64) -> bool:
-    """Whether a goal is away from the object, and the hand can carry it there over any things."""
+    """Whether a goal is away from the object, and the hand can carry it there over any obstacles."""
     scale = scale_of(world.scene)
     if math.dist(at[:2], goal[:2]) < APART * scale or not world.reach.has(goal):
         return False
-    height = scale * max(thing.height for thing in THINGS.values()) + max(world.extents(OBJECT)) / 2 + 2 * ABOVE
+    height = scale * max(one.height for one in OBSTACLES.values()) + max(world.extents(OBJECT)) / 2 + 2 * ABOVE
     over = [np.array([*one[:2], max(height, goal[2])], np.float64) for one in (at, goal)]
     lines = [np.linspace(start, end, 12) for start, end in ((at, over[0]), (over[0], over[1]), (over[1], goal))]
-    return bool(reaches(world.scene.robot, np.concatenate(lines, dtype=np.float64)).all())
+    return bool(world.reach.has_each(np.concatenate(lines, dtype=np.float64)).all())
+
+
+def _draw_obstacles(
+    rng: np.random.Generator, world: World, here: Sequence[str], at: F64, goal: F64
+) -> dict[str, tuple[F64, F64]]:
+    """Draw the places of the obstacles present, beside an object at (3,) with a goal (3,) [m].
+
+    Return the poses of all obstacles, empty if they do not fit.
+    """
+    scene, lengths = world.scene, world.extents(OBJECT)
+    x, y = scene.robot.workspace.centre
+    parked = np.array([x, y, -PARKED])
+    poses = {name: (parked, UPRIGHT) for name in (*OBSTACLES, EDGE)}
+    edge = _draw_edge(rng, scene, at, goal) if EDGE in here else None
+    if edge is not None:
+        poses[EDGE] = edge[0], turn_left(math.atan2(edge[1][1], edge[1][0]))
+    places: dict[str, F64] = {}
+    for name in (one for one in OBSTACLES if one in here):
+        nearest = x - scene.robot.workspace.half_width + scale_of(scene) * OBSTACLES[name].half[0]  # towards the robot
+        for _ in range(TRIES):
+            place = _draw_place(rng, scene, at, goal)
+            layout = make_layout(scene, lengths, goal, {**places, name: place}, edge)
+            if place[0] > nearest and _leaves_room(layout, hand_of(scene).home, at):
+                places[name], poses[name] = place, (place, UPRIGHT)
+                break
+        else:
+            return {}
+    return poses
+
+
+def _draw_edge(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> tuple[F64, F64]:
+    """Draw a point on the table's edge and the direction away from the table, (3,) each, clear of start and goal."""
+    scale, middle = scale_of(scene), np.array([*scene.robot.workspace.centre, 0.0])
+    outwards = np.array([*_SIDES[rng.integers(len(_SIDES))], 0.0])
+    farthest = max(float((one - middle) @ outwards) for one in (at, goal))
+    return middle + outwards * (max(farthest, 0.0) + scale * rng.uniform(*FROM_EDGE)), outwards
+
+
+def _draw_place(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> F64:
+    """Draw a place on the table, mostly between start and goal, (3,) [m]."""
+    space, scale = scene.robot.workspace, scale_of(scene)
+    if rng.uniform() > BETWEEN:
+        x, y = np.array(space.centre) + rng.uniform(-1.4, 1.4, 2) * space.half_width
+        return np.array([x, y, 0.0])
+    way, share = (goal - at)[:2], rng.uniform(0.25, 0.75)
+    across = np.array([-way[1], way[0]]) / max(np.linalg.norm(way), 1e-9)
+    x, y = at[:2] + share * way + across * rng.normal(0.0, OFF * scale)
+    return np.array([x, y, 0.0])
+
+
+def _leaves_room(layout: Layout, home: F64, at: F64) -> bool:
+    """Whether the last obstacle leaves room at the start, the goal and the hand's home, and to others and the edge."""
+    ends = np.array([at, layout.goal, [*home[:2], max(home[2], layout.half)]])
+    if layout.room(ends).min() < SPARE:
+        return False
+    *others, (name, place) = [(one, np.array(where)) for one, where in layout.places]
+    half = layout.scale * np.array(OBSTACLES[name].half)
+    for other, where in others:
+        apart = np.abs(place - where) - half - layout.scale * np.array(OBSTACLES[other].half)
+        if apart.max() < GAP * layout.scale:
+            return False
+    edge = layout.edge
+    return edge is None or bool((np.array(edge.at) - place) @ np.array(edge.outwards) > half.max())

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NoReturn
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import ManipError
-from manip_il.mdp import State
+from manip_il.mdp import F64, State
 
-F64 = NDArray[np.float64]
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class StockRung(NamedTuple):
+    """A phase: whether it holds in what an expert reads from a state, and its target there."""
+
+    name: str
+    holds: Callable[[Any], bool]
+    target: Callable[[Any], Any]
+
+
+def always(read: object) -> bool:
+    """Return True: the rung holds in every state."""
+    return True
 
 
 class StockBase:

@@ -7,6 +7,7 @@ import io
 from importlib import import_module
 from typing import Any
 
+import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,10 @@ from numpy.typing import NDArray
 # First: it chooses OpenGL before mujoco is imported.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import MismatchError
-from manip_il.mdp import Observation, State
+from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.tasks.stock.base import WHOLE, StockBase
 from manip_il.tasks.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
-
-F64 = NDArray[np.float64]
 
 
 class StockActions(ActionSpace):
@@ -146,5 +145,5 @@ class StockEnv(StockBase):
 def _make(task: StockTask) -> Any:
     """The environment without gymnasium's wrappers: the rollout's horizon is its time limit."""
     with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics announces its versions there
-        module = import_module(f"gymnasium_robotics.envs.fetch.{task.module}")
-    return getattr(module, task.cls)(reward_type="sparse")
+        import_module("gymnasium_robotics")  # which registers its names
+        return gymnasium.make(task.name, reward_type="sparse").unwrapped

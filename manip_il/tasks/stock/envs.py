@@ -25,8 +25,8 @@ def make_stock(
     check_cameras(robot, cameras)
     if changed := [one.name for one in conditions if one.ranges]:
         raise UsageError(
-            f"{robot} is unmodified and takes no {', '.join(changed)}; use --suite=nominal, for manip-il dagger "
-            "--disturbed_share=0"
+            f"{robot} runs unmodified, without {', '.join(changed)}; use --suite=nominal, or --disturbed_share=0 for "
+            "manip-il dagger"
         )
     return AlohaEnv(task, cameras) if robot == ALOHA else StockEnv(task)
 
@@ -40,7 +40,7 @@ def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
     """Raise `UsageError` for cameras that a robot, stock or not, does not have."""
     known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
     if cameras is not None and not known:
-        raise UsageError(f"{robot} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
+        raise UsageError(f"{robot} has no cameras here ({', '.join(cameras.names)}); omit --cameras")
     require_cameras(cameras, known)
 
 

@@ -1,24 +1,20 @@
 """Experts of the stock environments: ladders over gripper, cube and goal, latest rung first.
 
-All are functions of the state alone. An action of 1 moves the gripper by about `REACH` in a control step along each
-axis independently, so that the longest of x, y and z determines how long a move takes.
+A rung reads the environment. Its target is the gripper's displacement, (3,) [m], and the fingers' command, -1 to 1. An
+action of 1 moves the gripper by about `REACH` in a control step along each axis independently, so that the longest of
+x, y and z determines how long a move takes.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.mdp import Label, State
+from manip_il.mdp import F64, Label, State
+from manip_il.tasks.stock.base import StockRung, always
 from manip_il.tasks.stock.environment import StockEnv
 from manip_il.tasks.stock.table import PHASES
-
-F64 = NDArray[np.float64]
 
 REACH = 0.032  # displacement of the gripper in one control step at an action of 1 [m]
 OPEN, CLOSE = 1.0, -1.0
@@ -50,85 +46,64 @@ DOWN = 0.5  # share of a step after which a gripper that descends past the cube 
 LEG = 0.005  # cost of every leg of a path around the cube, added to its length [m]
 
 
-class Scene:
-    """Positions (3,) [m] of gripper, cube and goal in one state, and the opening of the fingers [m]."""
-
-    def __init__(self, env: StockEnv):
-        self.gripper, self.goal, self.opening = env.gripper.copy(), env.goal, env.opening
-        if env.task.has_object:
-            self.cube, self.velocity = env.object.copy(), env.object_velocity
-
-    @cached_property
-    def to_cube(self) -> F64:
-        """Vector from gripper to cube, (3,) [m]."""
-        return self.cube - self.gripper
-
-    @cached_property
-    def to_grasp(self) -> F64:
-        """Vector from gripper to where it grasps the cube, (3,) [m]."""
-        return self.to_cube + [0, 0, GRASP_HEIGHT]
+def _to_cube(env: StockEnv) -> F64:
+    """Vector from gripper to cube, (3,) [m]."""
+    return env.object - env.gripper
 
 
-class Rung(NamedTuple):
-    """A phase, whether it holds, and its command: the gripper's displacement (3,) [m], and the fingers', -1 to 1."""
-
-    name: str
-    holds: Callable[[Scene], bool]
-    command: Callable[[Scene], tuple[F64, float]]
+def _to_grasp(env: StockEnv) -> F64:
+    """Vector from gripper to where it grasps the cube, (3,) [m]."""
+    return _to_cube(env) + [0, 0, GRASP_HEIGHT]
 
 
-def _always(scene: Scene) -> bool:
-    return True
+def _reach(env: StockEnv) -> tuple[F64, float]:
+    return env.goal - env.gripper, CLOSE
 
 
-def _reach(scene: Scene) -> tuple[F64, float]:
-    return scene.goal - scene.gripper, CLOSE
+def _holds(env: StockEnv) -> bool:
+    return bool((np.abs(_to_grasp(env)) < GRASPED).all() and env.opening < HELD)
 
 
-def _holds(scene: Scene) -> bool:
-    return bool((np.abs(scene.to_grasp) < GRASPED).all() and scene.opening < HELD)
+def _carry(env: StockEnv) -> tuple[F64, float]:
+    return env.goal - env.object, CLOSE
 
 
-def _carry(scene: Scene) -> tuple[F64, float]:
-    return scene.goal - scene.cube, CLOSE
-
-
-def _between(scene: Scene) -> bool:
+def _between(env: StockEnv) -> bool:
     """Whether the cube is between the fingers, or will be before they have closed."""
-    wide = scene.opening > 2 * HALF + OPENING * max(0.0, abs(scene.to_grasp[0]) - 0.02)
-    return wide and bool((np.abs(scene.to_grasp) < NEAR).all())
+    wide = env.opening > 2 * HALF + OPENING * max(0.0, abs(_to_grasp(env)[0]) - 0.02)
+    return wide and bool((np.abs(_to_grasp(env)) < NEAR).all())
 
 
-def _grasp(scene: Scene) -> tuple[F64, float]:
+def _grasp(env: StockEnv) -> tuple[F64, float]:
     """Go to the cube, leading towards the goal as it gets nearer, so that a finger takes it along."""
-    way = scene.to_grasp.copy()
+    way = _to_grasp(env)
     share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
-    way[1] += share * np.clip(scene.goal[1] - scene.cube[1], -LEAD, LEAD)
+    way[1] += share * np.clip(env.goal[1] - env.object[1], -LEAD, LEAD)
     return way, CLOSE
 
 
-def _over(scene: Scene) -> tuple[F64, float]:
+def _over(env: StockEnv) -> tuple[F64, float]:
     """Go to the cube, but not below its top before the fingers are on both sides of it."""
-    way = scene.to_grasp.copy()
-    if abs(way[1]) > STRADDLE or scene.opening < 2 * HALF + 0.01:
-        way[2] = max(way[2], scene.to_cube[2] + CLEAR)
+    way = _to_grasp(env)
+    if abs(way[1]) > STRADDLE or env.opening < 2 * HALF + 0.01:
+        way[2] = max(way[2], _to_cube(env)[2] + CLEAR)
     return way, OPEN
 
 
-def _rests_at_goal(scene: Scene) -> bool:
+def _rests_at_goal(env: StockEnv) -> bool:
     """Whether the cube is at the goal, or will slide there by itself."""
-    velocity = scene.velocity[:2]
-    left = (scene.goal - scene.cube)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
+    velocity = env.object_velocity[:2]
+    left = (env.goal - env.object)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
     return bool(np.hypot(*left) < AT_GOAL)
 
 
-def _stay(scene: Scene) -> tuple[F64, float]:
+def _stay(env: StockEnv) -> tuple[F64, float]:
     return np.zeros(3), CLOSE
 
 
-def _direction(scene: Scene) -> F64:
+def _direction(env: StockEnv) -> F64:
     """Direction in which to move the cube, a unit vector in the plane, (2,)."""
-    way = (scene.goal - scene.cube)[:2] - LOOK * scene.velocity[:2]
+    way = (env.goal - env.object)[:2] - LOOK * env.object_velocity[:2]
     return way / max(float(np.hypot(*way)), 1e-6)
 
 
@@ -137,52 +112,52 @@ def _touching(direction: F64) -> float:
     return float(min(BOX / np.maximum(np.abs(direction), 1e-6)))
 
 
-def _is_behind(scene: Scene) -> bool:
-    direction, way = _direction(scene), scene.to_cube[:2]
+def _is_behind(env: StockEnv) -> bool:
+    direction, way = _direction(env), _to_cube(env)[:2]
     along, off = way @ direction, abs(way[0] * direction[1] - way[1] * direction[0])
-    return bool(0 < along < _touching(direction) + ALONG and off < ACROSS and -scene.to_cube[2] < BELOW)
+    return bool(0 < along < _touching(direction) + ALONG and off < ACROSS and -_to_cube(env)[2] < BELOW)
 
 
-def _push(scene: Scene) -> tuple[F64, float]:
+def _push(env: StockEnv) -> tuple[F64, float]:
     """Move at full speed in the cube's direction, and towards the line through cube and goal."""
-    direction = _direction(scene)
+    direction = _direction(env)
     across = np.array([-direction[1], direction[0]])
-    way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (scene.to_cube[:2] @ across)
-    return np.append(way, scene.to_cube[2] + LOW), CLOSE
+    way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (_to_cube(env)[:2] @ across)
+    return np.append(way, _to_cube(env)[2] + LOW), CLOSE
 
 
-def _ends(scene: Scene) -> tuple[F64, F64]:
+def _ends(env: StockEnv) -> tuple[F64, F64]:
     """Positions of the gripper now and behind the cube, both relative to the cube, (2,) [m]."""
-    direction = _direction(scene)
-    return -scene.to_cube[:2], -direction * (_touching(direction) + AHEAD)
+    direction = _direction(env)
+    return -_to_cube(env)[:2], -direction * (_touching(direction) + AHEAD)
 
 
-def _around(scene: Scene) -> tuple[F64, float]:
+def _around(env: StockEnv) -> tuple[F64, float]:
     """Go behind the cube, past its corners, as far as one step goes."""
-    start, end = _ends(scene)
-    return np.append(_walk(start, _path(start, end)), scene.to_cube[2] + LOW), CLOSE
+    start, end = _ends(env)
+    return np.append(_walk(start, _path(start, end)), _to_cube(env)[2] + LOW), CLOSE
 
 
-def _is_better_over(scene: Scene) -> bool:
+def _is_better_over(env: StockEnv) -> bool:
     """Whether the cube is in the way, and the path around it is long or the gripper is high already."""
-    start, end = _ends(scene)
-    height = -scene.to_cube[2]
+    start, end = _ends(env)
+    height = -_to_cube(env)[2]
     if _is_free(start, end) or (_is_inside(start) and height < HIGH - 0.02):
         return False
     around = sum(float(np.abs(two - one).max()) for one, two in itertools.pairwise([start, *_path(start, end)]))
     return height >= HIGH - 0.015 or around - np.abs(end - start).max() >= DETOUR
 
 
-def _over_cube(scene: Scene) -> tuple[F64, float]:
+def _over_cube(env: StockEnv) -> tuple[F64, float]:
     """Go straight over the cube to behind it: rise before crossing it, and descend as soon as it is past."""
-    start, end = _ends(scene)
+    start, end = _ends(env)
     way = _walk(start, [end])
-    if not _is_inside(start) and REACH - scene.to_cube[2] < HIGH:
+    if not _is_inside(start) and REACH - _to_cube(env)[2] < HIGH:
         share = next((one for one in (1, 0.75, 0.5, 0.25) if not _is_inside(start + one * way)), 0)
-        return np.append(share * way, scene.to_cube[2] + HIGH), CLOSE
+        return np.append(share * way, _to_cube(env)[2] + HIGH), CLOSE
     soon = start + DOWN * way
     height = LOW if not _is_inside(soon) and _is_free(soon, end) else HIGH
-    return np.append(way, scene.to_cube[2] + height), CLOSE
+    return np.append(way, _to_cube(env)[2] + height), CLOSE
 
 
 def _is_inside(place: F64) -> bool:
@@ -227,18 +202,18 @@ def _is_free(start: F64, end: F64) -> bool:
     return bool(enters >= leaves or leaves <= 0 or enters >= 1)
 
 
-LADDERS: dict[str, tuple[Rung, ...]] = {
-    "FetchReach-v4": (Rung("approach", _always, _reach),),
+LADDERS: dict[str, tuple[StockRung, ...]] = {
+    "FetchReach-v4": (StockRung("approach", always, _reach),),
     "FetchPush-v4": (
-        Rung("hold", _rests_at_goal, _stay),
-        Rung("push", _is_behind, _push),
-        Rung("approach", _is_better_over, _over_cube),
-        Rung("approach", _always, _around),
+        StockRung("hold", _rests_at_goal, _stay),
+        StockRung("push", _is_behind, _push),
+        StockRung("approach", _is_better_over, _over_cube),
+        StockRung("approach", always, _around),
     ),
     "FetchPickAndPlace-v4": (
-        Rung("carry", _holds, _carry),
-        Rung("grasp", _between, _grasp),
-        Rung("approach", _always, _over),
+        StockRung("carry", _holds, _carry),
+        StockRung("grasp", _between, _grasp),
+        StockRung("approach", always, _over),
     ),
 }
 
@@ -253,7 +228,6 @@ class StockExpert:
     def label(self, state: State, world: object | None = None) -> Label:
         """Return the expert's action in `state`, (4,). Raises `MismatchError` for another task's state."""
         self._env.set_state(state)
-        scene = Scene(self._env)
-        rung = next(rung for rung in self._ladder if rung.holds(scene))
-        way, fingers = rung.command(scene)
+        rung = next(rung for rung in self._ladder if rung.holds(self._env))
+        way, fingers = rung.target(self._env)
         return Label(np.append(np.clip(way / REACH, -1, 1), fingers), PHASES.index(rung.name), True, 0.0)

@@ -19,15 +19,10 @@ PHASES = ("none", "approach", "grasp", "carry", "push", "hold")
 
 @dataclass(frozen=True)
 class StockTask:
-    """One environment. has_object: the goal is a cube's, not the gripper's; blocked: the fingers stay closed.
-
-    module, cls: the class in gymnasium-robotics.
-    """
+    """One environment. has_object: the goal is a cube's, not the gripper's; blocked: the fingers stay closed."""
 
     name: str
     instruction: str
-    module: str
-    cls: str
     has_object: bool = True
     blocked: bool = True
     phases: tuple[str, ...] = PHASES
@@ -52,20 +47,10 @@ def _vectors(*names: str) -> tuple[str, ...]:
 
 
 STOCK: dict[str, StockTask] = {
-    "FetchReach-v4": StockTask(
-        "FetchReach-v4", "Move the gripper to the goal", "reach", "MujocoFetchReachEnv", has_object=False
-    ),
-    "FetchPush-v4": StockTask("FetchPush-v4", "Push the cube to the goal", "push", "MujocoFetchPushEnv"),
-    "FetchPickAndPlace-v4": StockTask(
-        "FetchPickAndPlace-v4",
-        "Bring the cube to the goal",
-        "pick_and_place",
-        "MujocoFetchPickAndPlaceEnv",
-        blocked=False,
-    ),
+    "FetchReach-v4": StockTask("FetchReach-v4", "Move the gripper to the goal", has_object=False),
+    "FetchPush-v4": StockTask("FetchPush-v4", "Push the cube to the goal"),
+    "FetchPickAndPlace-v4": StockTask("FetchPickAndPlace-v4", "Bring the cube to the goal", blocked=False),
 }
-
-
 ALOHA = "aloha"
 TWO_ARMS = "joint position targets [rad], gripper command [0 to 1], of two arms"
 SIDES = ("left", "right")
@@ -87,7 +72,7 @@ class Held:
 
 @dataclass(frozen=True)
 class AlohaTask:
-    """One task of `gym_aloha`. own: its name there. module: its ladders'. grasped: the hand that takes each object.
+    """One task of `gym_aloha`. own: its name there. grasped: the hand that takes each object.
 
     inserted: an object and the one that it goes into.
     """
@@ -95,7 +80,6 @@ class AlohaTask:
     name: str
     instruction: str
     own: str
-    module: str
     objects: Mapping[str, Held]
     grasped: Mapping[str, str]
     rungs: Mapping[str, tuple[str, ...]]
@@ -127,7 +111,6 @@ ALOHA_TASKS: dict[str, AlohaTask] = {
         "AlohaTransferCube-v0",
         "Pick up the cube with the right arm and transfer it to the left arm.",
         "transfer_cube",
-        "transfer",
         {"box": Held(0.027, 0.017)},
         {"box": "right"},
         {"left": ("wait", "come", "close", "hold"), "right": ("approach", "grasp", "carry", "release")},
@@ -135,7 +118,6 @@ ALOHA_TASKS: dict[str, AlohaTask] = {
     "AlohaInsertion-v0": AlohaTask(
         "AlohaInsertion-v0",
         "Insert the peg into the socket.",
-        "insertion",
         "insertion",
         {"peg": Held(0.018, 0.0075, long=True), "socket": Held(0.026, 0.019, long=True)},
         {"peg": "right", "socket": "left"},

@@ -1,4 +1,4 @@
-"""The grid of `carry`: costs are those of paths, paths keep off things, their features are line integrals."""
+"""The grid of `carry`: costs are those of paths, paths keep off obstacles, their features are line integrals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from manip_il.rewards.paths import cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
-from manip_il.tasks.carry.grid import Grid, descent, reaches
+from manip_il.tasks.carry.grid import Grid, descent
 from manip_il.tasks.carry.layout import Edge, Layout, Part, path_features
 from manip_il.tasks.carry.reward import FEATURES, TASTES, Reward
 
@@ -84,7 +84,7 @@ def test_a_heavier_weight_keeps_planned_paths_no_nearer(name: str):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_the_descent_leads_to_the_goal_past_all_things(seed: int):
+def test_the_descent_leads_to_the_goal_past_all_obstacles(seed: int):
     down, rng = descent(LAYOUT, CAREFUL, ROBOT), np.random.default_rng(seed)
     position = grid().points[rng.choice(np.flatnonzero(grid().free))] + rng.uniform(-0.01, 0.01, 3)
     cost, heading = down.look(position)
@@ -120,5 +120,5 @@ def test_the_grid_takes_the_map_of_where_the_hand_gets_to(robot: str):
         1,
         0.5,
     ]
-    assert reaches(arm, points).tolist() == [reach.has(point) for point in points]
-    assert 0 < reaches(arm, points).sum() < len(points)
+    assert reach.has_each(points).tolist() == [reach.has(point) for point in points]
+    assert 0 < reach.has_each(points).sum() < len(points)

@@ -9,10 +9,10 @@ from manip_il.collect.expert import Expert
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry.layout import THINGS, path_features
+from manip_il.tasks.carry.layout import OBSTACLES, path_features
+from manip_il.tasks.carry.obstacles import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
 from manip_il.tasks.carry.reward import TASTES
 from manip_il.tasks.carry.task import OBJECT, descent_of
-from manip_il.tasks.carry.things import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
 from manip_il.tasks.envs import make_env
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
@@ -25,8 +25,8 @@ PHASES = phases(TASKS["carry"])
 
 
 def touched(env: ManipEnv) -> set[str]:
-    """The things that something touches."""
-    geoms = {env.scene.model.geom(name).id: name for name in THINGS}
+    """The obstacles that something touches."""
+    geoms = {env.scene.model.geom(name).id: name for name in OBSTACLES}
     return {geoms[geom] for geom in env.data.contact.geom.ravel().tolist() if geom in geoms}
 
 
@@ -96,11 +96,11 @@ def test_neighbouring_positions_head_alike():
 
 
 @every_robot
-def test_one_to_four_things_stand_where_they_leave_room(robot: str):
+def test_one_to_four_obstacles_stand_where_they_leave_room(robot: str):
     env, counts = make_env(robot, "carry"), []
     for seed in range(SEED, SEED + 40):
         env.start(seed)
-        there = [name for name in (*THINGS, EDGE) if is_there(env.world, name)]
+        there = [name for name in (*OBSTACLES, EDGE) if is_there(env.world, name)]
         counts.append(len(there))
         layout = layout_of(env.world, OBJECT)
         assert not layout.meeting
@@ -138,19 +138,22 @@ def test_without_a_free_path_or_room_a_label_is_none_and_says_why():
     place(env.world, GOAL, env.world.goal)
     place(env.world, "vase", env.world.goal)
     label = expert.label(env.get_state())
-    assert (label.valid, label.reason) in {(False, "no free path to the goal"), (False, "a thing stands in another")}
+    assert (label.valid, label.reason) in {
+        (False, "no free path to the goal"),
+        (False, "two obstacles overlap"),
+    }
     env.set_state(state)
-    for name in THINGS:
+    for name in OBSTACLES:
         env.world.place(name, np.array([0.45, 0.0, -0.25]), UPRIGHT)
     place(env.world, "vase", env.world.pose(OBJECT).position + [0.06, 0.06, 0.0])
-    assert expert.label(env.get_state()).reason == "no room for the hand beside a thing"
+    assert expert.label(env.get_state()).reason == "no room for the hand beside an obstacle"
     place(env.world, "candle", env.world.pose("vase").position)
-    assert expert.label(env.get_state()).reason == "a thing stands in another"
+    assert expert.label(env.get_state()).reason == "two obstacles overlap"
 
 
-def test_an_object_beside_a_low_thing_is_grasped_where_the_hand_fits():
+def test_an_object_beside_a_low_obstacle_is_grasped_where_the_hand_fits():
     env = started("panda", "carry")
-    for name in (*THINGS, EDGE):
+    for name in (*OBSTACLES, EDGE):
         env.world.place(name, np.array([0.45, 0.0, -0.25]), UPRIGHT)
     env.world.place(GOAL, np.array([0.45, 0.1, 0.15]), UPRIGHT)
     env.world.place(OBJECT, np.array([0.45, -0.1, 0.025]), UPRIGHT)

@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 # First: it chooses OpenGL before mujoco is imported.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import ManipError, MismatchError, RenderError
-from manip_il.mdp import Observation, State
+from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import REMEDY
-from manip_il.tasks.stock.aloha.ladder import Scene
+from manip_il.tasks.stock.aloha.ladder import AlohaScene
 from manip_il.tasks.stock.base import WHOLE, StockBase
 from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
 
-F64 = NDArray[np.float64]
 INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
 MOST_REWARD = 4
 GRIPPERS = np.array([6, 13])
@@ -75,7 +74,7 @@ class AlohaEnv(StockBase):
         """Reward of the state as a share of the environment's highest."""
         return float(self._env._env.task.get_reward(self.physics)) / MOST_REWARD
 
-    def scene(self, kind: type[Scene] = Scene) -> Scene:
+    def scene(self, kind: type[AlohaScene] = AlohaScene) -> AlohaScene:
         """Return the scene read from the state."""
         return kind(self.task, self.model, self.data)
 
@@ -138,7 +137,7 @@ class AlohaEnv(StockBase):
         try:
             return {name: painter.draw(height=height, width=width, camera_id=name) for name in self._cameras.names}
         except Exception as error:  # what OpenGL and its bindings raise
-            raise RenderError(f"{ALOHA} cannot be drawn ({error}); {REMEDY}") from error
+            raise RenderError(f"{ALOHA} cannot be rendered ({error}); {REMEDY}") from error
 
 
 @cache

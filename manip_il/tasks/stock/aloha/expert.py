@@ -7,16 +7,15 @@ from importlib import import_module
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.mdp import Label, State
+from manip_il.mdp import F64, Label, State
 from manip_il.robots.ik import PoseProgram
 from manip_il.robots.rotations import turned_towards
+from manip_il.tasks.stock.aloha import insertion, transfer
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
-from manip_il.tasks.stock.aloha.ladder import Hand, Scene, Target
+from manip_il.tasks.stock.aloha.ladder import AlohaScene, Hand, HandTarget
+from manip_il.tasks.stock.base import StockRung
 from manip_il.tasks.stock.table import SIDES
-
-F64 = NDArray[np.float64]
 
 ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
 ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # cost of forearm roll at a straight wrist; its width, wrist up and down [rad]
@@ -28,14 +27,18 @@ CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
 
 
+LADDERS: dict[str, tuple[type[AlohaScene], dict[str, tuple[StockRung, ...]]]] = {
+    "AlohaTransferCube-v0": (transfer.Transfer, transfer.RUNGS),
+    "AlohaInsertion-v0": (insertion.Insertion, insertion.RUNGS),
+}
+
+
 class AlohaExpert:
     """Labels any state of one task. The same state gives bit-equal labels in any order and process."""
 
     def __init__(self, task: str):
         self._env = AlohaEnv(task)
-        module = import_module(f"manip_il.tasks.stock.aloha.{self._env.task.module}")
-        self._kind: type[Scene] = module.KIND
-        self._rungs = module.RUNGS
+        self._kind, self._rungs = LADDERS[task]
         self._pairs = {pair: number for number, pair in enumerate(self._env.task.phases)}
         self._arms = {side: _Arm(self._env, number, side) for number, side in enumerate(SIDES)}
 
@@ -57,7 +60,7 @@ class AlohaExpert:
         phase = self._pairs[", ".join(rung.name for rung in rungs.values())]
         return Label(np.clip(action, env.actions.low, env.actions.high), phase, True, 0.0)
 
-    def _unsound(self, scene: Scene) -> str:
+    def _unsound(self, scene: AlohaScene) -> str:
         if scene.arms_touch:
             return "the arms touch"
         for name, side in scene.task.grasped.items():
@@ -90,7 +93,7 @@ class _Arm:
         softness = self._gain * model.dof_invweight0[joints] * (0.1 / 0.9) * (CREEPS * constants.DT) / 2 * constants.DT
         self._creep = 1 - np.exp(-softness)  # step per lead [rad/rad]
 
-    def command(self, hand: Hand, target: Target) -> F64 | None:
+    def command(self, hand: Hand, target: HandTarget) -> F64 | None:
         """Return joint targets (6,) [rad] one step towards a target; None if there is no solution."""
         way = target.position - hand.position
         length = float(np.linalg.norm(way))

@@ -6,15 +6,14 @@ import math
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_between
 from manip_il.tasks.stock.aloha.ladder import (
     ARM,
     PITCH,
-    Rung,
-    Scene,
-    Target,
+    AlohaScene,
+    HandTarget,
     Thing,
     Z,
     cross,
@@ -22,8 +21,7 @@ from manip_il.tasks.stock.aloha.ladder import (
     pitched,
     take_rungs,
 )
-
-F64 = NDArray[np.float64]
+from manip_il.tasks.stock.base import StockRung
 
 PEG, SOCKET = "peg", "socket"
 OF = {"left": SOCKET, "right": PEG}
@@ -38,7 +36,7 @@ INSERTED = 0.03  # longest step of a joint with the peg before the socket [rad]
 CARRIED = 0.04  # and before that [rad]
 
 
-class Insertion(Scene):
+class Insertion(AlohaScene):
     """A state of the peg's insertion."""
 
     @cached_property
@@ -82,15 +80,15 @@ def _lifted_to(thing: Thing, to: F64) -> F64:
     return np.array([thing.position[0] + way[0], thing.position[1] + way[1], to[2]])
 
 
-def _carry(side: str, to: F64) -> Rung:
-    def target(scene: Insertion) -> Target:
+def _carry(side: str, to: F64) -> StockRung:
+    def target(scene: Insertion) -> HandTarget:
         place = _lifted_to(scene.things[OF[side]], to)
         return move_object(scene, side, OF[side], place, np.eye(3), CARRIED)
 
-    return Rung("carry", lambda scene: scene.has[side], target)
+    return StockRung("carry", lambda scene: scene.has[side], target)
 
 
-def _insert(scene: Insertion) -> Target:
+def _insert(scene: Insertion) -> HandTarget:
     socket = scene.things[SOCKET]
     frame = socket.frame
     return move_object(scene, "right", PEG, socket.position + scene.depth * frame[:, 0], frame, INSERTED)
@@ -99,11 +97,9 @@ def _insert(scene: Insertion) -> Target:
 RUNGS = {
     "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
-        Rung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
-        Rung("align", lambda one: one.has["right"] and one.ready, _insert),
+        StockRung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
+        StockRung("align", lambda one: one.has["right"] and one.ready, _insert),
         _carry("right", MEETING + WAITING),
         *take_rungs("right", PEG, lambda one: one.grasps["right"]),
     ),
 }
-
-KIND = Insertion

@@ -12,10 +12,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_between, turned_towards
+from manip_il.tasks.stock.base import StockRung, always
 from manip_il.tasks.stock.table import SIDES, AlohaTask, Held
-
-F64 = NDArray[np.float64]
 
 FINGER_AT_TOUCH = 0.0224  # finger joint position at which the two would touch [m]
 GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
@@ -79,7 +79,7 @@ class Thing:
         return np.stack([ahead, cross(up, ahead), up], axis=1)
 
 
-class Scene:
+class AlohaScene:
     """One state. A task's own scene adds the facts that its rungs need."""
 
     def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
@@ -185,8 +185,8 @@ def _within(off: F64, box: tuple[float, float, float]) -> bool:
     return abs(off[0] - GRASP_AHEAD) < box[0] and abs(off[1]) < box[1] and abs(off[2]) < box[2]
 
 
-class Target(NamedTuple):
-    """Target pose of a hand, (3,) [m] and (3, 3), its gripper's command, and the longest step of a joint [rad]."""
+class HandTarget(NamedTuple):
+    """HandTarget pose of a hand, (3,) [m] and (3, 3), its gripper's command, and the longest step of a joint [rad]."""
 
     position: F64
     rotation: F64
@@ -194,25 +194,14 @@ class Target(NamedTuple):
     longest: float = FAST
 
 
-class Rung(NamedTuple):
-    """A phase of one hand: whether it holds in a task's scene, and its target there."""
-
-    name: str
-    holds: Callable[[Any], bool]
-    target: Callable[[Any], Target]
-
-
-def always(scene: Scene) -> bool:
-    """Return True: the rung holds in every state."""
-    return True
-
-
-def close_on(scene: Scene, name: str, rotation: F64, longest: float = FAST) -> Target:
+def close_on(scene: AlohaScene, name: str, rotation: F64, longest: float = FAST) -> HandTarget:
     """Close the fingers at the object, in a grasp's rotation (3, 3)."""
-    return Target(scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest)
+    return HandTarget(scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest)
 
 
-def approach(scene: Scene, side: str, name: str, rotation: F64, back: float = 0.0, longest: float = FAST) -> Target:
+def approach(
+    scene: AlohaScene, side: str, name: str, rotation: F64, back: float = 0.0, longest: float = FAST
+) -> HandTarget:
     """Approach an object with open fingers, in a funnel along the grasp's axis.
 
     rotation: the grasp's, (3, 3). back: least distance to keep from it [m].
@@ -226,19 +215,21 @@ def approach(scene: Scene, side: str, name: str, rotation: F64, back: float = 0.
     left = off[0] - GRASP_AHEAD
     share = min(1.0, max(0.0, 1.0 - (away - left) / BACK_FIRST))
     way = rotation @ np.array([left - away, share * off[1], share * off[2]])
-    return Target(hand.position + way, rotation, OPEN, longest)
+    return HandTarget(hand.position + way, rotation, OPEN, longest)
 
 
-def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[Rung, Rung]:
+def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[StockRung, StockRung]:
     """Return the rungs of a hand that takes an object from the table. grasp: its rotation in a scene, (3, 3)."""
     return (
-        Rung("grasp", lambda one: one.is_at_grasp(side, name, grasp(one)), lambda one: close_on(one, name, grasp(one))),
-        Rung("approach", always, lambda one: approach(one, side, name, grasp(one))),
+        StockRung(
+            "grasp", lambda one: one.is_at_grasp(side, name, grasp(one)), lambda one: close_on(one, name, grasp(one))
+        ),
+        StockRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
     )
 
 
-def move_object(scene: Scene, side: str, name: str, to: F64, frame: F64, longest: float) -> Target:
+def move_object(scene: AlohaScene, side: str, name: str, to: F64, frame: F64, longest: float) -> HandTarget:
     """Bring a held object to a place (3,) [m] and its `frame` to axes (3, 3)."""
     hand, thing = scene.hands[side], scene.things[name]
     turn = turned_towards(np.eye(3), frame @ thing.frame.T, MOST_TURN)
-    return Target(to + turn @ (hand.position - thing.position), turn @ hand.rotation, CLOSED, longest)
+    return HandTarget(to + turn @ (hand.position - thing.position), turn @ hand.rotation, CLOSED, longest)

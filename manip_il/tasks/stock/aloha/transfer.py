@@ -5,29 +5,26 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.tasks.stock.aloha.ladder import (
     CLOSED,
     FAST,
     LIFTED,
     OPEN,
     PITCH,
-    Rung,
-    Scene,
-    Target,
+    AlohaScene,
+    HandTarget,
     X,
     Z,
     ahead_across,
-    always,
     approach,
     close_on,
     nearest,
     pitched,
     take_rungs,
 )
-
-F64 = NDArray[np.float64]
+from manip_il.tasks.stock.base import StockRung, always
 
 CUBE = "box"
 MEETING = np.array([0.0, 0.5, 0.25])  # position of the cube for the handover [m]
@@ -40,7 +37,7 @@ CLEAR = 0.12  # final distance of the right hand from the cube [m]
 CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest joint steps [rad]
 
 
-class Transfer(Scene):
+class Transfer(AlohaScene):
     """A state of the cube's transfer."""
 
     @cached_property
@@ -90,17 +87,17 @@ def _is_handed(scene: Transfer) -> bool:
     return scene.left_holds and scene.left.gap < LEFT_CLOSED
 
 
-def _let_go(scene: Transfer) -> Target:
+def _let_go(scene: Transfer) -> HandTarget:
     """Open, then back off."""
     hand = scene.right
     share = max(0.0, min(1.0, (hand.gap - OPENED) / OPENING))
     way = max(0.0, CLEAR - abs(hand.sees(scene.cube)[0]))
-    return Target(hand.position - share * way * hand.rotation[:, 0], hand.rotation, OPEN, PARTING)
+    return HandTarget(hand.position - share * way * hand.rotation[:, 0], hand.rotation, OPEN, PARTING)
 
 
-def _carry(scene: Transfer) -> Target:
+def _carry(scene: Transfer) -> HandTarget:
     hand = scene.right
-    return Target(hand.position + MEETING - scene.cube, pitched(hand.outward, PITCH), CLOSED, CARRIED)
+    return HandTarget(hand.position + MEETING - scene.cube, pitched(hand.outward, PITCH), CLOSED, CARRIED)
 
 
 def _left_may_close(scene: Transfer) -> bool:
@@ -111,27 +108,27 @@ def _is_brought(scene: Transfer) -> bool:
     return scene.right_holds and scene.lifted and scene.to_go < NEAR
 
 
-def _come(scene: Transfer) -> Target:
+def _come(scene: Transfer) -> HandTarget:
     back = min(KEPT_OFF, 2 * max(0.0, scene.to_go - ARRIVED))
     return approach(scene, "left", CUBE, scene.left_grasp, back, HANDED)
 
 
-def _wait(scene: Transfer) -> Target:
-    return Target(MEETING + WAITING, ahead_across(X, Z), OPEN, FAST)
+def _wait(scene: Transfer) -> HandTarget:
+    return HandTarget(MEETING + WAITING, ahead_across(X, Z), OPEN, FAST)
 
 
 RUNGS = {
     "left": (
-        Rung("hold", lambda one: one.left_holds, lambda one: Target(one.left.position, one.left.rotation, CLOSED)),
-        Rung("close", _left_may_close, lambda one: close_on(one, CUBE, one.left_grasp, CARRIED)),
-        Rung("come", _is_brought, _come),
-        Rung("wait", always, _wait),
+        StockRung(
+            "hold", lambda one: one.left_holds, lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED)
+        ),
+        StockRung("close", _left_may_close, lambda one: close_on(one, CUBE, one.left_grasp, CARRIED)),
+        StockRung("come", _is_brought, _come),
+        StockRung("wait", always, _wait),
     ),
     "right": (
-        Rung("release", _is_handed, _let_go),
-        Rung("carry", lambda one: one.right_holds, _carry),
+        StockRung("release", _is_handed, _let_go),
+        StockRung("carry", lambda one: one.right_holds, _carry),
         *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
 }
-
-KIND = Transfer

@@ -1,4 +1,4 @@
-"""Bodies of `carry`'s things, a world's layout and reward, and the parts of a hand that may hit a thing."""
+"""Bodies of `carry`'s obstacles, a world's layout and reward, and the parts of a hand that may hit an obstacle."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from manip_il.errors import MismatchError
+from manip_il.mdp import F64
 from manip_il.robots.geometry import outline
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.carry.layout import FULL, THINGS, Edge, Layout, Part
+from manip_il.tasks.carry.layout import FULL, OBSTACLES, Edge, Layout, Part
 from manip_il.tasks.carry.reward import DEFAULT, FEATURES, TASTES, Reward
+from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.objects import add_furniture, add_part
 
-F64 = NDArray[np.float64]
 Pose = tuple[F64, F64]  # position (3,) [m], quaternion wxyz (4,)
 
 EDGE = "edge"  # the mocap body of the table's edge; its x points away from the table
 TASTE_BODIES = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights
 LEANING = 0.01  # extra radius of a leaning hand [m]
 _ALIKE = 0.005  # difference of radii up to which parts count as one [m]
-_BARELY = 0.004  # clearance of a grasping hand from a thing beside it [m]
-PARKED = 0.25  # depth of absent things below the table's top [m]
+_BARELY = 0.004  # clearance of a grasping hand from an obstacle beside it [m]
+PARKED = 0.25  # depth of absent obstacles below the table's top [m]
 _PLATE = (0.15, 0.36, 0.0005)  # half lengths of the visual plate beyond the edge [m]
 _DARK, _LID, _KEYS = (0.16, 0.17, 0.20), (0.62, 0.64, 0.68), (0.20, 0.21, 0.24)
 _CLAY, _WAX, _FLAME = (0.20, 0.45, 0.52), (0.96, 0.93, 0.84), (1.0, 0.62, 0.15)
-_LOOKS = {  # visual geoms: kind, half size and middle in shares of the thing's box, colour
+_LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle's box, colour
     "vase": (
         ("CYLINDER", (0.60, 0.05), 0.05, _CLAY),
         ("ELLIPSOID", (1.0, 0.36), 0.42, _CLAY),
@@ -42,12 +41,12 @@ _LOOKS = {  # visual geoms: kind, half size and middle in shares of the thing's 
 }
 
 
-def add_things(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add every thing with its box for contacts, the table's edge, and the bodies that hold the reward."""
-    for name, thing in THINGS.items():
+def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
+    """Add every obstacle with its box for contacts, the table's edge, and the bodies that hold the reward."""
+    for name, obstacle in OBSTACLES.items():
         body = add_furniture(spec, name)
         body.pos = [0.5, 0, -PARKED]
-        half = scale * np.array([*thing.half, thing.height / 2])
+        half = scale * np.array([*obstacle.half, obstacle.height / 2])
         add_part(body, name, half.tolist(), (0, 0, half[2]), _LID)
         body.first_geom().rgba = [0, 0, 0, 0]  # its visual geoms lie within
         for kind, (wide, tall), middle, colour in _LOOKS[name]:
@@ -74,31 +73,25 @@ def _add_look(body: object, kind: str, size: F64, up: float, colour: Sequence[fl
 
 
 def scale_of(scene: Scene) -> float:
-    """Return the scale of the things for an arm: its workspace's half width over `FULL`."""
+    """Return the scale of the obstacles for an arm: its workspace's half width over `FULL`."""
     return scene.robot.workspace.half_width / FULL
 
 
+@once_per_state
 def reward_in(world: World) -> Reward:
     """Return the reward of an episode."""
-    return world.remember("reward", lambda: _reward(world))
-
-
-def _reward(world: World) -> Reward:
     return Reward(tuple(number for name in TASTE_BODIES for number in world.pose(name).position.tolist()))
 
 
 def is_there(world: World, name: str) -> bool:
-    """Return whether a thing, or the table's edge, is part of an episode."""
+    """Return whether an obstacle, or the table's edge, is part of an episode."""
     return bool(world.pose(name).position[2] > -PARKED / 2)
 
 
+@once_per_state
 def layout_of(world: World, name: str) -> Layout:
-    """Return the layout of an episode in which an object is carried to the goal; computed once per state."""
-    return world.remember(("layout", name), lambda: _layout(world, name))
-
-
-def _layout(world: World, name: str) -> Layout:
-    places = {thing: world.pose(thing).position for thing in THINGS if is_there(world, thing)}
+    """Return the layout of an episode in which an object is carried to the goal."""
+    places = {obstacle: world.pose(obstacle).position for obstacle in OBSTACLES if is_there(world, obstacle)}
     edge, turn = world.pose(EDGE)
     seen = (edge, turn[:, 0]) if is_there(world, EDGE) else None
     return make_layout(world.scene, world.extents(name), world.goal, places, seen)
@@ -107,7 +100,7 @@ def _layout(world: World, name: str) -> Layout:
 def make_layout(
     scene: Scene, lengths: Sequence[float], goal: F64, places: Mapping[str, F64], edge: tuple[F64, F64] | None
 ) -> Layout:
-    """Return the layout of an object of lengths (3,) [m], a goal (3,) [m], places of things (3,) [m], and an edge.
+    """Return the layout of an object of lengths (3,) [m], a goal (3,) [m], places of obstacles (3,) [m], and an edge.
 
     edge: a point on it (3,) [m] and the direction away from the table, (3,).
     """
@@ -116,7 +109,7 @@ def make_layout(
     return Layout(
         scale=scale_of(scene),
         goal=_numbers(goal),
-        places=tuple((name, _numbers(places[name])[:2]) for name in THINGS if name in places),
+        places=tuple((name, _numbers(places[name])[:2]) for name in OBSTACLES if name in places),
         edge=None if edge is None else Edge(_numbers(edge[0])[:2], _numbers(edge[1])[:2]),
         half=longest / 2,
         parts=(own, *hand_of(scene).parts),
@@ -129,30 +122,22 @@ def _numbers(vector: F64) -> tuple[float, float, float]:
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout of an episode with an object by that name, as `environment_state` shows it.
-
-    seen: numbers by name. Raises `MismatchError` if one that it needs is missing.
-    """
+    """Return the layout of an episode with an object by that name, from the numbers of `environment_state` by name."""
 
     def vector(of: str) -> F64:
-        return np.array([number(f"{of}.{axis}") for axis in "xyz"])
+        return np.array([seen[f"{of}.{axis}"] for axis in "xyz"], dtype=np.float64)
 
-    def number(of: str) -> float:
-        if of not in seen:
-            raise MismatchError("names of environment_state", "a dataset", f"no {of}", "carry", of)
-        return float(seen[of])
-
-    width = number(f"{name}.width")
+    width = seen[f"{name}.width"]
     lengths = [width, seen.get(f"{name}.length", width), seen.get(f"{name}.height", width)]
-    places = {thing: vector(thing) for thing in THINGS if number(f"{thing}.here") > 0.5}
-    edge = (vector(EDGE), vector(f"{EDGE}.outwards")) if number(f"{EDGE}.here") > 0.5 else None
+    places = {one: vector(one) for one in OBSTACLES if seen[f"{one}.here"] > 0.5}
+    edge = (vector(EDGE), vector(f"{EDGE}.outwards")) if seen[f"{EDGE}.here"] > 0.5 else None
     return make_layout(scene, lengths, vector("goal"), places, edge)
 
 
-def observe_things(world: World) -> dict[str, F64 | float]:
-    """Return every thing's position [m] and presence, and the table's edge: a point on it, and its direction."""
+def observe_obstacles(world: World) -> dict[str, F64 | float]:
+    """Return every obstacle's position [m] and presence, and the table's edge: a point on it, and its direction."""
     found: dict[str, F64 | float] = {}
-    for name in (*THINGS, EDGE):
+    for name in (*OBSTACLES, EDGE):
         found |= {name: world.pose(name).position, f"{name}.here": float(is_there(world, name))}
     return {**found, f"{EDGE}.outwards": world.pose(EDGE).rotation[:, 0]}
 
@@ -168,7 +153,7 @@ class Box(NamedTuple):
     half: F64
 
 
-class Hand(NamedTuple):
+class HandShape(NamedTuple):
     """The open, downward hand: its parts as heights and radii about the vertical through `ee`, and as boxes.
 
     home: where `ee` is at home, (3,) [m].
@@ -180,7 +165,7 @@ class Hand(NamedTuple):
 
 
 @lru_cache(8)
-def hand_of(scene: Scene) -> Hand:
+def hand_of(scene: Scene) -> HandShape:
     """Return the hand of a scene's robot at home, (3,) [m]; computed once."""
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[scene.arm_q] = scene.robot.home
@@ -194,7 +179,7 @@ def hand_of(scene: Scene) -> Hand:
         if model.geom_bodyid[geom] in moved and (model.geom_contype[geom] or model.geom_conaffinity[geom])
     ]
     lean = LEANING if scene.robot.leans else 0.0
-    return Hand(_parts(outlines, lean), tuple(_box(points, axes) for points in outlines), ee.copy())
+    return HandShape(_parts(outlines, lean), tuple(_box(points, axes) for points in outlines), ee.copy())
 
 
 def _parts(outlines: Sequence[F64], lean: float) -> tuple[Part, ...]:
@@ -214,8 +199,8 @@ def _box(points: F64, axes: F64) -> Box:
     return Box(float(points[:, 2].min()), (low + high) / 2, (high - low) / 2)
 
 
-def fits(hand: Hand, at: F64, yaw: float, layout: Layout) -> bool:
-    """Return whether a hand at a point (3,) [m], turned by a yaw [rad], is clear of the things of a layout."""
+def fits(hand: HandShape, at: F64, yaw: float, layout: Layout) -> bool:
+    """Return whether a hand at a point (3,) [m], turned by a yaw [rad], is clear of the obstacles of a layout."""
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])  # the hand's x and y
     for _, middle, half, height in layout.boxes:
         for box in hand.boxes:
