@@ -7,6 +7,7 @@ Options are fields of the same classes that the commands use, with the same name
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from manip_il.collect.record import MAX_TRIES, collect, collect_successes, prove
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
-from manip_il.errors import UsageError
+from manip_il.errors import FolderExistsError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import HOLD, episode_hold
@@ -51,20 +52,19 @@ def record(
     options: other fields of `RolloutJob`, such as `label` and `cameras`; a policy's `round` is 1 by default.
     Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder exists.
     """
-    driver = PolicyDriver((_folder(policy),), beta) if policy is not None else RolloutJob.driver
+    driver = RolloutJob.driver if policy is None else PolicyDriver((_folder(policy),), beta)
     chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)} | options
-    job, journals, name = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals"), "local/recorded"
-    for folder in (root, journals):
-        if folder.exists():
-            raise UsageError(f"{folder} already exists; give a new folder")
+    job, journals = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals")
+    if root.exists() or journals.exists():
+        raise FolderExistsError(root)
+    recording = Recording("local/recorded", provenance=provenance(job), only_labelled=not job.labels_all)
     with Engine(workers) as engine:
         if policy is None:
             seeds = stream_seeds("demonstrations", MAX_TRIES * episodes, seed)
             made = collect_successes(engine, job, seeds, episodes, journals)
-            recording = Recording(name, True, episodes, provenance(job))
+            recording = replace(recording, only_successes=True, episodes=episodes)
         else:
             made = collect(engine, job, stream_seeds(f"round/{job.round}", episodes, seed), journals)
-            recording = Recording(name, provenance=provenance(job), only_labelled=not job.labels_all)
         recording.write(journals)
         recording.make(made, root)
     return Dataset.open(root)

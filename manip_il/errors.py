@@ -6,16 +6,10 @@ The command line prints a `ManipError` as one line on standard error and exits w
 from __future__ import annotations
 
 import difflib
-import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 _MOST_OFFERED = 3  # names that an error suggests
-_SHORTEST_PREFIX = 3  # [characters]; shorter ones match too many names
-_LONGEST_PRINTED = 300  # [characters]
-_PRINTED = reprlib.Repr()
-_PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
-_PRINTED.maxlevel = 2
-_PRINTED.maxlist = _PRINTED.maxtuple = _PRINTED.maxdict = _PRINTED.maxset = 4
+_LONGEST_PRINTED = 200  # [characters]
 
 
 class ManipError(Exception):
@@ -43,7 +37,7 @@ class UnknownName(UsageError):
     def __init__(self, kind: str, name: str, known: Iterable[str], where: str = ""):
         """Take the known names. where: what lists them, if they are many; then only the nearest are named."""
         known = sorted(known)
-        near = did_you_mean(nearest_names(name, known, most=_MOST_OFFERED if where else 1))
+        near = nearest(name, known, _MOST_OFFERED if where else 1)
         super().__init__(f"unknown {kind} {shorten(name)}{near}; {where or f'known: {", ".join(known)}'}")
 
 
@@ -84,23 +78,10 @@ class RenderError(ManipError):
     """OpenGL for off-screen rendering does not work."""
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return ` (did you mean 'x'?)`, or "" if no known name is near."""
-    return did_you_mean(nearest_names(name, known, most=1))
-
-
-def nearest_names(name: str, known: Iterable[str], most: int = _MOST_OFFERED) -> list[str]:
-    """Return at most `most` known names like `name`: those that begin with it, then the most similar."""
-    known = list(known)
-    longer = [one for one in known if len(name) >= _SHORTEST_PREFIX and one.startswith(name)]
-    similar = difflib.get_close_matches(name, known, n=most, cutoff=0.6 if len(name) > _SHORTEST_PREFIX else 0.5)
-    return list(dict.fromkeys([*longer, *similar]))[:most]
-
-
-def did_you_mean(names: Sequence[str]) -> str:
-    """Return ` (did you mean 'x', 'y' or 'z'?)`, or "" without names."""
-    *others, last = map(repr, names) if names else ("",)
-    return f" (did you mean {', '.join(others)}{' or ' if others else ''}{last}?)" if last else ""
+def nearest(name: str, known: Iterable[str], most: int = 1) -> str:
+    """Return ` (did you mean 'x' or 'y'?)` with at most `most` known names like `name`, or "" if none is near."""
+    near = difflib.get_close_matches(name, list(known), most)
+    return f" (did you mean {' or '.join(map(repr, near))}?)" if near else ""
 
 
 def printable(text: str) -> str:
@@ -109,8 +90,8 @@ def printable(text: str) -> str:
 
 
 def shorten(value: object) -> str:
-    """Return `repr(value)`, shortened to at most 300 characters."""
-    printed = _PRINTED.repr(value)
+    """Return `repr(value)`, cut to at most 200 characters."""
+    printed = repr(value)
     return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
 
 

@@ -48,4 +48,4 @@ def check_bounds(options: Any, prefix: str = "") -> None:
 class Seeded:
     """Options of everything that draws random numbers."""
 
-    seed: int = option(0, "random seed, which shifts every random stream, 0 to 1000", at_least=0, at_most=1000)
+    seed: int = option(0, "random seed, 0 to 1000; it shifts every random stream", at_least=0, at_most=1000)

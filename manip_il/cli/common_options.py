@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 OF_POLICY: Given = dict.fromkeys(("robot", "task", "control_hz", "object"))  # by default those of the policy
 SMALL: Given = {"height": 96, "width": 96}  # picture size for policies [pixels]
-_CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras view, clutter, late"
+_CONDITIONS = "object, dynamics, knocked, sensing, random_actions, and with cameras view, clutter, late"
 
 DATASET = "a LeRobot v3.0 dataset"
 
@@ -68,31 +68,12 @@ class OfDataset:
 
 
 @dataclass(frozen=True)
-class PolicyGroup:
-    """`--policy.*`: the policy that drives."""
-
-    path: Path | None = option(None, "a checkpoint or a run")
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Options of the worker processes."""
+class EngineOptions:
+    """Options of worker processes on this machine or a Ray cluster."""
 
     workers: int | None = option(
-        None, "processes, or concurrent tasks on Ray; by default one per core", at_least=1, free=True
+        None, "processes, or concurrent tasks on Ray; none: one per core", at_least=1, free=True
     )
-
-    def open(self) -> Engine:
-        """Return the engine, to use as a context manager."""
-        from manip_il.collect.workers import Engine
-
-        return Engine(self.workers)
-
-
-@dataclass(frozen=True)
-class EngineOptions(Workers):
-    """Options of workers on this machine or a Ray cluster."""
-
     engine: Literal["local", "ray"] = option(
         "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else started here)", free=True
     )
@@ -108,9 +89,7 @@ class EngineOptions(Workers):
 class TrialGroup:
     """`--eval.*`: the test episodes."""
 
-    n_episodes: int | None = option(
-        None, "test episodes; by default 100 in eval, or up to 10,000 with --until_width", at_least=1, grows=True
-    )
+    n_episodes: int = option(500, "test episodes", at_least=1, grows=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +98,7 @@ class Tested:
 
     suite: str = option(
         "nominal",
-        f"nominal, disturbed, randomised, all; one of the conditions {_CONDITIONS}; or a YAML file of ranges",
+        f"nominal, disturbed, randomised or all; one condition ({_CONDITIONS}); or a YAML file of ranges",
     )
 
 
@@ -142,7 +121,7 @@ class Pictured:
 
     cameras: list[str] = option(
         list,
-        f"any of {', '.join(CAMERAS)}; for aloha top, angle, front_close, left_wrist, right_wrist, ...; "
+        f"any of {', '.join(CAMERAS)}; for aloha: top, angle, front_close, left_wrist, right_wrist, ...; "
         "by default all if pictures are needed, else none",
     )
     image: Given = given(CameraConfig)
@@ -156,4 +135,4 @@ class Pictured:
 class Varied(Pictured):
     """Options of a command that randomises worlds and renders pictures."""
 
-    vary: list[str] = option(list, f"what to randomise between worlds: {_CONDITIONS}, or YAML files of ranges")
+    vary: list[str] = option(list, f"what to randomise between episodes: {_CONDITIONS}; or YAML files of ranges")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, replace
+from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.comparison import Study
     from manip_il.evaluation.runner import Trial
 
-EPISODES = 500  # test episodes
 _YAML = (".yaml", ".yml")
 
 
@@ -51,7 +50,7 @@ class CompareOptions(Tested, Seeded, Trusting):
         "which rounds of a run count: end (all), or those within the labels, episodes, steps or seconds (of collecting "
         "and fitting) that every run reached",
     )
-    eval: TrialGroup = group(TrialGroup(EPISODES))
+    eval: TrialGroup = field(default_factory=TrialGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     training_seeds: int | None = option(
         None, "seeds of a study, instead of the file's; a resumed study may have more", at_least=1, free=True
@@ -70,7 +69,7 @@ class CompareOptions(Tested, Seeded, Trusting):
                 raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML file of one study")
 
     def _run_study(self, path: Path) -> None:
-        from manip_il.cli.study import read_arms, read_plan, run_arms
+        from manip_il.cli.study import read_plan, run_arms
         from manip_il.evaluation.arm import select_rounds
         from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
@@ -78,8 +77,7 @@ class CompareOptions(Tested, Seeded, Trusting):
         plan = read_plan(path, self.training_seeds, self.trust)
         file = plan.file
         with self.output.open(file) as folder:
-            run_arms(plan, folder, self.engine)
-            rule, arms = select_rounds(Rule(file.checkpoint, file.at), read_arms(plan, folder))
+            rule, arms = select_rounds(Rule(file.checkpoint, file.at), run_arms(plan, folder, self.engine))
             trials = [self._trial(plan.envs[arm.name], [arm], file.eval.n_episodes) for arm in arms]
             study = Study(self._measure(arms, trials, folder), plan.baseline, rule, file.target)
             result = study.arms[0].members[0].test
@@ -118,17 +116,17 @@ class CompareOptions(Tested, Seeded, Trusting):
         origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
         return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 
-    def _trial(self, env: EnvConfig, arms: Sequence[Arm], n_episodes: int | None) -> Trial:
+    def _trial(self, env: EnvConfig, arms: Sequence[Arm], n_episodes: int) -> Trial:
         """Return the test of these arms; raises, before any episode runs, if a policy does not fit it."""
-        from manip_il.cli.inputs import check_policies
+        from manip_il.cli.inputs import check_policy
         from manip_il.evaluation.runner import Trial
+        from manip_il.learn.checkpoint import Checkpoint
         from manip_il.seeding import stream_seeds
 
-        policies = {one.name: one.policy for arm in arms for one in arm.members if one.policy is not None}
-        seeds = stream_seeds("test", n_episodes or EPISODES, self.seed)
-        trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)
-        check_policies(policies, trial)
-        return trial
+        policies = [one.policy for arm in arms for one in arm.members if one.policy is not None]
+        for policy in policies:
+            check_policy(Checkpoint.open(policy), env, trust=self.trust)
+        return Trial.of(env, stream_seeds("test", n_episodes, self.seed), self.suite, policies, self.trust)
 
     def _measure(self, arms: Sequence[Arm], trials: Sequence[Trial], folder: Path) -> tuple[Arm, ...]:
         """Return the arms with the results of their tests."""

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.tables import PolicyRow
 
-METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
 _OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
 
 
@@ -135,8 +134,9 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     from manip_il.algorithms.run import Run
     from manip_il.collect.environments import env_fingerprint
     from manip_il.evaluation.results import write_json
+    from manip_il.evaluation.rounds import METRICS_FILE
 
-    write_json(folder / FINGERPRINT_FILE, env_fingerprint(config.env, config.cameras))
+    write_json(folder / "fingerprint.json", env_fingerprint(config.env, config.cameras))
     results: list[Result] = []
     there = {record["round"] for record in read_lines(folder / METRICS_FILE)}
     for result in Run(config, folder, engine, stages.watch()).results():
@@ -157,7 +157,7 @@ def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, *films
     """
     from manip_il.evaluation.eval_report import run_report
     from manip_il.evaluation.figures import Curve
-    from manip_il.evaluation.rounds import history
+    from manip_il.evaluation.rounds import METRICS_FILE, history
 
     records = read_lines(run / METRICS_FILE)
     curve = Curve(kind, (history(records, str(run)),))

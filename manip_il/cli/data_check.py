@@ -37,8 +37,8 @@ class CheckOptions(OfDataset):
 
     @property
     def _root(self) -> Path:
-        """The folder as a path that ends in its name, after which journals and copies beside it are named."""
-        return self.dataset if self.dataset.name not in ("", "..") else self.dataset.resolve()
+        """The folder, whose name also the folders beside it have: `.` has none."""
+        return self.dataset if self.dataset.name else self.dataset.absolute()
 
     def _examine(self) -> list[Finding]:
         """Check the dataset and print every finding."""
@@ -49,18 +49,15 @@ class CheckOptions(OfDataset):
         return findings
 
     def _say_verdict(self, findings: list[Finding]) -> None:
-        """Print how many episodes and frames are whole; raises `NotWhole` with the counts if there are errors."""
+        """Print how many episodes and frames there are; raises `NotWhole` with the counts if there are errors."""
         from manip_il.data.dataset import Dataset
         from manip_il.doctor.finding import NotWhole
 
         errors = sum(finding.is_error for finding in findings)
-        numbers = {"error": errors, "warning": len(findings) - errors}
-        counts = [f"{number} {name}{'' if number == 1 else 's'}" for name, number in numbers.items() if number]
         if errors:
-            raise NotWhole(f"{self._root}: {', '.join(counts)}")
+            raise NotWhole(f"{self._root}: errors: {errors}, warnings: {len(findings) - errors}")
         info = Dataset.open(self._root).info
-        whole = f"{info.episodes:,} episodes, {info.frames:,} frames: whole"
-        say(f"{self._root}: {', '.join([whole, *counts])}")
+        say(f"{self._root}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings: {len(findings)}")
 
 
 @dataclass(frozen=True)
@@ -77,11 +74,9 @@ class RepairOptions(CheckOptions):
         from manip_il.doctor.examine import repair
 
         findings = self._examine()
-        if done := list(repair(self._root, findings)) if findings else []:
-            say(*(f"repair   {line}" for line in done))
+        if findings:
+            say(*(f"repair   {line}" for line in repair(self._root, findings)))
             findings = self._examine()
-        else:
-            say(f"repair   nothing {'that can be repaired' if findings else 'to repair'}")
         self._say_verdict(findings)
 
 
@@ -136,5 +131,3 @@ class ScoreOptions(OfDataset):
             scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
         print_table(scoring.worst_table(scores))
         say(*scoring.fact_lines(scores))
-        weights = f"--weights={folder / scoring.WEIGHTS_FILE}"
-        say(f"next: manip-il train --dataset.root={self.dataset} {weights} --output_dir=runs/weighted")

@@ -8,8 +8,8 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli.common_options import DATASET, SMALL, Pictured, Varied, Workers
-from manip_il.cli.options import Given, given, group
+from manip_il.cli.common_options import SMALL, Pictured, Varied
+from manip_il.cli.options import Given, given
 from manip_il.cli.outputs import Replacing, prepare_output, require_replaceable
 from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import exclusive
@@ -54,7 +54,7 @@ class MergeOptions(Replacing):
     """
 
     example: ClassVar[str] = "manip-il data merge datasets/demos datasets/more --output=datasets/both"
-    datasets: list[Path] = option(MISSING, DATASET, exists="datasets/", positional=True)
+    datasets: list[Path] = option(MISSING, "LeRobot v3.0 datasets", exists="datasets/", positional=True)
     output: Path = option(MISSING, "folder of the new dataset")
 
     def run(self) -> None:
@@ -80,7 +80,7 @@ class Edit(Replacing):
     object: str | None = option(
         None, "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh", flag="task.object"
     )
-    processes: Workers = group(Workers(), prefix="")
+    workers: int | None = option(None, "processes; by default one per core", at_least=1)
 
     @contextmanager
     def open(
@@ -100,7 +100,7 @@ class Edit(Replacing):
         source = open_source(root, self.robot, self.task, self.object)
         warn(*source.warnings)
         with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:
-            yield source, EditTarget(folder, self.processes.workers or default_workers(), self.overwrite, bar.step)
+            yield source, EditTarget(folder, self.workers or default_workers(), self.overwrite, bar.step)
         say(f"dataset: {folder}")
 
 
@@ -168,8 +168,5 @@ class RedrawOptions(Edit, Varied, Seeded):
             cameras = self.camera_config(source.env)
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)
-            left, drawn = self.frames - info.episodes, f"{info.episodes:,} scenes, {info.frames:,} frames"
-            say(f"redrew {drawn}; {left:,} left out, without a valid label")
-        policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
-        train = f"manip-il train --dataset.root={target.root} --policy.type={policy}"
-        say(f"next: {train} --output_dir=runs/{target.root.name}")
+            left = self.frames - info.episodes
+            say(f"redrew {info.episodes:,} scenes, {info.frames:,} frames; {left:,} left out, without a valid label")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -49,32 +48,26 @@ class DemoOptions:
     def run(self) -> None:
         """Run the missing steps, print the table, write the report."""
         from manip_il.evaluation.comparison import Comparison
-        from manip_il.evaluation.rounds import format_seconds
         from manip_il.evaluation.tables import policy_table, print_table
 
-        began = time.monotonic()
         config = DaggerOptions(env=self.env, settings=self.settings, fit=self.fit).config()
         kept = f"every finished episode, round and evaluation, in {self.output.output_dir}"
         with self.output.open(self) as folder, Stages(kept) as stages, self.engine.open() as engine:
             engine.warm_up(learned=True)
             policies, rows = self._measure(config, folder, engine, stages)
             films = _film(policies, rows, config, stages)
-        _, *cloned, dagger = rows
-        undisturbed, disturbed = (
-            [Comparison(one.name, dagger.name, ((getattr(one, test), getattr(dagger, test)),)) for one in cloned]
-            for test in ("result", "disturbed")
+        _, first, more, dagger = rows
+        verdict, *facts = (
+            f"{prefix}{Comparison(one.name, dagger.name, ((getattr(one, test), getattr(dagger, test)),)).verdict}"
+            for prefix, test in (("", "result"), ("Disturbed: ", "disturbed"))
+            for one in (more, first)
         )
-        verdict = demo_verdict(rows, undisturbed[1].significant)
-        facts = (
-            *(f"Undisturbed: {test.verdict}" for test in undisturbed),
-            *(f"Disturbed: {test.verdict}" for test in disturbed),
-            f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.",
-        )
+        facts.append(f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.")
         title = f"Demo: {config.env.robot} {config.env.task}"
-        parts = {"title": title, "verdict": verdict, "facts": facts, "command": command_line("demo", self)}
+        parts = {"title": title, "verdict": verdict, "facts": tuple(facts), "command": command_line("demo", self)}
         write_page(folder, folder / "dagger", rows, "DAgger", *films, config=to_plain(self), **parts)
         print_table(policy_table(rows), empty="-")
-        say(verdict, *facts, f"took {format_seconds(time.monotonic() - began)} in all")
+        say(verdict, *facts)
         say(f"report: {folder / REPORT_FILE}")
         say(f"next: manip-il eval --policy.path={policies[-1]} --eval.films=3 --output_dir={folder}_eval")
 
@@ -90,12 +83,8 @@ class DemoOptions:
 
         results = run_rounds(config, folder / "dagger", engine, stages)
         first, best = results[0], best_result(results)
-        watch = replace(
-            stages.watch(),
-            on_stage=lambda stage, _, total: stages.start(f"cloning with as many labels, {stage}", total),
-        )
-        last = (results[-1].labels, folder / "dagger", folder / "cloning", engine, watch)
-        policy, labels = clone_with_labels(config, *last)
+        most, dagger, cloning = results[-1].labels, folder / "dagger", folder / "cloning"
+        policy, labels = clone_with_labels(config, most, dagger, cloning, engine, stages.watch())
         trials = [
             Trial.of(config.env, stream_seeds("test", count, config.seed), suite)
             for suite, count in (("nominal", self.test_episodes), ("knocked", self.disturbed_episodes))
@@ -103,7 +92,7 @@ class DemoOptions:
         contestants = (
             ("expert", None, None, EXPERT),
             ("cloning", first.policy, first.labels, CLONING),
-            ("cloning, as many labels", policy, labels, CLONING),
+            ("cloning with as many labels", policy, labels, CLONING),
             (f"DAgger (round {best.number})", best.policy, best.labels, DAGGER),
         )
         rows = list[PolicyRow]()
@@ -132,16 +121,3 @@ def _film(
         shots.append(Shot(trial.job(policy), episode, row.name, caption))
     stages.start("films", len(shots))
     return film_shots(shots, stages)
-
-
-def demo_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
-    """Return the report's first sentence. significant: whether DAgger differs from cloning with as many labels."""
-    from manip_il.evaluation.intervals import format_percent
-
-    _, cloned, more, dagger = rows
-    return (
-        f"DAgger solves {format_percent(dagger.success.rate)} of {dagger.success.n:,} unseen starts, "
-        f"cloning {format_percent(more.success.rate)} with as many labels "
-        f"and {format_percent(cloned.success.rate)} with the first demonstrations alone."
-        + ("" if significant else " With as many labels, cloning and DAgger do not differ significantly.")
-    )

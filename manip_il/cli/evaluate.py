@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from statistics import mean
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli.common_options import OF_POLICY, EngineOptions, PolicyGroup, Tested, TrialGroup, Trusting
+from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
@@ -18,7 +16,6 @@ from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.option import Seeded, option
 from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import ROBOTS
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
@@ -30,17 +27,21 @@ NO_FILES = ("expert", "random")  # drivers without a checkpoint
 
 
 @dataclass(frozen=True)
-class MeasuredPolicyGroup(PolicyGroup):
+class MeasuredPolicyGroup:
     """`--policy.*`: the policy to evaluate."""
 
+    path: Path | None = option(None, "a checkpoint or a run")
     type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
     device: str = option("cpu", "where the policy runs: cpu or cuda")
 
 
 @dataclass(frozen=True)
-class EvalGroup(TrialGroup):
+class EvalGroup:
     """`--eval.*`: the episodes to run."""
 
+    n_episodes: int | None = option(
+        None, "test episodes; none: 100, or up to 10,000 with --until_width", at_least=1, grows=True
+    )
     first: int = option(0, "index of the first seed in the stream, to run a large evaluation in parts", at_least=0)
     hold: int | None = option(
         10, "control steps after success until an episode ends; null: it ends at the horizon", at_least=0
@@ -103,8 +104,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         end = self.eval.first + (self.eval.n_episodes or most)
         seeds = stream_seeds(self.eval.stream, end, self.seed)[self.eval.first :]
         name, engine = str(self.policy.type or self.policy.path), self.engine.open()
-        if len(seeds) > 1:
-            engine.warm_up(learned=self.policy.path is not None)  # meanwhile this process checks the policy
+        engine.warm_up(learned=self.policy.path is not None)  # meanwhile this process checks the policy
         job, suite, width = self._job(), self.suite, self.until_width
         with self.output.open(self) as folder:
             finished_episodes(folder, job, suite)  # raises if they are another policy's
@@ -113,7 +113,7 @@ class EvalOptions(Tested, Seeded, Trusting):
                 films = film_outcomes(engine, job, result, self.eval.films, stages)
             self._report(result, folder, *films)
         seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
-        say(f"next: manip-il eval {shlex.quote(str(folder))} --replay={seed} --video=replay.mp4")
+        say(f"next: manip-il eval {folder} --replay={seed} --video=replay.mp4")
 
     def _job(self) -> RolloutJob:
         from manip_il.cli.inputs import open_driver
@@ -137,11 +137,6 @@ class EvalOptions(Tested, Seeded, Trusting):
         page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films)
         page.write(folder / REPORT_FILE)
         print_table(evaluation_table(result))
-        if result.failures:
-            phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
-            say(f"failures by final phase: {phases}")
-        if result.robot in ROBOTS:
-            say(f"return: {mean(episode.ret for episode in result.episodes):.2f}")
         say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
 
     def _merge(self) -> None:
@@ -197,7 +192,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         env = settings.env(result.robot, self.env["task"] or result.task)
         if (given := env_spec(env).task) != result.task:
             raise MismatchError("task", str(file), result.task, "--task.type", given)
-        is_policy = result.policy not in NO_FILES or bool(result.policy_sha256) or self.policy.path is not None
+        is_policy = result.policy not in NO_FILES or self.policy.path is not None
         path = find_policy(self.policy.path or Path(result.policy)) if is_policy else None
         _, driver, cameras = open_driver(path, result.policy, env, trust=self.trust)
         if path is not None and result.policy_sha256 not in ("", policy_sha256(path)):
@@ -208,23 +203,16 @@ class EvalOptions(Tested, Seeded, Trusting):
 
 
 def machine() -> str:
-    """Return renderer, PyTorch version and cores in one line. Raises what an evaluation here would raise."""
-    import multiprocessing
-    import tempfile
-    from importlib import metadata
-
+    """Return the OpenGL renderer and the number of cores. Raises what an evaluation here would raise."""
     from manip_il.collect.workers import default_workers
     from manip_il.sim import render
     from manip_il.sim.config import CAMERAS, CameraConfig
     from manip_il.tasks.envs import make_env
 
-    tempfile.TemporaryFile().close()
-    multiprocessing.get_context("spawn").Lock()  # needs /dev/shm
     env = make_env()
     env.start(0)
     render.pictures(env.scene, env.data, CameraConfig(CAMERAS))
     from OpenGL import GL  # after mujoco has chosen its platform
 
-    names = (GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER))
-    renderer = " ".join(name.decode(errors="replace") for name in names if name)
-    return f"{renderer}; torch {metadata.version('torch')}; cores {default_workers()}"
+    renderer = GL.glGetString(GL.GL_RENDERER) or b"unknown renderer"
+    return f"{renderer.decode()}; cores {default_workers()}"

@@ -18,9 +18,8 @@ from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.data.dataset import Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import SIM_STATE, RobotTaskSpec, check_same_spec
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
-from manip_il.evaluation.runner import Trial
 from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 from manip_il.learn.sources import check_same_sources
 from manip_il.sim.config import CameraConfig
@@ -108,12 +107,3 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
         theirs = {name: value for name, value in origin.fingerprint.items() if cameras or name != "cameras_sha256"}
         warn(*compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras)))
     return cameras
-
-
-def check_policies(policies: Mapping[str, Path], trial: Trial) -> None:
-    """Raise if one of the policies (name -> folder) does not fit a test."""
-    for name, policy in policies.items():
-        checkpoint = Checkpoint.open(policy)
-        if checkpoint.origin is not None and checkpoint.origin.task != trial.env.task:
-            raise MismatchError("task", name, checkpoint.origin.task, "the comparison", trial.env.task)
-        check_policy(checkpoint, trial.env, trust=trial.trust)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.cli.common_options import DatasetRoots, Workers
+from manip_il.cli.common_options import DatasetRoots, EngineOptions
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.checkpoint import Origin
 
-METRICS_FILE = "metrics.jsonl"
-
 
 @dataclass(frozen=True)
 class Learning:
@@ -35,12 +33,13 @@ class Learning:
     init: Path | None = option(None, "a cloned mlp, or its run, to start from; by default a new policy")
     settings: Given = given(LearningConfig, prefix="")
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    engine: Workers = group(Workers(1), prefix="")
+    engine: EngineOptions = group(EngineOptions(1), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/rl")), prefix="")
 
     def run(self) -> None:
         """Run all iterations, or continue them, and write the report."""
         from manip_il.algorithms.results import learning_report, validations
+        from manip_il.evaluation.rounds import METRICS_FILE
 
         config = self.learning_config()
         with self.output.open(self) as folder:
@@ -58,12 +57,8 @@ class Learning:
         """Return the configuration of the run; raises if datasets, policy and environment do not fit."""
         raise NotImplementedError
 
-    def _config(self, spec: RobotTaskSpec | Origin, name: str, **more: Any) -> LearningConfig:
-        """Return the configuration for the environment of `spec`, read from `name`; `UsageError` if it is unknown."""
-        from manip_il.collect.environments import is_known
-
-        if not is_known(spec.robot, spec.task, spec.object):
-            raise UsageError(f"{name} is for {spec.robot} {spec.task} {spec.object}, which cannot be simulated here")
+    def _config(self, spec: RobotTaskSpec | Origin, **more: Any) -> LearningConfig:
+        """Return the configuration for the environment of `spec`; `UnknownName` if that is not built in."""
         env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
         start = None if self.init is None else find_policy(self.init)
         return LearningConfig(method=self.method, env=env, ppo=self.ppo, start=start, **more, **self.settings)
@@ -71,6 +66,7 @@ class Learning:
     def _learn(self, config: LearningConfig, folder: Path, engine: Engine, stages: Stages) -> None:
         from manip_il.algorithms.results import Watch
         from manip_il.algorithms.run import Run
+        from manip_il.evaluation.rounds import METRICS_FILE
 
         watch, metrics = Watch(on_episode=lambda _: stages.check(), on_step=stages.check), folder / METRICS_FILE
         results = Run(config, folder, engine, watch).results()
@@ -79,8 +75,7 @@ class Learning:
         for result in results:
             if result.number not in written:
                 append_line(metrics, result.to_json())
-            shown = {key: result.metrics[key] for key in ("success", "kl") if key in result.metrics}
-            stages.reach(result.steps, **shown)
+            stages.log({"step": result.steps} | result.metrics)
             if result.validated is not None:
                 say(f"{result.steps:,} steps: validation success {result.validated.success}")
 
@@ -89,9 +84,8 @@ class Learning:
 class GailOptions(Learning):
     """Imitate demonstrations by generative adversarial imitation learning (GAIL).
 
-    A discriminator learns to tell the learner's steps from the expert's; PPO is rewarded for steps that it takes for
-    the expert's. OUTPUT_DIR/best holds the policy with the highest validation success: an mlp like that of `manip-il
-    train`.
+    A discriminator learns to tell the learner's steps from the expert's, and PPO learns to fool it. OUTPUT_DIR/best
+    holds the policy with the highest validation success: an mlp like that of `manip-il train`.
     """
 
     method: ClassVar[str] = "gail"
@@ -111,7 +105,7 @@ class GailOptions(Learning):
         for one in opened:
             warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
         more = {"datasets": tuple(self.dataset.root), "discriminator": self.discriminator}
-        return self._config(opened[0].spec, str(opened[0].root), **more)
+        return self._config(opened[0].spec, **more)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,6 +141,6 @@ class PpoOptions(Learning):
         if self.init is None:
             raise UsageError("--init is missing; expected the path of a cloned policy for PPO to improve")
         reward = LearnedReward.load(found := find_policy(self.reward))
-        config = self._config(reward.origin, str(self.reward), reward=found)
+        config = self._config(reward.origin, reward=found)
         reward.check_fits("the environment", env_spec(config.env))
         return config

@@ -24,7 +24,6 @@ from manip_il.checks import parse_yaml
 
 Open = dict[str, Any]  # option -> value as read by YAML
 Given = dict[str, Any]  # field -> value
-_EXPECTED = {int: "a whole number", float: "a number", bool: "true or false", Path: "a path", Any: "YAML"}
 _METAVARS = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH"}
 
 
@@ -50,7 +49,7 @@ class Option:
 
     path: attributes and keys from the command's options to its value. metadata: `help`, one line; `positional` for a
     value without a name; `command_line_only` for an option that no file may set; `exists` for a path to read: its
-    prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`. home: the class that declares it.
+    prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`.
     """
 
     name: str  # dotted: `dataset.root`
@@ -58,7 +57,6 @@ class Option:
     type: Any
     default: Any
     metadata: Mapping[str, Any]
-    home: type
 
     @property
     def positional(self) -> bool:
@@ -94,18 +92,17 @@ def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, .
     found: list[Option] = []
     for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
         inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
-        (home, kind), default = declared(cls, one), default_of(one, base)
+        kind, default = type_of(cls, one), default_of(one, base)
         if source := one.metadata.get("given"):
             for theirs in dataclasses.fields(source):
                 if "help" in theirs.metadata and theirs.name in (one.metadata["only"] or (theirs.name,)):
                     name = theirs.metadata.get("flag", inner + theirs.name)
-                    own, where = default.get(theirs.name, default_of(theirs)), (*here, theirs.name)
-                    home, kind = declared(source, theirs)
-                    found.append(Option(name, where, kind, own, theirs.metadata, home))
+                    own = default.get(theirs.name, default_of(theirs))
+                    found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, theirs.metadata))
         elif dataclasses.is_dataclass(kind):
             found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
         else:
-            found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata, home))
+            found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata))
     return found
 
 
@@ -116,10 +113,10 @@ def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
     return one.default if one.default_factory is MISSING else one.default_factory()
 
 
-def declared(cls: type, one: dataclasses.Field[Any]) -> tuple[type, Any]:
-    """Return the class that declares a field, and the field's type."""
+def type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
+    """Return the type of a dataclass's field; other fields may have types that are only imported for type checks."""
     home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
-    return home, eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
+    return eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
 
 
 def to_plain(options: Any) -> dict[str, Any]:
@@ -165,21 +162,11 @@ def word(value: Any) -> str:
 
 
 def metavar(option_type: Any) -> str:
-    """Return the placeholder of a value in help: `INT`, `PATH`, `mse|l1`, `FLOAT,...`."""
+    """Return the placeholder of a value in help and errors: `INT`, `PATH`, `mse|l1`, `FLOAT,...`."""
     option_type = without_none(option_type)
     if typing.get_origin(option_type) is list:
         return f"{metavar(typing.get_args(option_type)[0])},..."
     return "|".join(choices(option_type)) or _METAVARS.get(option_type, "VALUE")
-
-
-def expected(option_type: Any) -> str:
-    """Return the expected value, for an error message."""
-    if (some := without_none(option_type)) is not option_type:
-        return f"{expected(some)} or null"
-    if typing.get_origin(option_type) is list:
-        return f"a comma-separated list, each {expected(typing.get_args(option_type)[0])}"
-    named = choices(option_type)
-    return f"one of {', '.join(named)}" if named else _EXPECTED.get(option_type, "text")
 
 
 def from_word(option_type: Any, word: str) -> Any:

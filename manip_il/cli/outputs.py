@@ -97,11 +97,8 @@ def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] =
         raise FolderExistsError(folder)
     if source := next((one for one in sources if one.resolve().is_relative_to(folder.resolve())), None):
         raise UsageError(f"{folder} overlaps {source}; expected a separate folder")
-    real = folder.resolve()
     if folder.is_symlink():
-        raise UsageError(f"{folder} is a link to {real}; --overwrite=true follows no links, give the folder itself")
-    if any(kept.resolve().is_relative_to(real) for kept in (Path.home(), Path.cwd())) or any(real.rglob(".git")):
-        raise UsageError(f"{folder} holds your home or current folder, or a git checkout; it will not be deleted")
+        raise UsageError(f"{folder} is a link; --overwrite=true follows no links, give {folder.resolve()} itself")
     files = {folder / name: mark.encode() for name, mark in _MARKS.items() if (folder / name).is_file()}
     if not any(mark in path.read_bytes() for path, mark in files.items()):
         raise UsageError(

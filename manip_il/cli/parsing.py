@@ -18,27 +18,21 @@ from manip_il.checks import read_yaml, shorten
 from manip_il.cli.options import (
     Option,
     choices,
-    declared,
     decode,
     default_of,
-    expected,
     from_word,
+    metavar,
     options_of,
     to_plain,
+    type_of,
     without_none,
 )
-from manip_il.errors import ManipError, UsageError, did_you_mean, nearest, nearest_names
+from manip_il.errors import ManipError, UsageError, nearest
 from manip_il.evaluation.policy_folder import hub_hint
 from manip_il.option import check_bound
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
-# Removed option -> its replacement; old files may still have it, if it is empty.
-MOVED = {
-    "task.reward": "--task.type=carry:REWARD",
-    "within": "read off the page's curves",
-    "expert": "measured by manip-il eval --policy.type=expert",
-}
 _MOST_OFFERED = 3  # names that an error suggests
 type Known = Mapping[str, Option]
 
@@ -87,7 +81,7 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mappi
             if one.value is not None or without_none(option.type) is not option.type:  # else null: the default is used
                 values[option.path] = _decode_raw(option, one)
         elif option.default is MISSING:
-            raise UsageError(f"{option.label} is missing; expected {expected(option.type)}")
+            raise UsageError(f"{option.label} is missing; expected {metavar(option.type)}")
     return _build(cls, values)
 
 
@@ -141,7 +135,7 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[
             value = "true"
         elif not equals:
             if not rest or rest[0].startswith("--"):
-                raise UsageError(f"--{name} has no value; expected {expected(kind)}")
+                raise UsageError(f"--{name} has no value; expected {metavar(kind)}")
             value = rest.pop(0)
         if name == CONFIG_PATH:
             config_paths.append(value)
@@ -178,7 +172,7 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
                 raise UsageError(f"{origin}: {name} can only be set on the command line; give --{name}=...")
         elif any(option == name or option.startswith(f"{name}.") for option in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
-        elif name not in MOVED or value:
+        else:
             raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
     return raw
 
@@ -187,7 +181,7 @@ def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, pa
     """Return an instance of `cls`. values: by path; others are those of `base`, else the defaults."""
     arguments: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
-        here, (_, kind), default = (*path, field.name), declared(cls, field), default_of(field, base)
+        here, kind, default = (*path, field.name), type_of(cls, field), default_of(field, base)
         if "given" in field.metadata:
             raw = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
             arguments[field.name] = default | raw
@@ -208,9 +202,7 @@ def _decode_raw(option: Option, raw: _RawValue) -> Any:
         raise
     except Exception:  # draccus also raises plain Exception
         hint = nearest(raw.value, choices(kind)) if isinstance(raw.value, str) else ""
-        quotes = "; YAML needs quotes around text like this" if kind is str and not is_word else ""
-        text = f"{raw.origin}: expected {expected(kind)}, got {shorten(raw.value)}{hint}{quotes}"
-        raise UsageError(text) from None
+        raise UsageError(f"{raw.origin}: expected {metavar(kind)}, got {shorten(raw.value)}{hint}") from None
     check_bound(raw.origin, value, option.metadata)
     return value
 
@@ -220,13 +212,8 @@ def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: st
 
     `num_episodes` finds `dataset.num_episodes`. kind: `option`, or the file's key. dashes: prefix of the names.
     """
-    if name in MOVED:
-        return UsageError(f"{dashes}{name} is now {MOVED[name]}")
     if inside := [one.label for one in known.values() if one.label.startswith(f"--{name}.")]:
         return UsageError(f"{dashes}{name} is a group of options; known: {', '.join(inside)}")
-    named = [one.name for one in known.values() if not one.is_open and not (dashes and one.positional)]
-    leaf, leaves = name.rpartition(".")[2], {one.rpartition(".")[2] for one in named}
-    like = [leaf] if leaf in leaves else nearest_names(leaf, sorted(leaves))
-    near = [*(one for last in like for one in named if one.rpartition(".")[2] == last), *nearest_names(name, named)]
-    offered = did_you_mean([dashes + one for one in list(dict.fromkeys(near))[:_MOST_OFFERED]])
-    return UsageError(f"unknown {kind} {shorten(dashes + name)}{offered}; manip-il {command} --help=all lists all")
+    named = [dashes + one.name for one in known.values() if not one.is_open and not (dashes and one.positional)]
+    near = nearest(dashes + name, named, _MOST_OFFERED)
+    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help=all lists all")

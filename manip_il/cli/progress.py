@@ -139,14 +139,11 @@ class Stages:
         self._solved += episode.success
         self.step(success=self._solved / (self._done + 1))
 
-    def reach(self, step: int, **fields: object) -> None:
-        """Show that a stage has reached a step, with `fields`."""
-        self.step(step - self._done, **fields)
-
     def log(self, record: dict[str, Any]) -> None:
-        """Show a fit's metrics at a step. record: {} if there are none."""
+        """Show that a fit or a run has reached a step, with its metrics. record: {} if there are none."""
         if record:
-            self.reach(record["step"], loss=record["loss"])
+            shown = {name: record[name] for name in ("loss", "success", "kl") if name in record}
+            self.step(record["step"] - self._done, **shown)
         self.check()
 
     def check(self) -> None:

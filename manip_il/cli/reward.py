@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile
-from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.progress import progress, say
 from manip_il.data.atomic import write_file
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import Seeded, option
@@ -47,12 +47,10 @@ class IrlOptions(OfDataset, Seeded):
         learnt = learn(self.method, [one.demonstration for one in carried], rng)
         found = inverse.Inverse(str(self.dataset), tuple(carried), learnt)
         with self.output.open(self) as folder:
-            write_json(folder / inverse.FILE_NAME, found.to_json())
             page = inverse.inverse_report(found, command_line("reward irl", self), to_plain(self))
             page.write(folder / REPORT_FILE)
+            write_json(folder / inverse.FILE_NAME, found.to_json())
         print_table(inverse.weight_table(found))
-        if line := inverse.open_line(found):
-            warn(line)
         say(f"report: {folder / REPORT_FILE}")
         say(f"next: manip-il eval --policy.type=expert --task.type=carry:{folder / inverse.FILE_NAME}")
 
@@ -61,7 +59,7 @@ class IrlOptions(OfDataset, Seeded):
 class PairsOptions(Seeded):
     """Choose pairs of clips from datasets of one task, for comparison by people (ask) or simulated teachers (answer).
 
-    A SOURCE is a dataset or a run; each round of a DAgger run is one source. All sources are in equally many pairs.
+    A SOURCE is a dataset or a run; each round of a DAgger run is one source. Every source is in equally many pairs.
     Episodes shorter than --clip are left out.
     """
 
@@ -85,8 +83,6 @@ class PairsOptions(Seeded):
         rng = rng_for(stream_base("training", self.seed), "pairs")
         clips = choose_pairs(find_datasets(self.sources), self.clip, self.count, self.seed, rng, reward)
         write_json(self.file.output, clips.pairs.to_json())
-        if clips.too_short:
-            warn(f"{clips.too_short:,} episodes are shorter than {self.clip} control steps and are left out")
         say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {self.file.output}")
         say(f"next: manip-il reward ask {self.file.output} --output=ask.html")
 
@@ -114,8 +110,7 @@ class AskOptions(OfPairs):
             films = render_films(clips, str(self.robot) if self.robot else None, bar.step)
         page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
         write_file(self.file.output, page.encode())
-        say(f"{len(clips.pairs):,} pairs, {len(page) / 1e6:.1f} MB: {self.file.output}")
-        say("open it in a browser, compare, and save the answers as preferences.json")
+        say(f"{len(clips.pairs):,} pairs: {self.file.output}")
         say(f"next: manip-il reward fit {self.pairs} preferences.json --output_dir=runs/reward")
 
 
@@ -142,11 +137,8 @@ class AnswerOptions(OfPairs, Seeded):
         teacher = Teacher.parse(self.teacher)
         clips = read_clips(Pairs.read(self.pairs))
         rng = rng_for(stream_base("training", self.seed), "teacher")
-        found = answer_pairs(teacher, clips, rng)
-        write_json(self.file.output, found.to_json())
-        given = [one.answer for one in found.answers]
-        counts = ", ".join(f"{given.count(answer):,} {answer}" for answer in dict.fromkeys(sorted(given)))
-        say(f"{counts}: {self.file.output}")
+        write_json(self.file.output, answer_pairs(teacher, clips, rng).to_json())
+        say(f"{len(clips.pairs):,} answers: {self.file.output}")
         say(f"next: manip-il reward fit {self.pairs} {self.file.output} --output_dir=runs/reward")
 
 
@@ -189,6 +181,4 @@ class FitOptions(OfPairs, Seeded):
             write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
             write_json(folder / "fit.json", found.to_json())
         say(*summary_lines(found, answers))
-        if answers.contradictory:
-            warn(f"{answers.contradictory:,} pairs have contradictory answers; both count")
         say(f"next: manip-il data score DATASET --reward={folder} --output_dir=runs/scores")

@@ -47,15 +47,12 @@ class RobotNewOptions(Replacing):
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
         found = suggest(self.model, self.gripper)
         write_file(target, yaml_of(found, *paths).encode())
-        try:
-            with Engine(None) as engine:
-                checked = check_robot(str(target), list(NAMES), 0, engine, lambda _: None)
-        except ManipError as error:
-            raise ManipError(f"wrote {target}, but it cannot be used yet: {error}") from None
-        say(f"wrote {target}. {verdict(checked)}")
-        say(*(f"change: {line}" for line in advice(checked)))
+        say(f"robot: {target}")
+        with Engine(None) as engine:
+            checked = check_robot(str(target), list(NAMES), 0, engine, lambda _: None)
+        say(verdict(checked), *(f"change: {line}" for line in advice(checked)))
         if len(checked.failed) == len(NAMES):
-            raise ManipError(f"wrote {target}, but the robot cannot do any task yet; see above")
+            raise ManipError(f"{target} cannot do any task yet; see above")
         say(f"look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
 
 
@@ -86,7 +83,7 @@ class RobotCheckOptions:
         from manip_il.tasks.table import get_task
 
         sweep(get_robot(self.robot))  # raises, before anything is written, if the robot cannot be used
-        tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
+        tasks = self.tasks or list(NAMES)
         for task in tasks:
             get_task(task)
         with self.output.open(self) as folder:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli.common_options import Workers
+from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, Output
 from manip_il.cli.progress import progress, say
@@ -27,8 +27,8 @@ class TheoryOptions:
     example: ClassVar[str] = "manip-il theory runs/dagger --output_dir=runs/theory"
     source: Path | None = option(None, "a run of manip-il dagger, to measure its rounds", positional=True, exists="")
     episodes: int = option(50, "episodes of the expert and of every round's policy", at_least=2)
-    cases: int = option(30, "wrong actions of each kind, to measure the cost of one to the expert", at_least=1)
-    engine: Workers = group(Workers(), prefix="")
+    cases: int = option(30, "wrong actions of each kind, to measure what one costs the expert", at_least=1)
+    engine: EngineOptions = group(EngineOptions(), prefix="")
     output: Output = group(Output(Path("runs/theory")), prefix="")
 
     def run(self) -> None:
@@ -45,8 +45,7 @@ class TheoryOptions:
             write_json(folder / FILE_NAME, theory.to_json())
             theory_report(theory, command_line("theory", self), to_plain(self)).write(folder / REPORT_FILE)
         print_table(slope_table(theory))
-        say(f"policies above their bound: {theory.above}")
-        say(f"report: {folder / REPORT_FILE}")
+        say(f"policies above their bound: {theory.above}", f"report: {folder / REPORT_FILE}")
 
     def _shift(self, run: Path) -> Shift:
         from manip_il.evaluation.arm import read_arm

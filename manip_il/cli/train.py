@@ -63,19 +63,21 @@ class TrainOptions(Seeded, Trusting):
             set_quiet(True)
         config, folder = self.config(), self.output.output_dir
         datasets, weights = self._datasets(config), None
-        from manip_il.learn.lerobot_config import lerobot_options  # here, as what does not fit is said at once
+        # Imported after the datasets are checked: these take seconds.
+        from manip_il.cli.inputs import dataset_differences
+        from manip_il.learn.lerobot_config import lerobot_options
         from manip_il.learn.samples import rabc_weights
         from manip_il.learn.train import Trainer
 
         options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
-        self._warn(config, datasets)
+        for one in datasets:
+            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
         if self.weights is not None:
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
             weights = rabc_weights(
                 self.weights, episodes, getattr(options.policy, "chunk_size", None) or int(first.fps)
             )
-            say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         with self.output.open(self) if writes else contextlib.nullcontext():
             pictures = sum(len(one) * len(one.cameras) for one in datasets) if config.takes_images else 0
             with progress(pictures, "decode pictures, once") as bar:
@@ -115,14 +117,3 @@ class TrainOptions(Seeded, Trusting):
         for one in datasets:
             input_columns(config, one.root, one.info)
         return datasets
-
-    def _warn(self, config: FitConfig, datasets: list[Dataset]) -> None:
-        """Warn of what differs between the datasets and this machine, and of pictures that are left out."""
-        from manip_il.cli.inputs import dataset_differences  # which imports the simulator
-        from manip_il.learn.sources import input_columns
-
-        for one in datasets:
-            seen = input_columns(config, one.root, one.info)
-            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
-            odd = [key for key in one.cameras if config.takes_images and key not in seen]
-            warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))

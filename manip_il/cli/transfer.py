@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import group
 from manip_il.cli.outputs import OutputFile, Replacing, prepare_output, require_replaceable, save_options
-from manip_il.cli.progress import has_bars, progress, say, warn
+from manip_il.cli.progress import has_bars, progress, say
 from manip_il.data.atomic import new_folder, write_file
 from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
@@ -18,15 +18,8 @@ from manip_il.option import option
 EXPORTABLE = ("mlp", "cnn")
 
 
-@dataclass(frozen=True, kw_only=True)
-class DryRun:
-    """Options of a command that moves files."""
-
-    dry_run: bool = option(False, "only list what the command would do")
-
-
 @dataclass(frozen=True)
-class PushOptions(DryRun):
+class PushOptions:
     """Push a dataset, or a policy with its run, to the Hugging Face Hub, an object store, another machine or a folder.
 
     A dataset is checked first, as by manip-il data check, and refused if it has errors. Only changes are uploaded.
@@ -43,6 +36,7 @@ class PushOptions(DryRun):
     )
     journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
     private: bool = option(False, "make a new repository on the Hub private")
+    dry_run: bool = option(False, "only list what would be uploaded and removed")
 
     def run(self) -> None:
         """Check, list, upload, switch to the new version; print what was done."""
@@ -52,18 +46,17 @@ class PushOptions(DryRun):
 
         remote = open_remote(self.remote, private=self.private, quiet=not has_bars())
         plan = push(self.source, remote, journals=self.journals, dry_run=self.dry_run)
-        sizes = {path: plan.manifest.files[path].size for path in plan.upload}
+        size = filesize.decimal(sum(plan.manifest.files[path].size for path in plan.upload))
         if self.dry_run:
-            say(*(f"upload   {path} ({filesize.decimal(size)})" for path, size in sizes.items()))
-            say(*(f"remove   {path}" for path in plan.remove))
-        size, same = filesize.decimal(sum(sizes.values())), len(plan.local) - len(sizes)
-        uploaded, removed = ("to upload", "to remove") if self.dry_run else ("uploaded", "removed")
-        say(f"{remote.name}: {len(sizes)} files, {size}, {uploaded}; {len(plan.remove)} {removed}; {same} unchanged")
-        say("nothing was done" if self.dry_run else f"next: manip-il pull {remote.name} FOLDER")
+            say(*(f"upload   {path}" for path in plan.upload), *(f"remove   {path}" for path in plan.remove))
+        done = "would be " if self.dry_run else ""
+        say(f"{remote.name}: {len(plan.upload)} files, {size}, {done}uploaded; {len(plan.remove)} {done}removed")
+        if not self.dry_run:
+            say(f"next: manip-il pull {remote.name} FOLDER")
 
 
 @dataclass(frozen=True)
-class PullOptions(DryRun, Replacing):
+class PullOptions(Replacing):
     """Pull a dataset or a policy from the Hugging Face Hub, an object store, another machine or a folder.
 
     Before the folder appears, every file is verified by its hash, and every file of a dataset is opened once. Paths
@@ -74,6 +67,7 @@ class PullOptions(DryRun, Replacing):
     remote: str = option(MISSING, "the address given to manip-il push, or any Hub repository", positional=True)
     target: Path = option(MISSING, "the new folder", positional=True)
     revision: str | None = option(None, "branch, tag or commit of a Hub repository")
+    dry_run: bool = option(False, "only list what would be downloaded")
 
     def run(self) -> None:
         """Download, verify, rename; print what was pulled."""
@@ -86,12 +80,10 @@ class PullOptions(DryRun, Replacing):
         remote = open_remote(self.remote, revision=self.revision, quiet=not has_bars())
         manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
         if self.dry_run:
-            say(*(f"pull     {path} ({filesize.decimal(file.size)})" for path, file in manifest.files.items()))
+            say(*(f"pull     {path}" for path in manifest.files))
         size = filesize.decimal(sum(file.size for file in manifest.files.values()))
-        what = f"a {manifest.kind} of {len(manifest.files)} files, {size}"
-        say(f"{remote.name}: {what}; nothing was done" if self.dry_run else f"{self.target}: {what}, all verified")
-        if not self.dry_run and manifest.kind == "dataset":
-            say(f"next: manip-il data check {self.target}")
+        done = "would be downloaded" if self.dry_run else "all verified"
+        say(f"{self.target}: a {manifest.kind} of {len(manifest.files)} files, {size}, {done}")
 
 
 @dataclass(frozen=True)
@@ -121,13 +113,7 @@ class ExportOptions:
         except ImportError as error:
             raise ManipError(f"an ONNX file needs {error.name}: pip install 'manip_il[export]'") from error
         write_file(self.file.output, exported.data)
-        if "robot" not in exported.metadata:
-            warn(f"{path} was written by another tool: the file does not hold robot, task, control rate and names")
         say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
-        for direction in ("inputs", "outputs"):
-            for one in exported.metadata[direction]:
-                shape = ", ".join(map(str, one["shape"]))
-                say(f"{direction.removesuffix('puts'):>3}: {one['name']} {one['dtype']} ({shape})")
         say(f"exported: {self.file.output} ({len(exported.data):,} bytes)")
 
 
@@ -175,14 +161,10 @@ class McapImportOptions:
         """Import every file; the dataset appears when it is complete."""
         from manip_il.mcap.importing import import_files, list_files
         from manip_il.mcap.mapping import load_mapping
-        from manip_il.mcap.read import read_topics
 
-        mapping, paths, frames = load_mapping(self.mapping), list_files(self.source), 0
+        paths, frames = list_files(self.source), 0
         with progress(len(paths), "import") as bar:
-            for count in import_files(paths, self.dataset, mapping):
+            for count in import_files(paths, self.dataset, load_mapping(self.mapping)):
                 bar.step()
                 frames += count
-        wanted = {source.topic for source in mapping.sources.values()}
-        if rest := sorted({topic for path in paths for topic in read_topics(path)} - wanted):
-            say(f"topics not in the mapping: {', '.join(rest)}")
         say(f"imported {len(paths):,} episodes, {frames:,} frames to {self.dataset}")

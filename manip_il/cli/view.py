@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli.common_options import OF_POLICY, PolicyGroup, Tested, Trusting, default_cameras
+from manip_il.cli.common_options import OF_POLICY, Tested, Trusting, default_cameras
 from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say
 from manip_il.errors import UsageError
@@ -25,9 +25,10 @@ SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
 
 
 @dataclass(frozen=True)
-class WatchedPolicyGroup(PolicyGroup):
+class WatchedPolicyGroup:
     """`--policy.*`: the policy that drives."""
 
+    path: Path | None = option(None, "a checkpoint or a run")
     type: Literal["expert", "random", "sliders"] | None = option(
         None, "instead of a checkpoint, by default expert; sliders: those of the window"
     )
@@ -35,10 +36,10 @@ class WatchedPolicyGroup(PolicyGroup):
 
 @dataclass(frozen=True)
 class ViewOptions(Tested, Seeded, Trusting):
-    """Watch a robot at its task in MuJoCo's viewer, or without a display in a browser (Rerun) or from a file.
+    """Watch a robot at its task in MuJoCo's viewer; without a display, in a browser (Rerun) or from a file.
 
-    Shows --n_episodes in real time, or until the window is closed or Ctrl-C. Without a display it serves pictures,
-    joints, actions, phase and progress to a browser; `--output` writes them as fast as possible to a file, which `rerun
+    Episodes run in real time until there are --n_episodes, the window is closed or Ctrl-C is pressed. The browser shows
+    pictures, joints, actions, phase and progress. --output writes these as fast as possible to a file, which `rerun
     FILE.rrd` opens on any machine.
     """
 

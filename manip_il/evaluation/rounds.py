@@ -34,11 +34,6 @@ class Round:
         """Return the labels, episodes, steps or seconds that the run had used."""
         return getattr(self, cost)
 
-    def after(self, start: Round, *, fitted: float) -> Round:
-        """Return the round plus the costs of `start`, the round that the run began from. fitted: seconds of that."""
-        sums = {name: getattr(self, name) + getattr(start, name) for name in ("labels", "episodes", "steps")}
-        return replace(self, **sums, seconds=self.seconds + fitted)
-
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         success = {"validation_success": self.validation.rate, "validation_interval": list(self.validation.interval)}

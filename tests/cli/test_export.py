@@ -34,22 +34,16 @@ def write_run(folder: Path, kind: str = "mlp", observation: str = "state") -> Pa
     return write_checkpoint(place, kind, spec, observation, origin=meta)
 
 
-def test_it_tells_what_goes_in_and_out_and_how_near_the_checkpoint_is(here, capsys):
+def test_it_tells_how_near_the_checkpoint_the_file_is(here, capsys):
     policy = write_run(here / "run", "cnn", "both")
     assert main(["export", "run"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    first, *rest = out.splitlines()
+    first, last = out.splitlines()
     difference = re.fullmatch(rf"largest difference from {policy.relative_to(here)} over random .*: (\S+)", first)
     assert difference
     assert float(difference[1]) <= 1e-5
-    assert rest == [
-        " in: observation.state float32 (batch, 8)",
-        " in: observation.environment_state float32 (batch, 25)",
-        " in: observation.images.front uint8 (batch, 32, 48, 3)",
-        "out: action float32 (batch, 8)",
-        f"exported: policy.onnx ({(here / 'policy.onnx').stat().st_size:,} bytes)",
-    ]
+    assert last == f"exported: policy.onnx ({(here / 'policy.onnx').stat().st_size:,} bytes)"
     assert policy_sha256(policy).encode() in (here / "policy.onnx").read_bytes()
 
 

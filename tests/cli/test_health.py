@@ -14,4 +14,4 @@ def test_a_healthy_machine_says_what_it_has(capsys):
     assert main(["eval", "--check"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert re.fullmatch(r"healthy: \S.*; torch 2\.\d\S+; cores [1-9]\d*\n", out)
+    assert re.fullmatch(r"healthy: \S.*; cores [1-9]\d*\n", out)

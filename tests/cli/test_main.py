@@ -47,9 +47,10 @@ def test_the_module_runs_as_a_program():
             "manip-il: interrupted",
         ),
         (
-            ["fake", "--dataset.num_episode=1"],
+            ["fake", "--dataset.num_episods=1"],
             2,
-            "manip-il: error: unknown option '--dataset.num_episode' (did you mean '--dataset.num_episodes'?); "
+            "manip-il: error: unknown option '--dataset.num_episods' "
+            "(did you mean '--dataset.num_episodes' or '--dataset.root'?); "
             "manip-il fake --help=all lists all",
         ),
     ],

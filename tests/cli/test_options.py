@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.cli.main import COMMANDS, load
 from manip_il.cli.options import Given, Open, command_line, options_of, word
 from manip_il.cli.options import given as given_of
 from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml, parse
@@ -78,13 +77,13 @@ def test_words_change_what_they_name(words, change):
     ("words", "parts"),
     [
         (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help=all lists all"]),
-        (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--dataset.repo_id' or '--small.repo_id'?)"]),
+        (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"]),
         (["--dataset=x"], ["--dataset is a group", "--dataset.num_episodes"]),
-        (["--lr=fast"], ["--lr", "expected a number", "'fast'"]),
-        (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "a whole number", "'1.5'"]),
-        (["--loss=l2"], ["one of mse, l1", "'l2'", "did you mean 'l1'"]),
-        (["--resume=yes"], ["true or false", "'yes'"]),
-        (["--gains=1,x"], ["comma-separated list", "a number"]),
+        (["--lr=fast"], ["--lr", "expected FLOAT", "'fast'"]),
+        (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "expected INT", "'1.5'"]),
+        (["--loss=mze"], ["expected mse|l1", "'mze'", "did you mean 'mse'"]),
+        (["--resume=yes"], ["expected true|false", "'yes'"]),
+        (["--gains=1,x"], ["expected FLOAT,..."]),
     ],
 )
 def test_a_users_mistake_is_named_with_what_was_expected(words, parts):
@@ -94,7 +93,7 @@ def test_a_users_mistake_is_named_with_what_was_expected(words, parts):
 
 def test_positional_values_are_taken_in_order():
     assert parse(Doctor, ["data/x", "--repair"]) == Doctor(Path("data/x"), repair=True)
-    assert "DATASET is missing; expected a path" in fails([], Doctor)
+    assert "DATASET is missing; expected PATH" in fails([], Doctor)
     assert "unexpected 'y'" in fails(["x", "y"], Doctor)
     assert "unknown option" in fails(["--dataset=x"], Doctor)
 
@@ -114,8 +113,8 @@ def test_words_beat_yaml_beats_defaults(tmp_path):
     ("text", "parts"),
     [
         ("dataset: {num_episode: 9}", ["dataset.num_episode", "did you mean 'dataset.num_episodes'"]),
-        ("resume: 1", ["resume: expected true or false, got 1"]),
-        ("dataset: {repo_id: no}", ["expected text, got False", "quotes"]),
+        ("resume: 1", ["resume: expected true|false, got 1"]),
+        ("dataset: {repo_id: no}", ["expected TEXT, got False"]),
         ("a: [", ["is not YAML"]),
     ],
 )
@@ -209,21 +208,5 @@ def test_of_layers_the_later_one_counts():
 def test_a_layers_error_says_which_layer():
     with pytest.raises(UsageError, match=r"unknown key in x.yaml: arms.a: 'stepps' \(did you mean 'steps'\?\)"):
         from_layers(Fit, [("x.yaml: common", {"steps": 3}), ("x.yaml: arms.a", {"stepps": 3})])
-    with pytest.raises(UsageError, match=r"x.yaml: arms.a: data.num_episodes: expected a whole number, got 'many'"):
+    with pytest.raises(UsageError, match=r"x.yaml: arms.a: data.num_episodes: expected INT, got 'many'"):
         from_layers(Fit, [("x.yaml: arms.a", {"data": {"num_episodes": "many"}})])
-
-
-# Names that mean one thing in one command and another in the next; every other option is declared once.
-_OF_SEVERAL_MEANINGS = (
-    *("action_space", "branch_steps", "cases", "dataset", "dataset.root", "episodes", "journals", "method", "output"),
-    *("output_dir", "policy", "policy.type", "remote", "reward", "robot", "robot.type", "source", "steps", "target"),
-    *("task.object", "task.type", "validation_episodes"),
-)
-
-
-def test_an_option_that_commands_share_is_declared_once():
-    homes: dict[str, set[tuple[type, str]]] = {}
-    for command in COMMANDS:
-        for one in options_of(load(command)):
-            homes.setdefault(one.name, set()).add((one.home, one.path[-1]))
-    assert {name for name, places in homes.items() if len(places) > 1} == {*_OF_SEVERAL_MEANINGS}

@@ -27,7 +27,7 @@ def url(tmp_path: Path) -> str:
 def test_there_and_back_and_again_nothing_travels(run, url, tmp_path, capsys):
     assert main(["push", str(run), url]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"{url}: 2 files, 1.5 kB, uploaded; 0 removed; 0 unchanged",
+        f"{url}: 2 files, 1.5 kB, uploaded; 0 removed",
         f"next: manip-il pull {url} FOLDER",
     ]
     target = tmp_path / "got"
@@ -37,22 +37,21 @@ def test_there_and_back_and_again_nothing_travels(run, url, tmp_path, capsys):
     assert captured.err == ""
     assert (target / "metrics.jsonl").read_bytes() == b"x" * 1500
     assert main(["push", str(run), url]) == 0
-    assert capsys.readouterr().out.splitlines()[0] == f"{url}: 0 files, 0 bytes, uploaded; 0 removed; 2 unchanged"
+    assert capsys.readouterr().out.splitlines()[0] == f"{url}: 0 files, 0 bytes, uploaded; 0 removed"
 
 
 def test_dry_runs_only_say(run, url, tmp_path, capsys):
     assert main(["push", str(run), url, "--dry-run"]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        "upload   config.yaml (11 bytes)",
-        "upload   metrics.jsonl (1.5 kB)",
-        f"{url}: 2 files, 1.5 kB, to upload; 0 to remove; 0 unchanged",
-        "nothing was done",
+        "upload   config.yaml",
+        "upload   metrics.jsonl",
+        f"{url}: 2 files, 1.5 kB, would be uploaded; 0 would be removed",
     ]
     assert not (tmp_path / "store").exists()
     main(["push", str(run), url])
     capsys.readouterr()
     assert main(["pull", url, str(tmp_path / "got"), "--dry-run=true"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].endswith("a policy of 2 files, 1.5 kB; nothing was done")
+    assert capsys.readouterr().out.splitlines()[-1].endswith("a policy of 2 files, 1.5 kB, would be downloaded")
     assert not (tmp_path / "got").exists()
 
 

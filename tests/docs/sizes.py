@@ -138,18 +138,12 @@ def shrink_study(path: Path) -> None:
     if any("task.type" in arm for arm in study["arms"].values()):  # of tasks that take so few steps
         study["arms"] = {name: study["arms"][name] for name in _SHORT}
     study["arms"] = dict(list(study["arms"].items())[:2])
-    learning = [arm for arm in study["arms"].values() if "algorithm" in arm]
-    for arm in learning:
-        of_command = {option.name for option in options_of(load(f"rl {arm['algorithm']}"))}
-        arm |= {name: size for name, size in SMALL.items() if name in of_command and name != "workers"}
-        arm |= OF_COMMAND[f"rl {arm['algorithm']}"]
-    for arm in (study["common"], *(one for one in study["arms"].values() if "algorithm" not in one)):
+    common = study["common"]
+    for arm in (common, *study["arms"].values()):
         for option, size in (SMALL | GIVEN).items():
             if option in of_dagger and option in arm:
                 arm[option] = size
-    common = study["common"]
-    kept = ("workers", "env.horizon") if learning else ("workers",)  # learning arms take the task's own horizon
-    common |= {option: size for option, size in SMALL.items() if option in of_dagger and option not in kept}
+    common |= {option: size for option, size in SMALL.items() if option in of_dagger and option != "workers"}
     policy = common.setdefault("policy", {})
     policy |= OF_POLICY.get(policy.get("type", "mlp"), {})
     if "image" in common:

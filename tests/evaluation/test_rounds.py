@@ -31,6 +31,16 @@ def test_wall_clock_adds_up_without_validating():
     assert str(RUN[1].validation) == "90.0 % [59.6, 98.2]"
 
 
+def test_validated_iterations_are_rounds_and_cost_what_all_before_them_took():
+    lines = [
+        {"iteration": i, "steps": 100 * i, "episodes": 2 * i, "validation_success": rate, "validation_episodes": 10}
+        | {"seconds": {"collect": 1.0, "fit": 2.0, "validate": 4.0}}
+        for i, rate in enumerate((0.2, None, 0.5))
+    ]
+    found = [(one.unit, one.round, one.steps, one.labels, one.seconds) for one in history(lines, "x")]
+    assert found == [("iteration", 0, 0, 0, 3.0), ("iteration", 2, 200, 0, 9.0)]
+
+
 def test_best_is_the_later_of_equals_and_last_is_last():
     assert Rule("best").select(RUN, "x").round == 3
     assert Rule("last").select(RUN, "x").round == 4

@@ -66,10 +66,10 @@ def with_gripper(folder: Path, quat: str) -> list[str]:
 
 
 def test_a_hand_put_on_sideways_is_written_without_success_and_the_remedy_named(tmp_path: Path, capsys):
-    assert main(with_gripper(tmp_path, "0.7071 0.7071 0 0")) == 1
-    line = capsys.readouterr().err
-    assert f"wrote {tmp_path / 'arm.yaml'}, but it cannot be used" in line
-    assert "gripper.quaternion" in line
+    assert main(with_gripper(tmp_path, "0.7071 0.7071 0 0")) == 2
+    out, err = capsys.readouterr()
+    assert out == f"robot: {tmp_path / 'arm.yaml'}\n"
+    assert "gripper.quaternion" in err
     assert yaml.safe_load((tmp_path / "arm.yaml").read_text())["hand"] == "flange"
 
 
