@@ -104,7 +104,8 @@ def our_samples(root: Path) -> Samples:
     table = {key: values for key, values in dataset.columns().items() if values.dtype != object}
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
     pictures = {camera: decode([dataset.camera(camera)]) for camera in dataset.cameras}
-    return Samples(Windows(table["episode_index"], {}), columns, pictures, np.array([*dataset.tasks.values()], object))
+    windows, tasks, rows = Windows(table["episode_index"], {}), [*dataset.tasks.values()], np.arange(len(dataset))
+    return Samples(windows, columns, pictures, np.array(tasks, object), table, rows, rows[:0])
 
 
 def our_epoch(samples: Samples, augment: Augment | None, number: Iterator[int]) -> int:

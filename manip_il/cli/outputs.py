@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass
@@ -11,7 +10,7 @@ from typing import Any
 
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
-from manip_il.data.atomic import PARTIAL, exclusive, write_file
+from manip_il.data.atomic import PARTIAL, clear, exclusive, write_file
 from manip_il.errors import FolderExistsError, MismatchError, UsageError
 from manip_il.option import option
 
@@ -87,8 +86,7 @@ def prepare_output(
                 left.unlink()
     elif folder.exists() and any(folder.iterdir()):
         require_replaceable(folder, overwrite, sources)
-        for path in folder.iterdir():  # keep the folder itself, which may be a mount point
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+        clear(folder)
 
 
 def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] = ()) -> None:

@@ -141,9 +141,8 @@ def expert_actions(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
 
 def policy_actions(policy: LearnedPolicy, turns: Sequence[Turn]) -> F64:
     """Return a policy's action in every turn, (B, n); its memory is reset when an episode starts."""
-    if started := [turn.seed for turn in turns if turn.step == 0]:
-        policy.reset(started)
-        policy.instruct({turn.seed: turn.observation.instruction for turn in turns if turn.step == 0})
+    if started := {turn.seed: turn.observation.instruction for turn in turns if turn.step == 0}:
+        policy.begin(started)
     seen = [turn.observation for turn in turns]
     pictures = {camera: np.stack([one.images[camera] for one in seen]) for camera in policy.cameras}
     states = (np.stack([one.state for one in seen]), np.stack([one.environment_state for one in seen]))

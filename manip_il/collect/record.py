@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,6 @@ from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]
-_BETWEEN = 20  # most stored episodes yielded after each new one, since there may be thousands
 MAX_TRIES = 3  # most tries, as a multiple of the requested successes
 
 
@@ -48,7 +46,7 @@ def collect(
             on_disk.add(episode.seed)
             if on_episode is not None:
                 on_episode(episode)
-            yield from itertools.islice(ready(), _BETWEEN)
+            yield from ready()
         yield from ready()
         if waiting:
             _LOG.warning("seed %d is left out: it repeatedly killed its worker", waiting.popleft())

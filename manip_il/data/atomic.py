@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Generator
 from pathlib import Path
 
-from manip_il import checks
 from manip_il.errors import FolderExistsError, ManipError
 
 PARTIAL = ".partial"  # suffix of unfinished files and folders
@@ -33,78 +32,59 @@ def writing(path: Path) -> Generator[None]:
 def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     """Yield an empty sibling of `root` to write into; at the end, sync it to disk and rename it to `root`.
 
-    An exception removes the sibling; the next writer removes the leftovers of a killed one. Raises `FolderExistsError`
-    if `root` is not empty, at the beginning or end; with `replace` the old folder is removed once the new one is
-    complete. Raises `ManipError` if the disk is full or read-only.
+    An exception removes the sibling; the next writer removes what a killed one left. Raises `FolderExistsError` if
+    `root` is not empty, at the beginning or end; with `replace` the old folder is removed once the new one is complete.
+    Raises `ManipError` if the disk is full or read-only, or if another process writes the same folder.
     """
     root = root.absolute()
     if not (replace and root.is_dir()):
         _require_empty(root)
-    with writing(root):
-        root.parent.mkdir(parents=True, exist_ok=True)
-        for left in root.parent.glob(f".{root.name}.*{PARTIAL}"):
-            lock = os.open(left, os.O_RDONLY)
-            if _try_lock(lock):  # fails while its writer lives
-                shutil.rmtree(left, ignore_errors=True)
-            os.close(lock)
-        partial = _partial(root)
-        partial.mkdir()
-    lock = os.open(partial, os.O_RDONLY)
-    _try_lock(lock)  # the kernel releases it when the writer dies, which identifies leftovers
-    try:
-        with writing(root):
+    partial = root.with_name(f".{root.name}{PARTIAL}")
+    if partial.is_symlink():  # planted: what it leads to must not be cleared
+        partial.unlink()
+    with writing(root), exclusive(partial) as handle:
+        clear(partial)
+        try:
             yield partial
-            _libc("syncfs", lock)  # one call for all files
-        if replace and root.exists():
-            here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
-            _libc("renameat2", here, os.fsencode(partial), here, os.fsencode(root), exchange)
+            _libc("syncfs", handle)  # one call for all files
+            if replace and root.exists():
+                here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
+                _libc("renameat2", here, os.fsencode(partial), here, os.fsencode(root), exchange)
+            else:
+                _require_empty(root)
+                partial.rename(root)
+            sync(root.parent)
+        finally:
             shutil.rmtree(partial, ignore_errors=True)
-        else:
-            _require_empty(root)
-            partial.rename(root)
-        sync(root.parent)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    finally:
-        os.close(lock)
 
 
 @contextlib.contextmanager
-def exclusive(folder: Path) -> Generator[None]:
-    """Lock `folder`, which need not exist, for this process by a file `.<name>.lock` next to it.
+def exclusive(folder: Path) -> Generator[int]:
+    """Lock `folder`, which need not exist, for this process; yield it, opened.
 
-    If the file cannot be written (next to a container's volume), the folder is not locked. Raises `ManipError`, with
-    the owner's process id, if another process holds the lock. The kernel releases locks of a killed process.
+    The kernel releases the locks of a killed process. Raises `ManipError` if another process holds the lock.
     """
-    path = folder.absolute().with_name(f".{folder.absolute().name}.lock")
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle = _lock(folder, path)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
     try:
-        yield
+        if not _try_lock(handle):
+            raise ManipError(
+                f"{folder} is in use by another process; wait until that is done, or choose another folder"
+            )
+        try:
+            yield handle
+        finally:
+            with contextlib.suppress(OSError):
+                folder.rmdir()  # if nothing was written
     finally:
-        if handle is not None:
-            path.unlink(missing_ok=True)  # before unlocking, so that no other process's file is removed
-            os.close(handle)
-
-
-def _lock(folder: Path, path: Path) -> int | None:
-    """Return the lock file, open and locked; None if it cannot be written."""
-    try:
-        handle = checks.without_link(str(path), os.O_RDWR | os.O_CREAT)
-    except OSError as error:
-        if folder.is_dir() and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            return None
-        raise
-    if not _try_lock(handle):
-        holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
         os.close(handle)
-        busy = f"{folder} is in use by process {holder or 'unknown'}"
-        raise ManipError(f"{busy}; wait until that is done, or choose another folder")
-    os.ftruncate(handle, 0)
-    os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
-    return handle
+
+
+def clear(folder: Path) -> None:
+    """Delete everything in a folder, but not the folder itself, which may be locked or a mount point."""
+    for path in folder.iterdir():
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -112,7 +92,7 @@ def write_file(path: Path, data: bytes) -> None:
 
     Raises `ManipError` if the disk is full or read-only.
     """
-    partial = _partial(path)
+    partial = path.with_name(f".{path.name}.{os.urandom(6).hex()}{PARTIAL}")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -134,11 +114,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _partial(path: Path) -> Path:
-    """Return a unique sibling."""
-    return path.with_name(f".{path.name}.{os.urandom(6).hex()}{PARTIAL}")
 
 
 def _try_lock(handle: int) -> bool:

@@ -14,7 +14,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -194,18 +194,11 @@ def _table(path: Path, changed: int, key: str) -> Any:
 
 
 def _film_parts(episodes: EpisodeTable, info: Info, key: str) -> list[FrameRange]:
-    """Return maximal ranges of frames that are consecutive both in a file and in the dataset."""
+    """Return the frames of every episode."""
     clips = episodes.clips[key]
     firsts = np.round(clips.starts * info.fps).astype(np.int64)
-    found: list[FrameRange] = []
-    for place in np.argsort(episodes.start, kind="stable"):
-        count, row = int(episodes.length[place]), int(episodes.start[place])
-        path, first = clips.files[place], int(firsts[place])
-        if found and (path, first) == (found[-1].path, found[-1].first + found[-1].count):
-            found[-1] = replace(found[-1], count=found[-1].count + count)
-        elif count:
-            found.append(FrameRange(path, first, count, row))
-    return found
+    rows = zip(clips.files, firsts.tolist(), episodes.length.tolist(), episodes.start.tolist(), strict=True)
+    return sorted((FrameRange(*row) for row in rows if row[2]), key=lambda part: part.row)
 
 
 def _table_parts(root: Path, data_files: Sequence[Path]) -> list[FrameRange]:

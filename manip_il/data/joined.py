@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +11,10 @@ from numpy.typing import NDArray
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import PICTURES
 from manip_il.data.lerobot_layout import TASKS, Features
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
-from manip_il.data.statistics import PooledStatistics, Statistics
-from manip_il.errors import ManipError, MismatchError
+from manip_il.data.statistics import Statistics, pool
+from manip_il.errors import ManipError
 
 I64 = NDArray[np.int64]
-LEARNT = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)  # columns that joined datasets must share
 _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # from LeRobot, for every camera
 
 
@@ -24,24 +23,16 @@ class JoinedDatasets:
 
     features: LeRobot's table of the columns and cameras that all have with the same shape, without depth. stats: over
     all frames; for cameras those of ImageNet, as in `lerobot-train`. tasks: each text once.
-
-    Raises `MismatchError` if rates or training columns differ.
     """
 
     def __init__(self, datasets: Sequence[Dataset]):
         self.datasets, first = tuple(datasets), datasets[0]
         self.roots = tuple(one.root for one in datasets)
-        for other in self.datasets[1:]:
-            pairs = {"rate": (first.fps, other.fps)}
-            pairs |= {f"column {key}": (_shape(first, key) or "none", _shape(other, key) or "none") for key in LEARNT}
-            for what, (ours, theirs) in pairs.items():
-                if ours != theirs:
-                    raise MismatchError(what, str(first.root), ours, str(other.root), theirs)
         self.repo_id, self.fps = f"local/{first.root.name}", first.fps
         self.features: Features = {
             key: {"dtype": one.dtype, "shape": one.shape, "names": one.names}
             for key, one in first.features.items()
-            if all(_shape(other, key) == one.shape for other in self.datasets)
+            if all(key in other.features and other.features[key].shape == one.shape for other in self.datasets)
             and (one.is_rgb or one.dtype not in PICTURES)
         }
         self.camera_keys = [key for key, one in self.features.items() if one["dtype"] in PICTURES]
@@ -64,15 +55,8 @@ class JoinedDatasets:
         return np.concatenate(found)
 
     def _statistics(self) -> Statistics:
-        pooled = PooledStatistics()
-        for dataset in self.datasets:
-            numbers = self.features.keys() & dataset.statistics.keys() - {*self.camera_keys}
-            pooled.add({key: dataset.statistics[key] for key in self.features if key in numbers})
+        pooled = reduce(pool, (one.statistics for one in self.datasets))
+        numbers = {key: pooled[key] for key in self.features if key in pooled}
         imagenet = {name: np.array(values, np.float32).reshape(3, 1, 1) for name, values in _IMAGENET.items()}
         cameras = {key: self.datasets[0].statistics.get(key, {}) | imagenet for key in self.camera_keys}
-        return pooled.result() | cameras
-
-
-def _shape(dataset: Dataset, key: str) -> tuple[int, ...]:
-    """Return a column's shape; () if it is missing."""
-    return dataset.features[key].shape if key in dataset.features else ()
+        return numbers | cameras

@@ -52,8 +52,9 @@ class Journal:
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=_RECORD)
         writer.add_metadata(_RECORD, _to_texts(self, episode))
-        channels, times = foxglove.episode_channels(episode, self.spec), foxglove.frame_times(episode, self.spec)
-        foxglove.add_channels(writer, list(channels), times)
+        times = foxglove.frame_times(episode, self.spec)
+        channels = foxglove.episode_channels(episode, times, self.spec.joint_names)
+        foxglove.add_channels(writer, channels, times)
         for key, column in episode.columns.items():
             if not key.startswith(IMAGES):  # pictures are stored as lossless messages
                 numbers = BytesIO()

@@ -37,12 +37,6 @@ DRAWN = "drawn"  # our column in meta/episodes: an episode's random draws, as JS
 INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's content and its original name
-VIDEO_COLUMNS = {  # in meta/episodes, with the prefix `videos/<camera column>/`
-    "chunk_index": pa.int64(),
-    "file_index": pa.int64(),
-    "from_timestamp": pa.float64(),
-    "to_timestamp": pa.float64(),
-}
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
@@ -80,26 +74,6 @@ def data_schema(features: Features) -> pa.Schema:
     return pa.schema(fields, metadata=metadata)
 
 
-def episodes_schema(features: Features, *, drawn: bool) -> pa.Schema:
-    """Return the Arrow schema of `meta/episodes`: one row per episode, including statistics of every column.
-
-    drawn: include a column of the episodes' random draws.
-    """
-    columns = {EPISODE_INDEX: pa.int64(), "tasks": pa.list_(pa.string())}
-    for name in ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"):
-        columns[name] = pa.int64()
-    if drawn:
-        columns[DRAWN] = pa.string()
-    for key, feature in features.items():
-        if feature["dtype"] == "video":
-            columns |= {f"videos/{key}/{name}": dtype for name, dtype in VIDEO_COLUMNS.items()}
-    for key, feature in features.items():
-        if feature["dtype"] != "string":
-            is_picture = feature["dtype"] in ("video", "image")
-            columns |= {f"stats/{key}/{name}": _stat_type(name, is_picture) for name in STAT_NAMES}
-    return pa.schema(columns | dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64()))
-
-
 def tasks_table(instructions: Sequence[str]) -> pa.Table:
     """Return the table of tasks, written like pandas with `task` as index, by which LeRobot looks them up."""
     columns = [
@@ -122,10 +96,3 @@ def write_json(path: Path, data: Any) -> None:
     """Write `data` in LeRobot's JSON layout."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
-
-
-def _stat_type(name: str, is_picture: bool) -> pa.DataType:
-    """Return a statistic's type: one number per dimension, or per channel of pictures, as (3, 1, 1)."""
-    if name == "count":
-        return pa.list_(pa.int64())
-    return pa.list_(pa.list_(pa.list_(pa.float64()))) if is_picture else pa.list_(pa.float64())

@@ -24,14 +24,14 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.info import PICTURES, Info, read_info
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
-from manip_il.data.statistics import PooledStatistics, column_statistics, picture_statistics, to_lists
+from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
 from manip_il.data.video import CameraFiles, try_encoder
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 _GROUP_ROWS = 1_000  # frames per row group
-_EPISODE_ROWS = 100  # rows of meta/episodes that are buffered
+_GROUP_EPISODES = 100  # episodes per row group of meta/episodes
 _FORMAT = 1  # version of meta/manip_il.json
 Columns = Mapping[str, NDArray[Any]]
 Films = tuple[Dataset, int]  # a dataset, and the number of its episode with the same pictures, in films
@@ -60,7 +60,7 @@ def write_dataset(
     if spec.cameras and spec.video:
         try_encoder(video, spec.image_size, spec.fps)
     about = features(spec), spec.fps, spec.lerobot_type, video
-    with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about, drawn=True)) as writer:
+    with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about)) as writer:
         for item in episodes:
             episode, films = (item, None) if isinstance(item, Episode) else item
             columns = ordered_columns(episode, spec, writer.films if films else ())
@@ -75,7 +75,7 @@ def write_dataset(
 class TableWriter:
     """Writes a LeRobot dataset with any features into a folder, episode by episode.
 
-    features: the dataset's own columns and cameras. drawn: whether episodes come with their random draws.
+    features: the dataset's own columns and cameras.
     """
 
     def __init__(
@@ -85,18 +85,17 @@ class TableWriter:
         fps: float,
         robot_type: str | None,
         video: VideoConfig | None = None,
-        *,
-        drawn: bool = False,
     ):
         self.features, self.folder = layout.all_features(features), folder
         self._fps, self._robot_type = fps, robot_type
-        self._data = ParquetFiles(folder, layout.DATA_PATH, layout.data_schema(self.features), _GROUP_ROWS)
-        rows = layout.episodes_schema(self.features, drawn=drawn)
-        self._meta = ParquetFiles(folder, layout.EPISODES_PATH, rows)
+        self._schema = layout.data_schema(self.features)
+        self._data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)
+        self._meta = ParquetFiles(folder, layout.EPISODES_PATH)
+        self._rows: list[dict[str, Any]] = []
+        self._row_schema: pa.Schema | None = None  # that of the first rows
         films = [key for key, feature in features.items() if feature["dtype"] == "video"]
         self.films = {key: CameraFiles(folder, key, video or VideoConfig(), int(fps)) for key in films}
-        self._pooled = PooledStatistics()
-        self._rows: list[dict[str, Any]] = []
+        self._pooled: Statistics = {}
         self._tasks: dict[str, int] = {}  # text -> index, in order of first appearance
         self.episodes = self.frames = 0
 
@@ -115,7 +114,7 @@ class TableWriter:
                 statistics[key] = picture_statistics(columns[key])
         plain = {key: one for key, one in columns.items() if key not in statistics and one.dtype.kind not in "OU"}
         statistics |= column_statistics(plain)
-        chunk, file = self._data.write(to_table(columns, self._data.schema))
+        chunk, file = self._data.write(to_table(columns, self._schema))
         row: dict[str, Any] = {
             layout.EPISODE_INDEX: self.episodes,
             "tasks": list(dict.fromkeys(tasks)),
@@ -124,7 +123,7 @@ class TableWriter:
             "data/file_index": file,
             "dataset_from_index": self.frames,
             "dataset_to_index": self.frames + len(tasks),
-            layout.DRAWN: drawn,
+            **({} if drawn is None else {layout.DRAWN: drawn}),
         }
         for key, film in self.films.items():
             clip = film.copy(*films) if films else film.write(columns[key])
@@ -134,12 +133,15 @@ class TableWriter:
                 f"videos/{key}/from_timestamp": clip.first / self._fps,
                 f"videos/{key}/to_timestamp": (clip.first + clip.frames) / self._fps,
             }
+        statistics = {key: statistics[key] for key in self.features if key in statistics}
         for key, table in to_lists(statistics).items():
             row |= {f"stats/{key}/{name}": values for name, values in table.items()}
+        chunk, file = self._meta.next_place()
+        row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
         self._rows.append(row)
-        if len(self._rows) >= _EPISODE_ROWS:
+        if len(self._rows) == _GROUP_EPISODES:
             self._write_rows()
-        self._pooled.add({key: statistics[key] for key in self.features if key in statistics})
+        self._pooled = pool(self._pooled, statistics) if self._pooled else statistics
         self.episodes += 1
         self.frames += len(numbers)
 
@@ -171,7 +173,7 @@ class TableWriter:
         layout.write_json(self.folder / layout.INFO, about)
         tasks = layout.tasks_table(list(self._tasks))
         pq.write_table(tasks, self.folder / layout.TASKS, write_page_checksum=True)
-        layout.write_json(self.folder / layout.STATS, to_lists(self._pooled.result()))
+        layout.write_json(self.folder / layout.STATS, to_lists(self._pooled))
 
     def close(self) -> None:
         """Close all files, complete or not."""
@@ -190,10 +192,8 @@ class TableWriter:
         }
 
     def _write_rows(self) -> None:
-        """Write the buffered rows of meta/episodes."""
-        if not self._rows:
-            return
-        chunk, file = self._meta.next_place()
-        place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
-        self._meta.write(pa.Table.from_pylist([row | place for row in self._rows], self._meta.schema))
-        self._rows.clear()
+        """Write the waiting rows of meta/episodes."""
+        if self._rows:
+            table = pa.Table.from_pylist(self._rows, self._row_schema)
+            self._meta.write(table)
+            self._rows, self._row_schema = [], table.schema

@@ -35,8 +35,8 @@ class ParquetFiles:
     group in memory until the file is closed, so many small ones would need more memory than the rows.
     """
 
-    def __init__(self, folder: Path, template: str, schema: pa.Schema, group_rows: int = 1):
-        self._folder, self._template, self.schema = folder, template, schema
+    def __init__(self, folder: Path, template: str, group_rows: int = 1):
+        self._folder, self._template = folder, template
         self._limit, self._group_rows = layout.DATA_FILES_SIZE_IN_MB * 2**20, group_rows
         self._number = 0
         self._path = folder
@@ -75,9 +75,9 @@ class ParquetFiles:
         if self._writer is None:
             self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            repeating: Any = [field.name for field in self.schema if not pa.types.is_nested(field.type)]
+            repeating: Any = [field.name for field in table.schema if not pa.types.is_nested(field.type)]
             self._writer = pq.ParquetWriter(
-                *(self._path, self.schema),
+                *(self._path, table.schema),
                 compression="snappy",
                 use_dictionary=repeating,  # numbers in vectors seldom repeat
                 write_page_checksum=True,  # detects changed bits

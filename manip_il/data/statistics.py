@@ -21,27 +21,20 @@ from manip_il.data.info import reading
 from manip_il.data.lerobot_layout import QUANTILES, STAT_NAMES, STATS
 
 Statistics = dict[str, dict[str, NDArray[Any]]]  # column -> name -> one value per dimension
-F64 = NDArray[np.float64]
-_POOLED = tuple(name for name in STAT_NAMES if name != "count")
 _LEVELS = np.arange(256)  # pixel values
 
 
 def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
     """Return {column: {min, max, mean, std, count, q01, ...}} of numbers or booleans (T,) or (T, d), (d,) each."""
-    flat = {key: values.reshape(len(values), -1) for key, values in columns.items()}
-    rows = np.ascontiguousarray(np.concatenate(list(flat.values()), axis=1, dtype=np.float64, casting="unsafe").T)
-    count = rows.shape[1]
-    found = {"min": rows.min(axis=1), "max": rows.max(axis=1), "mean": rows.mean(axis=1), "std": rows.std(axis=1)}
-    places = quantile_places(count)
-    rows.partition(sorted(set(places.values())), axis=1)
-    found |= {name: rows[:, place].copy() for name, place in places.items()}
-    found["count"] = np.full(len(rows), count)
     statistics: Statistics = {}
-    start = 0
-    for key, values in flat.items():
-        stop = start + values.shape[1]
-        statistics[key] = {name: found[name][start : start + 1 if name == "count" else stop] for name in STAT_NAMES}
-        start = stop
+    for key, values in columns.items():
+        rows = np.array(values.reshape(len(values), -1).T, np.float64, order="C")
+        own = {"min": rows.min(axis=1), "max": rows.max(axis=1), "mean": rows.mean(axis=1), "std": rows.std(axis=1)}
+        places = quantile_places(len(values))
+        rows.partition(sorted(set(places.values())), axis=1)
+        own |= {name: rows[:, place].copy() for name, place in places.items()}
+        own["count"] = np.array([len(values)])
+        statistics[key] = {name: own[name] for name in STAT_NAMES}
     return statistics
 
 
@@ -69,47 +62,23 @@ def quantile_places(count: int) -> dict[str, int]:
     return {name: max(math.ceil(share * count), 1) - 1 for name, share in QUANTILES.items()}
 
 
-class PooledStatistics:
-    """Pooled statistics of episodes or datasets with the same columns; quantiles may be missing."""
+def pool(one: Statistics, other: Statistics) -> Statistics:
+    """Return the pooled statistics of the columns that two episodes or datasets share; quantiles may be missing.
 
-    def __init__(self) -> None:
-        self._first: Statistics = {}
-        self._sums: dict[str, F64] = {}  # statistic -> values of all columns, concatenated
-        self._count = 0
+    Mean and std follow Chan et al. (1979), Updating formulae and a pairwise algorithm, eq. 2.1.
+    """
+    return {key: _pool(one[key], other[key]) for key in one if key in other}
 
-    def add(self, episode: Statistics) -> None:
-        """Add the statistics of one episode or dataset.
 
-        Mean and std follow Chan et al. (1979), Updating formulae and a pairwise algorithm, eq. 2.1.
-        """
-        names = [name for name in _POOLED if all(name in one for one in episode.values())]
-        new = {name: np.concatenate([one[name].ravel() for one in episode.values()]) for name in names}
-        more = int(next(iter(episode.values()))["count"][0])
-        old, self._count = self._sums, self._count + more
-        if not old:
-            self._first, self._sums = episode, new
-            return
-        share = more / self._count
-        apart = new["mean"] - old["mean"]
-        spread = (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
-        means = [name for name in ("mean", *QUANTILES) if name in old and name in new]
-        self._sums = {name: old[name] + share * (new[name] - old[name]) for name in means} | {
-            "min": np.minimum(old["min"], new["min"]),
-            "max": np.maximum(old["max"], new["max"]),
-            "std": np.sqrt(spread),
-        }
-
-    def result(self) -> Statistics:
-        """Return the statistics of all frames."""
-        statistics: Statistics = {}
-        start = 0
-        for key, one in self._first.items():
-            shape, size = one["mean"].shape, one["mean"].size
-            own = {name: values[start : start + size].reshape(shape) for name, values in self._sums.items()}
-            own["count"] = np.array([self._count])
-            statistics[key] = {name: own[name] for name in STAT_NAMES if name in own}
-            start += size
-        return statistics
+def _pool(old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    count = old["count"] + new["count"]
+    share, apart = new["count"] / count, new["mean"] - old["mean"]
+    spread = (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
+    found = {"min": np.minimum(old["min"], new["min"]), "max": np.maximum(old["max"], new["max"])}
+    found |= {"std": np.sqrt(spread), "count": count}
+    means = [name for name in ("mean", *QUANTILES) if name in old and name in new]
+    found |= {name: old[name] + share * (new[name] - old[name]) for name in means}
+    return {name: found[name] for name in STAT_NAMES if name in found}
 
 
 def to_lists(statistics: Statistics) -> dict[str, dict[str, list[Any]]]:

@@ -37,7 +37,7 @@ def leftovers(root: Path) -> list[Path]:
     """Return unneeded temporary files and folders in a dataset and next to it."""
     root = root.absolute()
     inside = [path for path in [*root.iterdir(), *root.glob("meta/*")] if _TEMPORARY.fullmatch(path.name)]
-    beside = root.parent.glob(f".{root.name}.*.partial")
+    beside = root.parent.glob(f".{root.name}.*partial")
     return sorted(path for path in [*inside, *beside] if any(one.is_file() for one in [path, *path.rglob("*")]))
 
 

@@ -44,7 +44,7 @@ class MeasuredJointsStep(RelativeActionsProcessorStep):
         """Return the same transition. Raises `ManipError` if it has an action from a dataset."""
         if transition.get(TransitionKey.ACTION) is not None and not self.converted:
             raise ManipError(
-                "this policy learns actions in a space of manip_il's, which are not in the dataset; go on with "
+                "this policy learns converted actions, which the dataset does not have; continue with "
                 "manip-il train --resume=true"
             )
         self._last_state = (transition.get(TransitionKey.OBSERVATION) or {}).get(STATE)
@@ -70,8 +70,8 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
         if not isinstance(targets, torch.Tensor) or states is None or targets.shape != states.shape:
             given = f"{tuple(getattr(targets, 'shape', ()))} of {None if states is None else tuple(states.shape)}"
             raise ManipError(
-                f"{self.action_space}: an action is made with the joints measured in its own step; expected the "
-                f"output of one step and its observation, (B, n) both, not {given}"
+                f"{self.action_space}: an action is converted with the joints measured at its own step; expected the "
+                f"output of one step and its observation, both (B, n), not {given}"
             )
         rows = targets.detach().to("cpu", torch.float32).numpy()
         actions = Conversion(self.action_space, self.robot).decode(rows, states.to("cpu", torch.float32).numpy())

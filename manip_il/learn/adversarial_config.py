@@ -19,7 +19,7 @@ class PPOConfig:
         at_most=1,
     )
     epochs: int = option(10, "passes over an iteration's steps", at_least=1)
-    minibatches: int = option(4, "gradient steps in one pass", at_least=1)
+    minibatches: int = option(4, "gradient steps per pass", at_least=1)
     gamma: float | None = option(
         None, "discount per control step; by default 0.9, or 0.97 for a clone", at_least=0, at_most=1
     )
@@ -27,7 +27,7 @@ class PPOConfig:
     clip_range: float = option(0.2, "clipping range of the probability ratio", at_least=1e-6, at_most=1)
     entropy: float = option(0.0, "weight of the entropy bonus", at_least=0)
     target_kl: float = option(
-        0.05, "end an iteration's passes once the KL divergence reaches 1.5 times this [nats]", at_least=1e-6
+        0.05, "stop an iteration's passes if the KL divergence exceeds 1.5 times this [nats]", at_least=1e-6
     )
 
     def __post_init__(self) -> None:
@@ -48,8 +48,8 @@ class DiscriminatorConfig:
 
     width: int = option(128, "units in each of the two hidden layers", at_least=1)
     lr: float = option(1e-3, "learning rate", at_least=1e-9, at_most=1)
-    steps: int = option(10, "gradient steps an iteration", at_least=1)
-    batch_size: int = option(256, "transitions of the expert in a step, and as many of the learner", at_least=1)
+    steps: int = option(10, "gradient steps per iteration", at_least=1)
+    batch_size: int = option(256, "transitions of the expert per gradient step, and as many of the learner", at_least=1)
     penalty: float = option(1.0, "weight of the gradient penalty; 0: none", at_least=0)
 
     def __post_init__(self) -> None:

@@ -23,7 +23,6 @@ from manip_il.sim.config import CameraConfig, Look
 
 CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
 MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that convert actions
-LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
 _STEPS = (  # registry names of LeRobot's default steps, and ours: they load nothing
     *("rename_observations_processor", "to_batch_processor", "device_processor"),
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
@@ -108,11 +107,8 @@ def read_origin(path: Path) -> Origin | None:
     file = Path(path) / META_FILE
     if not file.is_file():
         return None
-    try:
-        return Origin(**checks.read_json(file, "what a policy was trained for", LARGEST_JSON))
-    except (ManipError, TypeError) as error:
-        line = checks.one_line(error)
-        raise ManipError(f"{file} cannot be read ({line}); train again, or restore the file") from error
+    with in_one_line(f"{file} cannot be read"):
+        return Origin(**checks.read_json(file, "what a policy was trained for"))
 
 
 @dataclass(frozen=True)
@@ -143,15 +139,12 @@ class Checkpoint:
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
         processors = {name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
-        try:
+        with in_one_line(f"{path / CONFIG} has features that cannot be read"):
             inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
             action = math.prod(outputs[ACTION][1])
             pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
             sizes = {name: (height, width) for name, (_, height, width) in pictures.items()}
             space, robot = _space(config, processors.get(PROCESSORS[1], []))
-        except (ManipError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
-            line = f"{type(error).__name__}: {checks.one_line(error)}"
-            raise ManipError(f"{path / CONFIG} has features that cannot be read ({line})") from error
         return cls(
             path,
             config,
@@ -202,13 +195,6 @@ class Checkpoint:
         """Raise `ManipError` unless `trust` is given or the policy and its processors load nothing by name."""
         steps = [step for steps in self.processors.values() for step in steps]
         require_trust(self.config, str(self.path), trust, steps)
-
-    def require_processors(self) -> None:
-        """Raise `ManipError` unless both processors exist."""
-        for name in PROCESSORS:
-            if name not in self.processors:
-                hint = "LeRobot's migrate_policy_normalization adds it to an old checkpoint"
-                raise ManipError(f"no {self.path / name}; {hint}")
 
 
 def policy_sha256(policy: Path) -> str:
@@ -278,20 +264,20 @@ def require_trust(
     texts = sorted({value for value in named if isinstance(value, str)})
     if (kind not in PLAIN or texts) and not trust:
         raise ManipError(
-            f"{source} is a policy of type {kind!r} that would load what it names ({checks.shorten(texts)}): this "
-            "fetches files and may run code that comes with them; if you trust its source, add --trust=true"
+            f"{source} is a policy of type {kind!r}, which loads what it names ({checks.shorten(texts)}): "
+            "this downloads files and may run code in them; if you trust its source, add --trust=true"
         )
 
 
 def read_config(path: Path) -> dict[str, Any]:
     """Return the `config.json` of a folder. Raises `ManipError` if the folder is incomplete."""
     if not (path / CONFIG).is_file():
-        raise ManipError(f"no {CONFIG} in {path}; expected LeRobot's pretrained_model folder")
+        raise ManipError(f"no {CONFIG} in {path}; expected a pretrained_model folder of LeRobot's")
     if not (path / WEIGHTS).is_file():
         raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
-    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json", LARGEST_JSON)
+    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json")
     if not isinstance(config.get("type"), str):
-        raise ManipError(f"{path / CONFIG} is not a LeRobot policy's: it names no type")
+        raise ManipError(f"{path / CONFIG} is not the configuration of a LeRobot policy: it has no type")
     return config
 
 
@@ -300,13 +286,12 @@ def processor_steps(path: Path) -> list[dict[str, Any]]:
 
     Refuses steps given by import path, as LeRobot would import and call whatever a downloaded file names.
     """
-    values = checks.read_json(path, "a processor of LeRobot's", LARGEST_JSON)
-    try:
+    values = checks.read_json(path, "a processor of LeRobot's")
+    with in_one_line(f"{path} cannot be read"):
         if odd := next((step for step in values["steps"] if "registry_name" not in step), None):
-            raise ManipError(f"it asks to run {checks.shorten(odd.get('class'))}; only registered steps are loaded")
+            name = checks.shorten(odd.get("class"))
+            raise ManipError(f"{path} asks to run {name}; only registered steps are loaded")
         return [
             {"registry_name": str(step["registry_name"]), "config": checks.mapping("config", step.get("config", {}))}
             for step in values["steps"]
         ]
-    except (ManipError, KeyError, TypeError, AttributeError) as error:
-        raise ManipError(f"{path} cannot be read: {checks.one_line(error)}") from error

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any, cast, override
 
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from torch import Tensor, nn
+from torch.nn.functional import grid_sample
 
 from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, KEYPOINTS, STATE
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import UsageError
 from manip_il.learn.mlp import MLPConfig, MLPPolicy, offsets_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
@@ -27,7 +27,6 @@ from manip_il.option import option
 __all__ = ["CNNConfig", "CNNPolicy", "make_cnn_pre_post_processors"]
 __path__: list[str] = []
 
-MIN_SIDE = 32  # smallest side of a picture [pixels]
 NUMBERS = 4  # numbers per keypoint: x, y, spread, strength
 STRIDE = 4  # distance between cells of the heat maps [pixels]
 _LIGHT, _COLOUR = 4.0, 16.0  # pictures vary far more in brightness than in colour; these scales equalise them
@@ -57,8 +56,8 @@ class CNNConfig(MLPConfig):
 
     channels: tuple[int, ...] = (16, 32, 32, 32)
     keypoints: int = option(32, "keypoints per camera", at_least=1)
-    aux_weight: float = option(0.5, "loss weight of the predicted state", at_least=0)
-    heatmap_weight: float = option(0.0, "loss weight of the heat maps", at_least=0)
+    aux_weight: float = option(0.5, "weight of the loss of the predicted state", at_least=0)
+    heatmap_weight: float = option(0.0, "weight of the loss of the heat maps", at_least=0)
     privileged_size: int = 0  # size of the predicted state; taken from the dataset
     named_points: int = 0  # number of points with a heat map; taken from the dataset
 
@@ -71,19 +70,17 @@ class CNNConfig(MLPConfig):
         super().__post_init__()
         self.channels = tuple(self.channels)
         if len(self.channels) < 2 or min(self.channels) < 1:
-            raise UsageError(f"policy.channels is {list(self.channels)}; expected two layers or more")
+            raise UsageError(
+                f"policy.channels is {list(self.channels)}; expected at least two layers, of at least one channel each"
+            )
 
     @override
     def validate_features(self) -> None:
-        """Raise unless there are `observation.state`, `action` of the same size, and pictures, (3, H, W) each."""
+        """Raise unless there are `observation.state`, `action` of the same size, and pictures."""
         super().validate_features()
         if not self.image_features:
             have = ", ".join(self.input_features or {})
             raise UsageError(f"the cnn policy needs pictures (observation.images.*); the inputs are {have}")
-        for key, feature in self.image_features.items():
-            shape = tuple(feature.shape)
-            if len(shape) != 3 or shape[0] != 3 or min(shape[1:]) < MIN_SIDE:
-                raise MismatchError("shape", key, shape, "the cnn policy", f"(3, >= {MIN_SIDE}, >= {MIN_SIDE})")
 
 
 def _perceptron(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
@@ -330,16 +327,12 @@ def heat_map_losses(maps: Tensor, places: Tensor) -> Tensor:
     among the four around it by bilinear weights.
     """
     size = torch.tensor([maps.shape[3], maps.shape[2]], device=maps.device)
-    at = ((places[..., :2] * STRIDE * size - 0.5) / STRIDE).clamp(min=0).minimum(size - 1.0)
-    low = at.floor().minimum(size - 2.0)
-    share, low = at - low, low.long()
-    losses = torch.zeros_like(share[..., 0])
-    for right, below in product((0, 1), repeat=2):
-        weight = (share[..., 0] if right else 1 - share[..., 0]) * (share[..., 1] if below else 1 - share[..., 1])
-        cell = (low[..., 1] + below) * maps.shape[3] + low[..., 0] + right
-        losses = losses - weight * maps.flatten(2).gather(2, cell.unsqueeze(-1)).squeeze(-1)
+    at = (places[..., :2] * STRIDE * size - 0.5) / STRIDE
+    grid = 2 * at / (size - 1) - 1  # from -1 at the first cell's centre to 1 at the last one's
+    each = maps.flatten(0, 1).unsqueeze(1), grid.view(-1, 1, 1, 2)
+    found = grid_sample(*each, padding_mode="border", align_corners=True).view(places.shape[:2])
     seen = places[..., 2]
-    return (losses * seen).sum(1) / seen.sum(1).clamp(min=1)
+    return -(found * seen).sum(1) / seen.sum(1).clamp(min=1)
 
 
 def _light_and_colour(pictures: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ class EpisodePolicy:
     """A LeRobot policy with its processors and one memory per episode.
 
     module: the policy without any episode's memory. task: instruction for a policy that reads language, in episodes
-    without one from `instruct`.
+    without one from `begin`.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class EpisodePolicy:
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> Tensor:
         """Return one action per row, (B, n). Episodes that are not listed have ended and are forgotten."""
-        self.forget([episode for episode in self._steps if episode not in set(episodes)])
+        self._forget([episode for episode in self._steps if episode not in set(episodes)])
         seeds = [self._next_seed(episode) for episode in episodes]
         # mixed precision if the policy was trained with it, as in lerobot-eval
         half = torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
@@ -66,15 +66,15 @@ class EpisodePolicy:
                 actions = torch.cat([self._one(*row) for row in zip(rows, episodes, seeds, strict=True)])
         return actions.to("cpu", torch.float32)
 
-    def forget(self, episodes: Iterable[int]) -> None:
-        """Drop the memory of these episodes."""
+    def begin(self, instructions: Mapping[int, str]) -> None:
+        """Drop the memory of episodes that begin, and set their instructions."""
+        self._forget(instructions)
+        self._instructions.update({episode: text for episode, text in instructions.items() if text})
+
+    def _forget(self, episodes: Iterable[int]) -> None:
         for episode in episodes:
             for kept in (self._memories, self._steps, self._instructions):
                 kept.pop(episode, None)
-
-    def instruct(self, instructions: Mapping[int, str]) -> None:
-        """Set the instructions of episodes that begin, by their numbers."""
-        self._instructions.update({episode: text for episode, text in instructions.items() if text})
 
     def _one(self, row: Batch, episode: int, seed: int) -> Tensor:
         if episode not in self._memories:

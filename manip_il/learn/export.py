@@ -20,11 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from manip_il.checks import mapping, shorten
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
-from manip_il.learn.checkpoint import CONFIG
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
@@ -150,11 +148,10 @@ def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
 def _load(path: Path) -> LearnedPolicy:
     """Return the policy in a folder. Raises `ManipError` for a policy that cannot be exported."""
     policy = LearnedPolicy.load(path)
-    modes = policy.checkpoint.config.get("normalization_mapping", {})
-    if any(mode != "IDENTITY" for mode in mapping(f"{path / CONFIG}: normalization_mapping", modes).values()):
-        raise ManipError(f"{path / CONFIG}: normalization_mapping is {shorten(modes)}; expected IDENTITY for all")
     if policy.checkpoint.space == EE_DELTA:
-        raise ManipError(f"{path} has learnt {EE_DELTA}, and a file holds no inverse kinematics; use {JOINT_DELTA}")
+        raise ManipError(
+            f"{path} learnt {EE_DELTA}, whose inverse kinematics cannot be exported; train with {JOINT_DELTA}"
+        )
     return policy
 
 

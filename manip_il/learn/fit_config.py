@@ -50,36 +50,36 @@ class FitConfig:
 
     policy: Mapping[str, Any] = option(
         dict,
-        "an option of the policy by its name: type (mlp, cnn or one of LeRobot's), path of a policy to start from, or "
-        "one that --policy.type=TYPE --help lists",
+        "an option of the policy: type (mlp, cnn or one of LeRobot's), path (a policy to start from), or any option "
+        "that --policy.type=TYPE --help lists",
     )
     action_space: ActionSpace | None = option(
-        None, "what is learnt, out of the same dataset; by default joint_delta by mlp and cnn, else joint_target"
+        None, "what the policy learns to predict; by default joint_delta for mlp and cnn, else joint_target"
     )
     observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
+        None, "what the policy observes in addition to the joints; by default images for cnn, else state"
     )
     steps: int | None = option(None, f"gradient steps; {_by_default('steps')}", grows=True, at_least=1)
     batch_size: int | None = option(None, f"frames per step; {_by_default('batch_size')}", at_least=1)
     lr: float | None = option(None, "peak learning rate; by default the policy's own", at_least=1e-15)
     optimizer: Mapping[str, Any] = option(
-        dict, "an option of an optimiser in place of the policy's own: type (adamw), weight_decay, ..."
+        dict, "an option of an optimiser that replaces the policy's own: type (adamw, ...), weight_decay, ..."
     )
     scheduler: Mapping[str, Any] = option(
-        dict, "an option of a schedule of the learning rate in place of the policy's own: type, ..."
+        dict, "an option of a learning-rate schedule that replaces the policy's own: type, ..."
     )
     eval_split: float = option(
         0.05, "share of the episodes held out for val_loss", flag="dataset.eval_split", at_least=0, at_most=0.99
     )
     image_augment: bool | None = option(
-        None, "random crops and colour jitter of pictures while training; by default for all but cnn"
+        None, "random crops and colour jitter during training; by default on, except for cnn"
     )
-    threads: int = option(1, "PyTorch threads; more help only on free cores", free=True, at_least=1)
+    threads: int = option(1, "PyTorch threads; more than one helps only if cores are idle", free=True, at_least=1)
     save_freq: int | None = option(
         None, f"steps between checkpoints; {_by_default('save_freq')}", free=True, at_least=1
     )
     log_freq: int = option(200, "steps between metrics", free=True, at_least=1)
-    tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard", free=True)
+    tensorboard: bool = option(False, "write curves for TensorBoard to OUTPUT_DIR/tensorboard", free=True)
     wandb: Mapping[str, Any] = option(dict, "an option of Weights & Biases: enable, project, mode, ...", free=True)
     trust: bool = False
     seed: int = 0
@@ -88,10 +88,14 @@ class FitConfig:
     def __post_init__(self) -> None:
         check_bounds(self)
         if "path" in self.policy and "type" in self.policy:
-            raise UsageError("give one of --policy.path=DIR and --policy.type=...: the type is in the checkpoint")
+            raise UsageError(
+                "--policy.path and --policy.type exclude each other: a checkpoint has its own type; give one of them"
+            )
         check_convertible(self.kind, self.action_space or JOINT_TARGET)
         if self.is_mlp and self.takes_images:
-            raise UsageError(f"--policy.type=mlp does not take images, so not --observation={self.observes}; use cnn")
+            raise UsageError(
+                f"--observation={self.observes} needs a policy that takes images, unlike mlp; use --policy.type=cnn"
+            )
 
     @cached_property
     def start(self) -> Checkpoint | None:
@@ -139,9 +143,9 @@ class FitConfig:
 
 
 def check_convertible(kind: str, space: str) -> None:
-    """Raise `UsageError` for a policy type whose processors cannot carry an action space."""
+    """Raise `UsageError` for a policy type that does not support an action space."""
     if space != JOINT_TARGET and kind not in CONVERTED:
         raise UsageError(
-            f"action_space is {space!r}, which LeRobot's processors of {kind!r} cannot carry; expected {JOINT_TARGET}, "
+            f"action_space is {space!r}, which --policy.type={kind} does not support; expected {JOINT_TARGET}, "
             f"or --policy.type={', '.join(CONVERTED[:-1])} or {CONVERTED[-1]}"
         )

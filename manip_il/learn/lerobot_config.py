@@ -60,7 +60,7 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     """
     given = {name: value for name, value in fit.policy.items() if name not in ("type", "path")}
     if str(given.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot would choose another
-        raise UsageError(f"--policy.device={given['device']}, but torch sees no graphics card here; expected cpu")
+        raise UsageError(f"--policy.device={given['device']}, but PyTorch finds no GPU here; expected cpu")
     given.setdefault("device", "cuda" if torch.cuda.is_available() else "cpu")
     source, options = f"--policy.type={fit.kind}", dict(given)
     cls = policy_class(fit.kind)

@@ -39,10 +39,10 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     config.pretrained_path = None if warm else resumed or start
     what = f"{config.pretrained_path} does not fit this policy"
     if config.pretrained_path is None:
-        what = f"cannot make --policy.type={config.type}"
+        what = f"cannot build --policy.type={config.type}"
     if weights:
         what += (
-            f" with {weights} (without a network: --policy.pretrained_backbone_weights=null, or put the file that "
+            f" with {weights} (offline, use --policy.pretrained_backbone_weights=null, or put the file that "
             f"torchvision names into {torch.hub.get_dir()}/checkpoints)"
         )
     with _lerobot(what):
@@ -72,11 +72,10 @@ def load_processors(
 ) -> tuple[Any, Any]:
     """Return the processors of a checkpoint, on the configuration's device. learns: whether a fit continues from it.
 
-    Raises `ManipError` if they do not exist, and what `Checkpoint.require_trust` raises.
+    Raises what `Checkpoint.require_trust` and LeRobot raise.
     """
-    checkpoint.require_processors()
     checkpoint.require_trust(trust)
-    names = [step["registry_name"] for step in checkpoint.processors[PROCESSORS[0]]]
+    names = [step["registry_name"] for step in checkpoint.processors.get(PROCESSORS[0], ())]
     overrides = {_DEVICE_STEP: {"device": config.device}, **({MEASURED: {"converted": True}} if learns else {})}
     kept = {name: values for name, values in overrides.items() if name in names}
     return make_pre_post_processors(config, str(checkpoint.path), preprocessor_overrides=kept)

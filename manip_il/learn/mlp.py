@@ -169,7 +169,7 @@ class MLPPolicy(PreTrainedPolicy):
         table = dict(getattr(dataset_meta, "table", {}))
         if config.action_space == EE_DELTA and not table:
             raise ManipError(
-                f"{EE_DELTA} needs the robot's kinematics, which LeRobot has not: train with manip-il train"
+                f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with manip-il train"
             )
         wanted = [key for key in (*self.inputs, ACTION, LABEL_VALID, *self._more_columns()) if key not in table]
         if names := [key for key in wanted if key in dataset_meta.features]:
@@ -196,7 +196,7 @@ def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
     names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
     found = tuple(i for i, name in enumerate(names) if "_from_" in name)
     if not found:
-        raise UsageError(f"policy.scales is for offsets (..._from_...) among what is seen; there are {list(names)}")
+        raise UsageError(f"policy.scales needs offsets (..._from_...) among the inputs, which are {list(names)}")
     return found
 
 

@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from manip_il import checks
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import ARM, GRIPPER
-from manip_il.learn.checkpoint import WEIGHTS
+from manip_il.learn.checkpoint import WEIGHTS, in_one_line
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
 from manip_il.option import check_bounds, option
@@ -55,10 +53,10 @@ class Shape:
     depth: int = option(3, "hidden layers", at_least=1)
     activation: str = "silu"
     loss: str = "l1"
-    components: int = option(5, "Gaussians of a mixture", at_least=1)
-    bins: int = option(21, "bins a dimension", at_least=2)
-    sigma: float | None = option(None, "by default 3 bins", at_least=0)
-    clamp: float = option(10.0, "standard deviations", at_least=1e-9)
+    components: int = option(5, "Gaussians in a mixture", at_least=1)
+    bins: int = option(21, "bins per dimension", at_least=2)
+    sigma: float | None = option(None, "smearing of targets [bins]; by default 3", at_least=0)
+    clamp: float = option(10.0, "bound on the inputs [standard deviations]", at_least=1e-9)
     action_space: str = JOINT_DELTA
     scales: tuple[float, ...] = ()
     scaled: tuple[int, ...] = ()
@@ -209,10 +207,8 @@ def threads(count: int) -> Iterator[None]:
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
     """Return weights (n, d) and statistics (n,) by name from a `pretrained_model` folder. Raises `ManipError`."""
     path = Path(pretrained_model) / WEIGHTS
-    try:
+    with in_one_line(f"{path} cannot be read"):
         return {name.removeprefix("model."): tensor for name, tensor in load_file(path).items()}
-    except (SafetensorError, OSError) as error:
-        raise ManipError(f"{path} cannot be read: {checks.one_line(error)}") from error
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.checkpoint import CONFIG, Checkpoint
+from manip_il.learn.checkpoint import CONFIG, Checkpoint, in_one_line
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
 from manip_il.mdp import F32, F64, Images
@@ -39,12 +38,12 @@ class LearnedPolicy:
         """Load any LeRobot `pretrained_model` folder, only from JSON and safetensors unless `trust`.
 
         The mlp is loaded without LeRobot, whose import takes seconds; other policies by LeRobot's own factory. task:
-        instruction for a policy that reads language, if `instruct` gives no other. trust: also load models and code
+        instruction for a policy that reads language, if `begin` gives no other. trust: also load models and code
         that the checkpoint names. Raises what `Checkpoint.open` raises, `ManipError` for files that do not match or,
         without `trust`, that name models to load; `UnknownName` for an unknown type of policy.
         """
         if device.startswith("cuda") and not torch.cuda.is_available():
-            raise UsageError(f"device is {device!r}, but torch sees no graphics card here; expected 'cpu'")
+            raise UsageError(f"device is {device!r}, but PyTorch finds no GPU here; expected 'cpu'")
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
         if opened.kind == MLP:
             return cls(_Perceptron(opened, device), opened)
@@ -82,16 +81,15 @@ class LearnedPolicy:
         found = actions.cpu().numpy().astype(np.float64)
         if not (finite := np.isfinite(found)).all():
             row = int(np.argmin(finite.all(axis=1)))
-            raise NotFiniteError(f"the policy's action in row {row} is {found[row]}: not finite")
+            raise NotFiniteError(f"the policy's action in row {row} is not finite: {found[row]}")
         return found
 
-    def reset(self, episodes: Iterable[int]) -> None:
-        """Reset the memory of episodes that begin."""
-        self._policy.forget(episodes)
+    def begin(self, instructions: Mapping[int, str]) -> None:
+        """Reset the memory of episodes that begin; their instructions, by number, are for a policy that reads language.
 
-    def instruct(self, instructions: Mapping[int, str]) -> None:
-        """Set the instructions of episodes that begin, by their numbers, for a policy that reads language."""
-        self._policy.instruct(instructions)
+        An empty instruction stands for the policy's `task`.
+        """
+        self._policy.begin(instructions)
 
     def _numbers(self, states: F32, environment_states: F32) -> Batch:
         given = {STATE: states, ENVIRONMENT_STATE: environment_states}
@@ -134,12 +132,9 @@ class _Perceptron:
         self._device = device
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in checkpoint.numbers]
         width = sum(checkpoint.numbers[key] for key in self._keys)
-        try:
+        with in_one_line(f"{checkpoint.path}: weights and {CONFIG} do not match"):
             self.module = MLPNetwork(width, checkpoint.action, Shape.of(checkpoint.config))
             self.module.load_state_dict(read_weights(checkpoint.path))
-        except (TypeError, RuntimeError) as error:
-            line = checks.one_line(error)
-            raise ManipError(f"{checkpoint.path}: weights and {CONFIG} do not match: {line}") from error
         self.module.to(device).eval()
         space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network does the others itself
         self._conversion = Conversion(space, checkpoint.robot)
@@ -154,11 +149,8 @@ class _Perceptron:
             return targets
         return torch.from_numpy(self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy()))
 
-    def forget(self, episodes: Iterable[int]) -> None:
-        """Do nothing: the mlp has no memory."""
-
-    def instruct(self, instructions: Mapping[int, str]) -> None:
-        """Do nothing: the mlp does not read language."""
+    def begin(self, instructions: Mapping[int, str]) -> None:
+        """Do nothing: the mlp has no memory, and does not read language."""
 
     def _inputs(self, batch: Batch) -> torch.Tensor:
         return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)

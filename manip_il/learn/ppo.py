@@ -291,7 +291,7 @@ def start_policy(start: Path | None, space: str, spec: RobotTaskSpec, rows: tupl
         inputs = policy.model.expanded(torch.from_numpy(rows[0])).numpy()
         policy.model.set_statistics(fit_statistics(inputs, rows[1], _GAUSSIAN))
     else:
-        raise UsageError("no demonstrations and no policy to begin with; give --dataset.root=DIR or --init=RUN")
+        raise UsageError("no demonstrations and no policy to start from; give --dataset.root=DIR or --init=RUN")
     return policy
 
 

@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import generator_of
-from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, read_config, read_origin
+from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one_line, read_config, read_origin
 from manip_il.learn.network import read_weights, threads
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
@@ -162,19 +162,15 @@ class LearnedReward:
 
         Raises `ManipError` for a folder that is incomplete or not such a reward.
         """
-        config = read_config(path)
-        if config["type"] != PREFERENCE:
-            raise ManipError(f"{path} is of type {checks.shorten(config['type'])}; expected a reward, {PREFERENCE!r}")
-        origin = read_origin(path)
-        if origin is None:
-            raise ManipError(f"{path} does not say for which robot and task it is: {META_FILE} is missing")
-        try:  # fields missing in older files have their defaults
+        config, origin = read_config(path), read_origin(path)
+        if config["type"] != PREFERENCE or origin is None:
+            kind = checks.shorten(config["type"])
+            raise ManipError(f"{path} is of type {kind}; expected {PREFERENCE!r}, with {META_FILE}")
+        with in_one_line(f"{path}: {CONFIG}, {META_FILE} and {WEIGHTS} do not match"):
+            # fields missing in older files have their defaults
             shape = RewardShape(**{one.name: config[one.name] for one in fields(RewardShape) if one.name in config})
             network = RewardNetwork(sum(_widths(origin).values()), shape)
             network.load_state_dict(read_weights(path))
-        except (TypeError, IndexError, RuntimeError) as error:
-            line = checks.one_line(error)
-            raise ManipError(f"{path}: {CONFIG}, {META_FILE} and {WEIGHTS} do not match: {line}") from error
         return cls(network, origin)
 
     def check_fits(self, name: str, spec: RobotTaskSpec) -> None:
@@ -189,14 +185,10 @@ class LearnedReward:
 
     @torch.inference_mode()
     def of_inputs(self, inputs: F32) -> F32:
-        """Return the reward, (B,), of concatenated inputs (B, n + k + n). Raises `NotFiniteError` unless finite."""
+        """Return the reward, (B,), of concatenated inputs (B, n + k + n)."""
         with threads(1):
             parts = [self.network(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
-        rewards = np.concatenate(parts) if parts else np.empty(0, np.float32)
-        if not np.isfinite(rewards).all():
-            row = int(np.argmin(np.isfinite(rewards)))
-            raise NotFiniteError(f"the reward of row {row} is {rewards[row]}: its inputs or the weights are not finite")
-        return rewards
+        return np.concatenate(parts)
 
     @torch.inference_mode()
     def members(self, inputs: F32) -> F64:
@@ -290,7 +282,7 @@ def deal(pair: I64, folds: int, seed: int) -> I64:
     """Return the fold of every answer, (A,); all answers about a pair are in the same fold."""
     names, place = np.unique(pair, return_inverse=True)
     if len(names) < folds:
-        raise ManipError(f"{len(names)} pairs are answered by left, right or equal; expected at least {folds}")
+        raise ManipError(f"only {len(names)} pairs are answered by left, right or equal; expected at least {folds}")
     order = np.random.default_rng([seed, 2]).permutation(len(names))
     return (order % folds)[place]
 

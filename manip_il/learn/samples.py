@@ -75,7 +75,9 @@ class Windows:
         sound = valid[self.rows(samples, ACTION)[0]]
         samples = samples[sound if sound.ndim == 1 else sound.all(axis=1)]
         if len(samples) == 0:
-            raise ManipError(f"none of {len(valid)} frames has valid labels in its whole window: nothing to learn from")
+            raise ManipError(
+                f"none of {len(valid)} frames has valid labels in its whole window, so there is nothing to learn from"
+            )
         return samples
 
 
@@ -91,13 +93,16 @@ class Samples:
     """Samples in memory; a batch is one gather per column.
 
     columns: numbers, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8 (N, 3, H, W). tasks: text of
-    every `task_index`, (M,).
+    every `task_index`, (M,). table: the columns as arrays, with those that are not inputs. train, held_out: samples.
     """
 
     windows: Windows
     columns: dict[str, torch.Tensor]
     pictures: dict[str, NDArray[np.uint8]]
     tasks: NDArray[np.object_]
+    table: Table
+    train: I64
+    held_out: I64
 
     def batch(self, samples: I64) -> Batch:
         """Return the batch of these samples, (B,); pictures are uint8."""
@@ -111,15 +116,6 @@ class Samples:
         return batch
 
 
-@dataclass(frozen=True)
-class TrainingData(Samples):
-    """The data of one fit. train, held_out: samples; table: columns to train on."""
-
-    train: I64
-    held_out: I64
-    table: Table
-
-
 def load_data(
     policy: PreTrainedConfig,
     meta: JoinedDatasets,
@@ -128,7 +124,7 @@ def load_data(
     seed: int,
     encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]] | None = None,
     on_frames: Callable[[int], None] | None = None,
-) -> TrainingData:
+) -> Samples:
     """Return the samples of the concatenated datasets for a policy that has its features.
 
     meta: that of the datasets; its statistics are updated to the encoded actions. encode: maps actions (N, n) and
@@ -152,14 +148,14 @@ def load_data(
     train, held_out = split_by_episode(episodes[usable], eval_split, seed)
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
-    return TrainingData(
+    return Samples(
         windows,
         {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)},
         {key: decode([one.camera(key) for one in meta.datasets], on_frames) for key in cameras},
         np.array(meta.tasks, object),
-        train=usable[train],
-        held_out=usable[held_out],
-        table=table,
+        table,
+        usable[train],
+        usable[held_out],
     )
 
 
@@ -191,16 +187,18 @@ def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
     losses by them; here samples are drawn in proportion: the same gradient, without computing what has no weight.
 
     episodes: the dataset's `episode_index`, (N,). ahead: number of frames that an action spans. Raises `ManipError` if
-    the file is no such table or every frame weighs 0, `MismatchError` if it is for another dataset.
+    the file is not such a table or every frame weighs 0, `MismatchError` if it is for another dataset.
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 
-    with in_one_line(f"{path} is no file of weights"):
+    with in_one_line(f"{path} is not a file of weights"):
         found = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
     if found.episode_lookup != dict(enumerate(episodes.tolist())):
         frames = f"{len(found.episode_lookup)} frames"
         raise MismatchError("episodes", str(path), frames, "the dataset", f"{len(episodes)} frames")
     weights, _ = found.compute_batch_weights({"index": np.arange(len(episodes))})
     if not weights.any():
-        raise ManipError(f"all {len(weights)} frames weigh 0: progress falls from each of them; nothing to learn from")
+        raise ManipError(
+            f"all {len(weights)} frames weigh 0, as progress falls after each; there is nothing to learn from"
+        )
     return (weights / weights.max()).double().numpy()

@@ -27,14 +27,9 @@ def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64)
     """Return the relative sampling weight of each training row, (S,).
 
     shares: relative shares of the samples drawn from each dataset. rows: frame numbers in the concatenated datasets.
-    Raises `ManipError` for a dataset without any row.
     """
     which = np.searchsorted(np.cumsum([*map(len, datasets)]), rows, side="right")
-    counts = np.bincount(which, minlength=len(datasets))
-    if (counts == 0).any():
-        empty = datasets[int(np.argmin(counts))].root
-        raise ManipError(f"{empty} has no sample to learn from, but a weight; leave it out, or hold out less of it")
-    return (np.asarray(shares) / counts)[which]
+    return np.asarray(shares)[which] / np.bincount(which)[which]
 
 
 def check_same_sources(

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
 from manip_il.errors import NothingToLearnError, UsageError
@@ -32,7 +32,6 @@ from manip_il.learn.samples import Table
 from manip_il.mdp import Actor, require_finite
 
 F32 = NDArray[np.float32]
-_TELLING = (LABEL_VALID, ACTOR, SUCCESS)  # columns that say whether an episode is a demonstration
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +58,12 @@ class Transitions:
 class Demonstrations:
     """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, in a policy's action space.
 
-    hold: steps from success to the end; None if no column says when an episode succeeds.
+    hold: steps from success to the end.
     """
 
     inputs: tuple[F32, ...]
     targets: tuple[F32, ...]
-    hold: int | None
+    hold: int
 
     @property
     def longest(self) -> int:
@@ -79,13 +78,14 @@ class Demonstrations:
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
         """Return all episodes as `steps` transitions each. encode: normalises raw targets (T, n).
 
-        Without a `hold` nothing is padded, as it is unknown how the episodes would have continued.
         Raises `UsageError` if one is longer.
         """
         if self.longest > steps:
-            raise UsageError(f"episode_steps is {steps}; expected at least {self.longest}, the longest demonstration")
+            raise UsageError(
+                f"episode_steps is {steps}; expected at least {self.longest}, the steps of the longest demonstration"
+            )
         made = [
-            padded_episode(inputs, encode(targets), 0 if self.hold is None else steps)
+            padded_episode(inputs, encode(targets), steps)
             for inputs, targets in zip(self.inputs, self.targets, strict=True)
         ]
         return Transitions(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
@@ -94,11 +94,9 @@ class Demonstrations:
 def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32]:
     """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode with T steps that ended.
 
-    N is the larger of T and `steps`: the rest is absorbing. With `steps` 0 the episode did not end and N is T - 1.
+    N is the larger of T and `steps`: the rest is absorbing.
     """
     states = np.pad(inputs, ((0, 0), (0, 1)))
-    if not steps:
-        return states[:-1], actions[:-1], states[1:]
     rest = np.zeros((max(1, steps - len(states) + 1), states.shape[1]), np.float32)
     rest[:, -1] = 1.0
     states = np.concatenate([states, rest])
@@ -111,25 +109,23 @@ def read_demonstrations(
 ) -> Demonstrations:
     """Read the expert's whole episodes from datasets. encode: `Conversion.encode` for actions (T, n), states (T, n).
 
-    Skips episodes in which a learner drove at some step or a label is invalid, and those that failed according to their
-    columns. Raises `NothingToLearnError` if none is left, `NotFiniteError`, and what `joined_columns` raises.
+    Skips episodes in which a learner drove at some step or a label is invalid, and those that failed. Raises
+    `NothingToLearnError` if none is left, `NotFiniteError`, and what `joined_columns` raises.
     """
-    table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
+    table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, LABEL_VALID, ACTOR, SUCCESS])
     for name in (STATE, ENVIRONMENT_STATE, ACTION):
         require_finite(f"column {name}", table[name])
     pieces = _episodes(table)
     kept = [piece for piece in pieces if _is_demonstration(table, piece)]
     if not kept:
         raise NothingToLearnError(
-            f"none of the {len(pieces)} episodes in {', '.join(map(str, roots))} is the expert's from beginning to "
-            "success; record demonstrations with manip-il record"
+            f"none of the {len(pieces)} episodes in {', '.join(map(str, roots))} is the expert's and successful; "
+            "record demonstrations with manip-il record"
         )
     inputs = np.concatenate([table[STATE], table[ENVIRONMENT_STATE]], axis=1).astype(np.float32)
     targets = [encode(table[ACTION][piece], table[STATE][piece]).astype(np.float32) for piece in kept]
-    hold = None
-    if SUCCESS in table:
-        solved = table[SUCCESS].reshape(-1) != 0
-        hold = min(len(solved[piece]) - 1 - int(np.argmax(solved[piece])) for piece in kept)
+    solved = table[SUCCESS].reshape(-1) != 0
+    hold = min(len(solved[piece]) - 1 - int(np.argmax(solved[piece])) for piece in kept)
     return Demonstrations(tuple(inputs[piece] for piece in kept), tuple(targets), hold)
 
 
@@ -140,14 +136,6 @@ def _episodes(table: Table) -> list[slice]:
 
 
 def _is_demonstration(table: Table, piece: slice) -> bool:
-    """Return whether an episode is the expert's, valid and successful, as far as its columns say so."""
-    rows = {name: np.asarray(table[name][piece]).reshape(-1) for name in _TELLING if name in table}
-    valid = LABEL_VALID not in rows or bool((rows[LABEL_VALID] != 0).all())
-    driven = ACTOR not in rows or bool((rows[ACTOR] == Actor.EXPERT).all())
-    return valid and driven and (SUCCESS not in rows or bool((rows[SUCCESS] != 0).any()))
-
-
-def _optional(roots: Sequence[Path]) -> list[str]:
-    """Return the columns, besides those for training, that every dataset has."""
-    known = [set(Dataset.open(root).features) for root in roots]
-    return [name for name in _TELLING if all(name in names for names in known)]
+    """Return whether an episode is the expert's, valid and successful."""
+    valid, driven = (table[LABEL_VALID][piece] != 0).all(), (table[ACTOR][piece] == Actor.EXPERT).all()
+    return bool(valid and driven and (table[SUCCESS][piece] != 0).any())

@@ -60,10 +60,10 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
         start, stop = int(episodes.start[place]), int(episodes.stop[place])
         times = frame_times(stop - start, rate)
         tasks = [texts[number] for number in table[layout.TASK_INDEX][start:stop].tolist()]
-        channels = [foxglove.texts(_TASK_TOPIC, TASK, tasks, times)]
+        channels = {_TASK_TOPIC: foxglove.texts(TASK, tasks, times)}
         for one in columns:
             values = _pictures(cameras[one.key], start, stop) if one.key in cameras else table[one.key][start:stop]
-            channels.append(_channel(one, values, times))
+            channels[_topic(one.key)] = _messages(one, values, times)
         path = folder / f"episode_{episode:06d}.mcap"
         with path.open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
@@ -95,18 +95,17 @@ def _columns(info: Info) -> list[Feature]:
     return [one for one in columns if one.dtype in (*NUMBERS, TEXT) or one.is_rgb]
 
 
-def _channel(column: Feature, values: Any, times: foxglove.Times) -> foxglove.Channel:
-    topic = _topic(column.key)
+def _messages(column: Feature, values: Any, times: foxglove.Times) -> foxglove.Messages:
     if column.dtype in PICTURES:
-        return foxglove.images(topic, column.key, values, times)
+        return foxglove.images(column.key, values, times)
     if column.dtype == TEXT:
-        return foxglove.texts(topic, column.key, values.reshape(-1).tolist(), times)
+        return foxglove.texts(column.key, values.reshape(-1).tolist(), times)
     values = values.reshape(len(times), -1)
     if _is_joints(column):
-        return foxglove.joint_states(topic, column.labels, values, times)
+        return foxglove.joint_states(column.labels, values, times)
     unnamed = [column.key] if column.size == 1 else [f"{column.key}_{place}" for place in range(column.size)]
     labels = column.labels if column.names else unnamed  # as in LeRobot
-    return foxglove.scalars(topic, labels, (values.astype(np.int64) if values.dtype == bool else values).tolist())
+    return foxglove.scalars(labels, (values.astype(np.int64) if values.dtype == bool else values).tolist())
 
 
 def _pictures(camera: Camera, start: int, stop: int) -> Iterator[foxglove.U8]:

@@ -45,11 +45,8 @@ class Diary:
         self.notes.append((list(episodes), images["front"][:, 0, 0, 0].tolist()))
         return np.tile(self.action, (len(states), 1))
 
-    def reset(self, episodes) -> None:
-        self.notes.append(("begin", list(episodes)))
-
-    def instruct(self, instructions) -> None:
-        self.notes.append(("told", dict(instructions)))
+    def begin(self, instructions) -> None:
+        self.notes.append(("begin", dict(instructions)))
 
 
 def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | None = None) -> Turn:
@@ -86,8 +83,8 @@ def test_a_learner_is_told_whose_turn_it_is_and_of_what_and_sees_the_pictures_of
     for step in ([turn(10, 0), turn(20, 4)], [turn(10, 1), turn(20, 0)], [turn(10, 2)]):
         driver(step)
     assert diary.notes == [
-        *(("begin", [10]), ("told", {10: "do 10"}), ([10, 20], [10, 24])),
-        *(("begin", [20]), ("told", {20: "do 20"}), ([10, 20], [11, 20])),
+        *(("begin", {10: "do 10"}), ([10, 20], [10, 24])),
+        *(("begin", {20: "do 20"}), ([10, 20], [11, 20])),
         ([10], [12]),
     ]
 
@@ -104,7 +101,7 @@ def test_an_ensemble_queries_where_its_members_spread():
     gate = Query("ensemble", 0.2).start(setting(None, *others))
     agreed, alone = np.array([0.0, 0.0, 0.08]), np.array([0.09, 0.0, 0.08])
     assert gate([turn(7), turn(8, step=3)], [agreed, alone]) == [False, True]
-    assert [member.notes[0] for member in others] == [("begin", [7])] * 2  # a memory must know who begins
+    assert [member.notes[0] for member in others] == [("begin", {7: "do 7"})] * 2  # a memory must know who begins
 
 
 def test_chance_queries_in_its_share_of_the_steps_and_the_same_for_a_seed():

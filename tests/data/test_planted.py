@@ -7,17 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.atomic import exclusive
 from manip_il.data.json_lines import append_line
 from manip_il.errors import ManipError
 from manip_il.learn.training_state import json_lines
 
 HELD = b"of the user\n"
-
-
-def lock(folder: Path) -> None:
-    with exclusive(folder / "run"):
-        pass
 
 
 def write_metrics(folder: Path) -> None:
@@ -28,7 +22,6 @@ def write_metrics(folder: Path) -> None:
 
 
 WRITERS: dict[str, Callable[[Path], None]] = {
-    ".run.lock": lock,
     "records.jsonl": lambda folder: append_line(folder / "records.jsonl", {"a": 1}),
     "planted": write_metrics,
 }

@@ -10,7 +10,7 @@ import pytest
 
 from manip_il.data import schema as s
 from manip_il.data.fingerprint import canonical_json, compare_fingerprints, environment_fingerprint
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import MismatchError
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,6 @@ class Config:
 
 def test_a_spec_survives_json(spec):
     assert s.RobotTaskSpec.from_json(spec.to_json()) == spec
-    with pytest.raises(ManipError, match="colour"):
-        s.RobotTaskSpec.from_json(spec.to_json() | {"colour": "red"})
 
 
 def test_one_spec_agrees_with_itself_on_another_task(spec):

@@ -81,7 +81,7 @@ def test_a_folder_that_may_not_be_written_is_one_clear_error(tmp_path):
     assert list(closed.iterdir()) == []
 
 
-def test_a_second_recorder_is_refused_by_the_firsts_process_id(tmp_path):
+def test_a_second_recorder_is_refused(tmp_path):
     words = [word.format(tmp_path) for word in (*RECORD, "--dataset.num_episodes=1000", "--workers=1")]
     first = subprocess.Popen([sys.executable, "-m", "manip_il.cli.main", *words], stderr=-3, stdout=-3)
     try:
@@ -90,7 +90,7 @@ def test_a_second_recorder_is_refused_by_the_firsts_process_id(tmp_path):
             assert time.monotonic() < deadline
             time.sleep(0.05)
         for more in ("--resume=true", "--overwrite=true"):
-            assert f"in use by process {first.pid}" in error_of(run(tmp_path, RECORD, more))
+            assert "in use by another process" in error_of(run(tmp_path, RECORD, more))
     finally:
         first.kill()
         first.wait()

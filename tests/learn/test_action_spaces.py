@@ -172,7 +172,7 @@ def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_t
     halves = trainer_of(sources, tmp_path / "halves", ACT, JOINT_DELTA, **more).fit()
     assert all(torch.equal(value, weights(halves)[name]) for name, value in weights(whole).items())
     before, _ = make_pre_post_processors(PreTrainedConfig.from_pretrained(whole), str(whole))
-    with pytest.raises(ManipError, match="go on with manip-il train --resume=true"):
+    with pytest.raises(ManipError, match="continue with manip-il train --resume=true"):
         before({STATE: torch.zeros(2, 8), ACTION: torch.zeros(2, 4, 8)})
 
 
@@ -183,7 +183,7 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
     assert np.isfinite(more.act(table[STATE], table["observation.environment_state"])).all()
     with pytest.raises(MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"):
         trainer_of(sources, tmp_path / "other", {"path": str(path)}, JOINT_DELTA)
-    with pytest.raises(ManipError, match="holds no inverse kinematics; use joint_delta"):
+    with pytest.raises(ManipError, match="cannot be exported; train with joint_delta"):
         export_onnx(path, "")
 
 

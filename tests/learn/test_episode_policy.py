@@ -77,7 +77,7 @@ def test_an_episode_that_is_left_out_or_reset_begins_anew(act):
     assert not np.array_equal(policy.act(*one, None, [0]), first)  # the second action of the chunk
     policy.act(*two, None, [1])  # without 0, which has ended
     assert np.array_equal(policy.act(*one, None, [0]), first)
-    policy.reset([0])
+    policy.begin({0: ""})
     assert np.array_equal(policy.act(*one, None, [0]), first)
     assert policy.act(np.empty((0, 4)), np.empty((0, 6))).shape == (0, 4)
 
@@ -90,7 +90,7 @@ def test_draws_belong_to_the_episode_and_leave_the_global_generator_alone(spec, 
     assert torch.equal(torch.get_rng_state(), generator)
     assert not np.array_equal(left, right)
     torch.manual_seed(5)
-    policy.reset([1])
+    policy.begin({1: ""})
     assert np.array_equal(policy.act(state[:1], environment[:1], None, [1])[0], left)
 
 
@@ -105,7 +105,7 @@ def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
     policy = LearnedPolicy.load(act, task="put it there")
     policy.act(*observations(STEPS, 0))
     assert tasks == [["put it there"]] * STEPS
-    policy.instruct({1: "no, here"})
+    policy.begin({1: "no, here"})
     policy.act(*observations(2, 0))
     assert tasks[STEPS:] == [["put it there"], ["no, here"]]
 
@@ -118,7 +118,7 @@ def test_pictures_must_be_those_of_the_checkpoint(pictured, tmp_path):
     states, environments = (column[:2] for column in observations(STEPS, 0))
     picture = np.zeros((2, 32, 48, 3), np.uint8)
     dark = policy.act(states, environments, {"front": picture, "wrist": picture}, [0, 1])
-    policy.reset([0, 1])
+    policy.begin({0: "", 1: ""})
     assert not np.array_equal(
         policy.act(states, environments, {"front": picture + 255, "wrist": picture}, [0, 1]), dark
     )

@@ -123,5 +123,5 @@ def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, sp
     assert np.array_equal(MLPPolicy.from_pretrained(path).model.act(raw).numpy().astype(np.float64), actions)
     again = Trainer(data, FitConfig({"path": str(path)}, steps=1, lr=1e-12, batch_size=32), tmp_path / "again").fit()
     np.testing.assert_allclose(LearnedPolicy.load(again).act(states, environments), actions, atol=2e-5)
-    with pytest.raises(UsageError, match="scales is for offsets"):
+    with pytest.raises(UsageError, match="scales needs offsets"):
         Trainer(write(table, "other"), FitConfig({"scales": [0.003]}), tmp_path / "other_run").fit()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +14,10 @@ from manip_il.mdp import Actor
 from .conftest import EPISODES, LENGTH, make_table
 
 
-def two(hold: int | None = 2) -> Demonstrations:
+def two() -> Demonstrations:
     inputs = tuple(np.full((length, 3), length, np.float32) for length in (4, 6))
     targets = tuple(np.full((length, 2), length, np.float32) for length in (4, 6))
-    return Demonstrations(inputs, targets, hold)
+    return Demonstrations(inputs, targets, hold=2)
 
 
 def doubled(values):
@@ -40,13 +39,6 @@ def test_a_demonstration_that_fills_the_episode_still_ends_in_the_absorbing_stat
     assert rows.next_states[-1].tolist() == [0, 0, 0, 1]
 
 
-def test_where_nothing_says_when_they_succeeded_they_are_not_padded():
-    rows = two(hold=None).padded(8, doubled)
-    assert len(rows) == 3 + 5
-    assert rows.next_states[2].tolist() == [4, 4, 4, 0]
-    assert not rows.absorbing.any()
-
-
 @pytest.fixture
 def read(monkeypatch):
     """Reads a table in place of a dataset."""
@@ -58,7 +50,6 @@ def read(monkeypatch):
         table["next.success"] = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
         table |= {name.replace("__", "."): value for name, value in changes.items()}
         monkeypatch.setattr(transitions, "joined_columns", lambda roots, names: {name: table[name] for name in names})
-        monkeypatch.setattr(transitions.Dataset, "open", lambda root: SimpleNamespace(features=table))
         return read_demonstrations([Path("demos")], lambda actions, states: actions - states)
 
     return run

@@ -102,7 +102,7 @@ def test_a_policy_of_ours_drives_the_real_arm_as_lerobot_rollout_asks_it(real, s
 
     state = np.array([[observed[name] for name in keys]], np.float32)
     ours = LearnedPolicy.load(path)
-    ours.reset([0])
+    ours.begin({0: ""})
     wanted = ours.act(state, np.empty((1, 0), np.float32), {"front": real.cameras["front"].picture[None]}, [0])[0]
     np.testing.assert_allclose(action.numpy(), wanted, atol=1e-3)
     sent = real.send_action(dict(zip(keys, action.tolist(), strict=True)))
