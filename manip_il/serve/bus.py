@@ -6,11 +6,13 @@ The checksum is the complement of the sum of all bytes from the id on. Present_P
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import math
 import os
 import pty
 import select
+import termios
 import threading
 import time
 import tty
@@ -135,6 +137,11 @@ class Bus:
         while not self._closing.is_set():
             if select.select([self._master], [], [], 0.1)[0]:
                 os.write(self._master, self.feed(os.read(self._master, 4096)))
+            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # root may open it, too
+
+    @property
+    def _is_in_use(self) -> bool:
+        return time.monotonic() - self._was_read < _BUSY
 
     def feed(self, received: bytes) -> bytes:
         """Return the answers to all packets that these bytes complete; keep the rest for the next call.
@@ -163,7 +170,7 @@ class Bus:
     def _answer(self, number: int, instruction: int, parameters: bytes) -> bytes:
         here = {int(self.memory[one, _ID]): self.memory[one] for one in self.connected}
         if instruction == protocol.INST_PING:
-            if time.monotonic() - self._was_read < _BUSY:
+            if self._is_in_use:
                 _LOG.warning("%s is open in another program already: the second gets no answer", self.path)
                 return b""
             return b"".join(_packet(one) for one in here if number in (one, protocol.BROADCAST_ID))
