@@ -190,7 +190,7 @@ def certify(
         rows.append(row("action" if known.wrong else "state", kind, known.words, found))
     job = RolloutJob(env, hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
     noisy = [_case(episode, 0, env.horizon) for episode in rollouts(job)]
-    rows.append(row("start", "noise", f"{NOISE:.0%} noise on every action", noisy))
+    rows.append(row("start", "noise", f"{100 * NOISE:.0f} % noise on every action", noisy))
     settings = {"cases": cases, "seed": seed}
     settings |= {name: getattr(env, name) for name in ("horizon", "control_hz", "tolerance", "success_steps")}
     return Certificate(env.robot, env.task, env_fingerprint(env), settings, tuple(rows))

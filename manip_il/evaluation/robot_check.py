@@ -175,11 +175,7 @@ def verdict(check: RobotCheck) -> str:
     asked = any(task.clean is not None for task in check.tasks)
     can, end = ("can do", "") if asked else ("has starts for", "; the expert was not run")
     words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} task{'s' if count > 1 else ''}{end}"
-    words += f"; it cannot do {cannot}" if cannot else ""
-    shaken = [(task.name, task.noisy.success) for task in check.tasks if task.done and task.noisy is not None]
-    if poor := [f"{one} in {success.successes} of {success.n}" for one, success in shaken if success.rate < SOLVES]:
-        words += f"; with a tenth of its actions random the expert solves {', '.join(poor)} episodes"
-    return f"{words}."
+    return f"{words}; it cannot do {cannot}." if cannot else f"{words}."
 
 
 def task_table(check: RobotCheck) -> Table:

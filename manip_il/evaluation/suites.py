@@ -53,20 +53,15 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
     return (kept,)
 
 
-def require_suite(suite: str) -> None:
-    """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; reads no file."""
-    if suite.endswith(_YAML):
-        if not Path(suite).is_file():
-            raise UsageError(f"--suite={suite}: no such file; expected a YAML file of ranges")
-    elif suite not in (*SUITES, *CONDITIONS):
-        raise UnknownName("suite", suite, [*SUITES, *CONDITIONS[1:]])
-
-
 def read_condition(name: str) -> Condition:
-    """Return a condition by name, or from a YAML of ranges by path. Raises a `UsageError` that names what is wrong."""
-    require_suite(name)
+    """Return a condition by name, or from a YAML file of ranges by path.
+
+    Raises `UnknownName` for an unknown name, `UsageError` for a file that is missing or invalid.
+    """
+    if not name.endswith(_YAML) and name not in CONDITIONS:
+        raise UnknownName("suite", name, [*SUITES, *CONDITIONS[1:]])
     path = Path(name) if name.endswith(_YAML) else _suites_folder() / f"{name}.yaml"
-    tree = checks.read_yaml(path, "a YAML of ranges")
+    tree = checks.read_yaml(path, "a YAML file of ranges")
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
     return Condition(path.stem, **{str(key): value for key, value in (tree or {}).items()})

@@ -68,8 +68,8 @@ class Condition:
     factor on the damping of every arm joint; actuator_gain: factor on its actuators' kp, and its square root on kv.
     posture: largest offset of every joint from home at the start [rad]. camera_shift [m], camera_turn [deg]: of every
     camera, in a random direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
-    clutter: number of things around the workspace that touch nothing. picture_delay: control steps by which pictures
-    alone are late.
+    clutter: number of visual objects around the workspace. picture_delay: control steps by which pictures alone are
+    late.
 
     Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds, `ManipError` for a name
     that cannot name a file.

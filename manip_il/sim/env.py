@@ -37,7 +37,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32. Observation: a dict
     of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
-    Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
+    Reward is 1 while the task is solved, else 0. An episode ends only at the horizon (truncated), so that
     "solved once" and "solved at the end" can both be read. conditions: how episodes differ from the nominal world, in
     turn by their seeds; `drawn` has the current values. The state is the true one, whatever is observed.
     render_mode: `rgb_array`, or `human`: MuJoCo's viewer in real time, from `reset` and `step`.

@@ -21,8 +21,8 @@ _CORNERS = 4  # a box's upper corners, which cameras see
 def points_in(world: World) -> dict[str, F64]:
     """Return name -> position (3,) [m].
 
-    What a task observes is a position if it has the name of something in the scene. Corners of a box are numbered by
-    their direction from its centre.
+    A vector that the task observes is a keypoint if it has the name of a body, geom or site. Corners of a box are
+    numbered by their direction from its centre.
     """
     model = world.scene.model
     found = {

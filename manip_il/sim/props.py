@@ -1,4 +1,4 @@
-"""Visual things that touch nothing: the stand of a goal, and clutter around the workspace."""
+"""Visual objects without contact: the stand of a goal, and clutter around the workspace."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _DRAWS = 50  # draws of a thing's place before it is left out
 
 
 class Prop(NamedTuple):
-    """A thing to draw: MuJoCo's geom type and size (3,), its place (3,) [m], axes (3, 3), red, green, blue, opacity."""
+    """An object to draw: MuJoCo's geom type and size (3,), its place (3,) [m], axes (3, 3), red, green, blue, alpha."""
 
     kind: int
     size: F64
@@ -50,9 +50,9 @@ class Prop(NamedTuple):
 
 
 def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
-    """Return the visual things of a scene's world; poses of mocap bodies and joints in `data` must be up to date.
+    """Return the visual objects of a scene's world; poses of mocap bodies and joints in `data` must be up to date.
 
-    clutter: (2,) number of things, and the seed of their kinds and places.
+    clutter: (2,) number of objects, and the seed of their kinds and places.
     """
     return [*_stand(scene, data), *_clutter(scene, data, int(clutter[0]), int(clutter[1]))]
 
@@ -107,7 +107,7 @@ def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
 
 
 def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple[float, float] | None:
-    """A random place on the table around the workspace, away from the robot's base; None for one elsewhere."""
+    """A random place on the table around the workspace; None if it is in the workspace or near the robot's base."""
     space = scene.robot.workspace
     outer = space.half_width + _WITHIN
     x, y = rng.uniform(-outer, outer, 2).tolist()

@@ -28,7 +28,7 @@ PREFIX = "robot/"  # prefix of the robot's names in a scene
 TABLE = "table"  # name of the table's geom
 _THICK = 0.04  # thickness of the table's top [m]
 SCENES_KEPT = 8  # compiled scenes cached per process: the finest meshes take 64 MB
-_TURN, _SPARE_TURN = 0.1, 0.1  # test turn of the last joint, to see its sense; margin to its limits [rad]
+_TURN, _SPARE_TURN = 0.1, 0.1  # test rotation of the last joint, to find its direction; margin to its limits [rad]
 SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of a workspace that cameras see from these places [m]
 # From the workspace's middle on the table; cameras look at a point over that, with a vertical field of view.
 _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]

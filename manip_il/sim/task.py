@@ -61,7 +61,7 @@ class Limits:
 
 
 class Task(Protocol):
-    """A task, for every arm that can do it.
+    """A task, independent of the arm.
 
     objects: what the arm moves and must reach; events move the first. grasped: those that the gripper must go around.
     rungs: latest first, the last one holding everywhere; each is a function of the world alone, so that the expert can

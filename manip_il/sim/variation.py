@@ -1,4 +1,4 @@
-"""Variation of worlds from episode to episode, as numbers that a state holds.
+"""How a world differs from the compiled model, as numbers that a state holds.
 
 Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then those of
 the world, named as in `Condition`: see `_WORLD`.

@@ -106,12 +106,12 @@ def test_two_processes_give_the_same_certificate(measured: Certificate):
     assert certify(Engine(), make_config("fetch", "pick_place"), 3, seed=1).rows != again.rows
 
 
-# What 500 cases a kind gave, panda and fetch: start 100 and 100 %, changed states 99.7 and 99.8 %, wrong actions 100
-# and 99.7 %. By the binomial, an expert as good as that falls under a floor in
+# What 500 cases a kind gave, panda and fetch: start 100 and 100 %, changed states 100 and 99.8 %, wrong actions 100
+# and 100 %. By the binomial, an expert as good as that falls under a floor in
 # one or two of a thousand draws of CASES seeds, and one that fails in 5 % of the changed states in 19 of 20.
 CASES = 40
 FLOORS = {"start": 0.96, "state": 0.98, "action": 0.98}
-MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: measured 4.5 and 4.0; 23 and 19, with 1 % above 35
+MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: the mean was 4.0 and 4.5
 
 
 @pytest.fixture(scope="module", params=["panda", "fetch"])
