@@ -17,18 +17,18 @@ from manip_il.mdp import F64
 class ServoUnits:
     """Conversion from [rad] and [m] to degrees and 0 to 100, and back.
 
-    openings: the gripper's [m], rising, (c,). percents: its servo's numbers there, 0 to 100, (c,).
+    openings: of the gripper [m], rising, (c,). percents: its servo's positions there, 0 to 100, (c,).
     """
 
     openings: F64
     percents: F64
 
     def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Return degrees (n - 1,) and the gripper's number, 0 to 100, for joints (n - 1,) [rad] and an opening [m]."""
+        """Return degrees (n - 1,) and the gripper's position, 0 to 100, of joints (n - 1,) [rad] and an opening [m]."""
         return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
 
     def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and the gripper's number, 0 to 100."""
+        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and the gripper's position, 0 to 100."""
         order = slice(None, None, 1 if self.percents[0] < self.percents[-1] else -1)  # rising, as `interp` needs them
         return np.radians(arm), float(np.interp(percent, self.percents[order], self.openings[order]))
 

@@ -1,4 +1,4 @@
-"""Parts of a robot's YAML as typed values, and files of a MuJoCo model, mended as the YAML says."""
+"""Parts of a robot's YAML as typed values, and files of a MuJoCo model, patched as the YAML says."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _LARGEST = 16 * 1024**2  # largest MJCF [bytes]
 class ModelFiles:
     """An MJCF and what it needs; paths are absolute.
 
-    includes: the folder of the files that the model includes; it is read as if it lay there. meshes: the folder of its
-    meshes. mend: text of the file, and what MuJoCo reads in its place, for third-party files that do not compile.
+    includes: the folder of the files that the model includes; the model is read as if it lay there. meshes: the folder
+    of its meshes. mend: texts in the file and their replacements, for third-party files that do not compile.
     """
 
     model: Path
@@ -82,7 +82,7 @@ def _included(model: bytes, home: Path) -> set[str]:
 def read(what: str, kind: Any, value: Any) -> Any:
     """Return a YAML's value as a type: a dataclass, whose fields are the keys, a tuple, a mapping, a number, text.
 
-    Raises `UnknownName` for another key, `ManipError` for a value that is missing, mistyped or refused by the class.
+    Raises `UnknownName` for any other key, `ManipError` for a value that is missing, of the wrong type or invalid.
     """
     import draccus  # imported here: names of robots do not need it
 
@@ -102,7 +102,7 @@ def read(what: str, kind: Any, value: Any) -> Any:
 
 
 def require_lengths(one: Any, **counts: int) -> None:
-    """Raise `ManipError` for a field with a wrong count of numbers."""
+    """Raise `ManipError` for a field with the wrong number of values."""
     for name, count in counts.items():
         if len(getattr(one, name)) != count:
             raise ManipError(f"{name} has {len(getattr(one, name))} numbers; expected {count}")

@@ -16,7 +16,7 @@ from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import Body, at_tip, nearest, outline
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.robot import EndEffector, Robot, costs_of, yaw_of
+from manip_il.robots.robot import EndEffector, Robot
 from manip_il.robots.rotations import hand_down, rotation_vector
 from manip_il.robots.spec import arm_spec, bare_spec, require
 
@@ -46,8 +46,6 @@ def complete(said: Mapping[str, Any]) -> dict[str, Any]:
     spec = bare_spec(said["name"], said["files"], said["hand"], said["gripper"])
     joints = said.setdefault("joints", arm_joints(said["name"], spec, said["hand"], said["gripper"].joints))
     require(said["name"], "joint", joints, spec.joints)
-    said.setdefault("costs", costs_of(len(joints)))
-    said.setdefault("yaw", yaw_of(len(joints)))
     forces, armature = motor_limits(said["name"], said["files"], spec, joints)
     said.setdefault("forces", forces)
     said.setdefault("armature", armature)
@@ -153,7 +151,7 @@ def find_ee(robot: Robot) -> EndEffector:
 
 
 def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The robot with its arm as the model has it, and its fingers at rest at a share of the way from closed to open."""
+    """The robot, its arm as in the model, its fingers at rest at a share of the way from closed to open."""
     alone = replace(robot, joints=(), home=(), gains=(), forces=(), armature=())
     spec = arm_spec(alone)
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -188,8 +186,8 @@ def _along_axis(vector: F64, least: float = 0.0) -> F64:
 def find_home(robot: Robot, turns: bool) -> Robot:
     """Return the robot with its best posture for a hand that points down over the workspace's middle.
 
-    turns: the frame `ee` may be turned by half a turn about z if that suits the arm better. Raises `UsageError` if the
-    hand gets there from none of forty postures.
+    turns: the frame `ee` may be turned by half a turn about z if that suits the arm better. Raises `UsageError` if
+    inverse kinematics arrives from none of forty random postures.
     """
     halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
     heights = [min(_HIGHEST, robot.workspace.height / 2) * share for share in _LOWER]

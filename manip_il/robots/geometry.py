@@ -67,7 +67,7 @@ def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequenc
 
 
 class Body:
-    """The whole robot, to detect collisions of its parts that it does not have at home."""
+    """The whole robot, to detect self-collisions that it does not have at home."""
 
     def __init__(self, robot: Robot):
         self._model = arm_spec(robot).compile()

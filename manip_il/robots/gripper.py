@@ -117,34 +117,50 @@ def sweep(robot: Robot) -> Sweep:
     Raises `UsageError` if they do not come apart.
     """
     model, data, fingers, shares, poses = _at_rest(robot)
-    jaws = _apart(*_at(model, data, poses[-1]), fingers)
+
+    def gaps_at(pose: F64, groups: Geoms) -> list[F64]:
+        """For each group of geoms, how far each of them is from the other groups [m]."""
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        others = [[geom for other in groups if other is not one for geom in other] for one in groups]
+        return [
+            np.array([min((distance(model, data, one, other) for other in rest), default=0.0) for one in own])
+            for own, rest in zip(groups, others, strict=True)
+        ]
+
+    # The geoms that touch no other finger when open, so none around a jaw's hinge.
+    jaws = [
+        [geom for geom, gap in zip(*one, strict=True) if gap > 0]
+        for one in zip(fingers, gaps_at(poses[-1], fingers), strict=True)
+    ]
     if not all(jaws):
         raise UsageError(f"robot {robot.name}: the fingers touch when open; check gripper.open and gripper.fingers")
-    tips = _tips(*_at(model, data, poses[-1]), jaws)
-    gaps = [_gaps(*_at(model, data, pose), tips) for pose in poses]
+    # Those near the tips; the links behind may pass beside the other finger's.
+    tips = [at_tip(model, data, jaw, data.site("ee").xmat.reshape(3, 3)[:, 2]) for jaw in jaws]
+    gaps = [gaps_at(pose, tips) for pose in poses]
     least = [min(float(gap.min()) for gap in one) for one in gaps]
     shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # links may pass each other
     pads = [_near(gap, tip, float(gap.min())) for gap, tip in zip(gaps[shut], tips, strict=True)]
-    measured = [_opening(*_at(model, data, pose), pads) for pose in poses[shut:]]
-    openings, shares = [opening for opening, _ in measured], shares[shut:]
-    middles = np.array([middle for _, middle in measured])
+    openings, middles, shares = [], [], shares[shut:]
+    for pose in poses[shut:]:
+        openings.append(min(float(one.min()) for one in gaps_at(pose, pads)))
+        middle = nearest(model, data, pads)[1].mean(axis=0) - data.site("ee").xpos
+        middles.append(float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle))
     if openings[-1] - openings[0] < _LEAST_TRAVEL or (np.diff(openings) <= 0).any() or (np.diff(shares) <= 0).any():
         raise UsageError(
             f"robot {robot.name}: the fingers stand {openings[0]:.3f} m apart closed and {openings[-1]:.3f} m open; "
             "expected the gap to grow all the way: check gripper.joints, closed, open and fingers"
         )
-    if np.ptp(middles) < _LOPSIDED:
-        middles = np.zeros(len(middles))
     holding = jaws  # a turning jaw holds wide objects farther from its tip
-    if not middles.any():
-        of_all = _gaps(*_at(model, data, poses[shut]), jaws)
+    if np.ptp(middles) < _LOPSIDED:
+        middles = [0.0] * len(middles)
         most = [float(gap.min()) for gap in gaps[shut]]
-        holding = [_near(*one) for one in zip(of_all, jaws, most, strict=True)]
+        holding = [_near(*one) for one in zip(gaps_at(poses[shut], jaws), jaws, most, strict=True)]
     places = [
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
     ]
-    return Sweep(np.array(shares), np.array(openings), middles, *places)
+    return Sweep(np.array(shares), np.array(openings), np.array(middles), *places)
 
 
 def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[float], list[F64]]:
@@ -167,42 +183,6 @@ def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[f
         shares.append(float(((data.qpos[q] - closed) / travel).mean()))
         poses.append(data.qpos.copy())
     return model, data, fingers, shares, poses
-
-
-def _at(model: mujoco.MjModel, data: mujoco.MjData, pose: F64) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    data.qpos[:] = pose
-    mujoco.mj_kinematics(model, data)
-    return model, data
-
-
-def _apart(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[list[int]]:
-    """The geoms of each finger that touch no other finger when open, so none around a jaw's hinge."""
-    gaps = _gaps(model, data, fingers)
-    return [[geom for geom, gap in zip(*one, strict=True) if gap > 0] for one in zip(fingers, gaps, strict=True)]
-
-
-def _tips(model: mujoco.MjModel, data: mujoco.MjData, jaws: Geoms) -> list[list[int]]:
-    """The geoms of each finger near its tip; the links behind may pass beside the other finger's."""
-    along = data.site("ee").xmat.reshape(3, 3)[:, 2]
-    return [at_tip(model, data, jaw, along) for jaw in jaws]
-
-
-def _gaps(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[F64]:
-    """For each finger, how far each of its geoms is from the other fingers [m]."""
-    gaps = []
-    for finger in fingers:
-        others = [geom for other in fingers if other is not finger for geom in other]
-        gaps.append(
-            np.array([min((distance(model, data, one, other) for other in others), default=0.0) for one in finger])
-        )
-    return gaps
-
-
-def _opening(model: mujoco.MjModel, data: mujoco.MjData, pads: Geoms) -> tuple[float, float]:
-    """Distance between the pads, and where the middle between them is along y of `ee` [m]."""
-    gap = min(float(one.min()) for one in _gaps(model, data, pads))
-    middle = nearest(model, data, pads)[1].mean(axis=0) - data.site("ee").xpos
-    return gap, float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle)
 
 
 def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:

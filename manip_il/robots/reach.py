@@ -49,7 +49,7 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 class Reach:
     """Errors on a grid: how far from each point the downward hand ends [m], (x, y, z).
 
-    origin: the grid's [m], (3,).
+    origin: of the grid [m], (3,).
     """
 
     origin: F64
@@ -114,7 +114,7 @@ class Reach:
         return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
 
     def leaning(self, position: Sequence[float] | F64) -> bool:
-        """Return whether a hand that may lean gets near `position` [m], (3,): an upright one does farther in."""
+        """Return whether a hand that may lean gets near `position` [m], (3,), as an upright one does farther in."""
         if self.nearly(position):
             return True
         (x, y, z), (in_x, in_y) = position, self._middle

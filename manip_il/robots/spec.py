@@ -1,4 +1,4 @@
-"""A robot's model as a spec of its own: motorised, with the site `ee`, and nothing that belongs to a world."""
+"""A robot's model as a spec of its own: motorised, with the site `ee`, without anything of a scene."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _to_radians(spec: mujoco.MjSpec) -> None:
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
-    """Return a robot's model with its gripper's attached to its hand, without what belongs to a world.
+    """Return a robot's model with its gripper's attached to its hand, without what belongs to a scene.
 
     robot: its name. camera: the one on the hand, kept as `wrist`.
     Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is missing.
@@ -79,7 +79,7 @@ def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, 
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
-    """Return the arm as a spec: position-controlled, with the site `ee`, and nothing that is not the robot's.
+    """Return the arm as a spec: position-controlled, with the site `ee`, and nothing else.
 
     Raises `UsageError` naming a joint, body or file that is missing, and those that exist.
     """
@@ -189,7 +189,7 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
-    """Put the bodies of joints where they are with the joints at `fixed` [rad or m]."""
+    """Move the bodies of joints to where they are if the joints stand at `fixed` [rad or m]."""
     twin = spec.copy()
     model = twin.compile()
     data = mujoco.MjData(model)
@@ -209,9 +209,9 @@ def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
 
 
 def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
-    """Delete what belongs to a world: motors, mocap bodies, sky, cameras, gravity and time step.
+    """Delete what belongs to a scene: motors, mocap bodies, sky, cameras, gravity and time step.
 
-    hand: what is not in that body's tree also belongs to the world: a floor, a table, what lies on it.
+    hand: what is not in that body's tree also belongs to the scene: a floor, a table, what lies on it.
     """
     for one in _foreign(spec, hand, kept):
         spec.delete(one)
@@ -221,7 +221,7 @@ def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
 
 
 def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
-    """Copy physics options from one spec to another; MuJoCo warns if those of two that it joins differ."""
+    """Copy physics options from one spec to another; MuJoCo warns if two that it joins differ."""
     for name in [name for name in dir(origin.option) if not name.startswith("_")]:
         setattr(spec.option, name, getattr(origin.option, name))
 

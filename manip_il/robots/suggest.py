@@ -1,4 +1,4 @@
-"""A first YAML for an MJCF: the hand's body, the joints that drive the fingers, and a workspace."""
+"""A first draft of the YAML for an MJCF: the hand's body, the joints that drive the fingers, and a workspace."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
 def _ends(
     spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
 ) -> tuple[list[float], list[float], Sequence[str]]:
-    """Find each driven joint's closed and open positions, by the fingers' distance, and the bodies that meet."""
+    """Find each driven joint's closed and open positions, by the fingers' distance, and the bodies that touch."""
     moving = [
         jaw.name
         for jaw in jaws

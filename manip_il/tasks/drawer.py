@@ -104,7 +104,7 @@ def hand_at_handle(world: World) -> F64:
     return world.pose(TRAY).position + [0.0, 0.0, HAND_Z]
 
 
-def is_inside(world: World) -> bool:
+def is_in_drawer(world: World) -> bool:
     """Return whether the object is in the drawer."""
     x, y, z = (world.pose(OBJECT).position - middle_of_drawer(world)).tolist()
     return abs(x) < INSIDE[0] and abs(y) < INSIDE[1] and z < WALL + 0.01
@@ -220,10 +220,10 @@ class Drawer:
     grasped = (OBJECT,)
     sizes = (0.03, 0.045)
     rungs = (
-        Rung("done", lambda w: is_inside(w) and _is_shut(w), _to_bar),
-        Rung("let_go", lambda w: is_inside(w) and _hand_is_in(w), lambda w: let_go(w, OBJECT, HOVER)),
-        Rung("push", lambda w: is_inside(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
-        Rung("to_push", is_inside, _to_bar),
+        Rung("done", lambda w: is_in_drawer(w) and _is_shut(w), _to_bar),
+        Rung("let_go", lambda w: is_in_drawer(w) and _hand_is_in(w), lambda w: let_go(w, OBJECT, HOVER)),
+        Rung("push", lambda w: is_in_drawer(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+        Rung("to_push", is_in_drawer, _to_bar),
         Rung("carry", lambda w: held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
         Rung("set_down", lambda w: held(w, OBJECT) and _is_set_down(w), lambda w: let_go(w, OBJECT, HOVER)),
         Rung("put_aside", lambda w: held(w, OBJECT), _put_aside),
@@ -270,13 +270,13 @@ class Drawer:
 
     def error(self, world: World) -> float:
         """Return how far the drawer is open [m], plus the object's distance if it is not inside."""
-        missing = 0.0 if is_inside(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))
+        missing = 0.0 if is_in_drawer(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))
         return max(0.0, pulled(world)) + missing
 
     def progress(self, world: World) -> float:
         """Return progress of opening, putting in and closing."""
         opened = min(1.0, max(0.0, pulled(world) / OPEN))
-        if is_inside(world):
+        if is_in_drawer(world):
             if _is_shut(world):
                 return 1.0
             if _hand_is_in(world):

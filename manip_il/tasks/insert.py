@@ -24,7 +24,7 @@ from manip_il.tasks.peg import (
     PEG_RUNGS,
     Way,
     hangs,
-    held,
+    holds_peg,
     lower_end,
     move,
     peg_progress,
@@ -48,7 +48,7 @@ NOT_FARTHER = 0.05  # how far beyond the workspace's middle a lying peg may star
 _QUARTER = math.pi / 2
 
 
-def is_in(world: World) -> bool:
+def is_inserted(world: World) -> bool:
     """Return whether the peg is at the hole's floor."""
     return math.dist(lower_end(world), world.pose(HOLE).position) < IN
 
@@ -100,7 +100,7 @@ def _bring(world: World) -> Target:
 
 
 def _hold(world: World) -> Target:
-    if held(world):
+    if holds_peg(world):
         return _bring(world)
     return Target(world.ee.position.copy(), world.ee.rotation.copy(), CLOSED)
 
@@ -117,7 +117,7 @@ class Insert:
     objects: tuple[str, ...] = (PEG,)
     grasped: tuple[str, ...] = (PEG,)
     rungs: tuple[Rung, ...] = (
-        Rung("inserted", is_in, _hold),
+        Rung("inserted", is_inserted, _hold),
         Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
         Rung("carry", hangs, _bring),
         *PEG_RUNGS,
@@ -183,7 +183,7 @@ class Insert:
 
     def progress(self, world: World) -> float:
         """Return progress of grasping, carrying and inserting, by the distance left."""
-        if is_in(world):
+        if is_inserted(world):
             return 1.0
         if not hangs(world):
             return 0.6 * peg_progress(world)

@@ -100,8 +100,8 @@ def rise_first(at: F64, to: Sequence[float]) -> F64:
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
     """Approach from above: over the object and down around it, fingers open; straight up if too low beside it.
 
-    hover: least height over the object on the way there, if that is more than clears its top [m]; rise: least height
-    over the grasp [m].
+    hover: least height over the object on the way there, if more than what clears its top [m]; rise: least height over
+    the grasp [m].
     """
     g = grasp_of(world, name)
     x, y, z = g.at
@@ -213,5 +213,5 @@ def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = CARRY) 
 
 
 def nearness(rest: float) -> float:
-    """Return 1 within `AT_GOAL` [m], and less the more distance is left."""
+    """Return 1 within `AT_GOAL` [m] of the goal, and less the more distance is left."""
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))

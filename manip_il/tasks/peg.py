@@ -1,4 +1,4 @@
-"""A peg: grip it, set it upright, release and catch it, and move it; ladder and progress of tasks with one."""
+"""A peg: grip it, set it upright, release and catch it, and move it; the ladder and progress of tasks with a peg."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def upper_axis(world: World) -> F64:
     axis = peg.rotation[:, 2]
     if stands(world):
         return math.copysign(1.0, axis[2]) * axis
-    if held(world):
+    if holds_peg(world):
         from_peg = ee.position - peg.position - BACK * ee.rotation[:, 2]
         return math.copysign(1.0, float(axis @ from_peg)) * axis
     at = angle_across(ee.rotation)
@@ -105,7 +105,7 @@ def stands(world: World) -> bool:
 
 
 @once_per_state
-def held(world: World) -> bool:
+def holds_peg(world: World) -> bool:
     """Return whether both fingers touch the peg, and the hand is between its faces and its ends."""
     if not world.touched(PEG):
         return False
@@ -311,7 +311,7 @@ def _approach(world: World) -> Target:
 
 def hangs(world: World) -> bool:
     """Return whether the peg hangs from a hand that points along it, more or less."""
-    return held(world) and not is_aslant(world) and stands(world)
+    return holds_peg(world) and not is_aslant(world) and stands(world)
 
 
 def peg_progress(world: World) -> float:
@@ -320,7 +320,7 @@ def peg_progress(world: World) -> float:
     above = float(world.ee.position[2] - grip.position[2])
     if is_up(world):
         return 0.55 + 0.11 * min(1.0, max(0.0, above / (FROM_END + CLEAR)))
-    if held(world):
+    if holds_peg(world):
         way = to_stand(world)
         height = _set_up_height(world, way)
         rest = math.hypot(*way.off) + abs(height - way.low) + height + 0.25 * way.angle
@@ -331,7 +331,7 @@ def peg_progress(world: World) -> float:
 
 PEG_RUNGS = (
     Rung("let_stand", is_up, _let_stand),
-    Rung("set_up", held, _set_up),
+    Rung("set_up", holds_peg, _set_up),
     Rung("catch", _falls, _catch),
     Rung("grasp", _at_grip, lambda w: Target(grip_of(w).position, grip_of(w).rotation, CLOSED)),
     Rung("open", lambda w: not grip_of(w).open_enough, _approach),

@@ -36,14 +36,17 @@ def place_on_base(world: World) -> F64:
 
 def stands(world: World) -> bool:
     """Return whether the upper cube lies level on the base."""
-    x, y, z = (world.pose(TOP).position - place_on_base(world)).tolist()
-    return math.hypot(x, y) < ON_XY and abs(z) < ON_Z and max(lie_of(world, TOP).tilt, lie_of(world, BASE).tilt) < LEVEL
+    return _is_on_base(world, ON_Z) and max(lie_of(world, TOP).tilt, lie_of(world, BASE).tilt) < LEVEL
 
 
 def _rests(world: World) -> bool:
     """Whether a leaning hand has put the upper cube on the base, where it will lie level once released."""
+    return world.robot.leans and _is_on_base(world, LEANS_Z) and lie_of(world, TOP).tilt < LEANS
+
+
+def _is_on_base(world: World, height: float) -> bool:
     x, y, z = (world.pose(TOP).position - place_on_base(world)).tolist()
-    return world.robot.leans and math.hypot(x, y) < ON_XY and abs(z) < LEANS_Z and lie_of(world, TOP).tilt < LEANS
+    return math.hypot(x, y) < ON_XY and abs(z) < height
 
 
 def _hand_is_away(world: World) -> bool:

@@ -99,7 +99,7 @@ class Grid:
 
     @cached_property
     def _links(self) -> _Links:
-        """Return the edges that are free from end to end."""
+        """Edges that are free from end to end."""
         every = _links(self.shape)
         kept: NDArray[np.bool_] = np.all(self.free[every.edges], axis=1)
         middles = every.fine[kept, 1]

@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.checks import task_name
-from manip_il.cli.evaluate import EvalOptions
-from manip_il.cli.parsing import from_yaml, parse
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError, UsageError
 from manip_il.tasks.carry.reward import FEATURES, Reward
@@ -47,13 +45,3 @@ def test_a_task_of_which_there_is_one_takes_nothing_behind_a_colon():
         make_config(task="lift:low")
     with pytest.raises(ManipError, match=r"task is 'carry:own.json'; expected NAME=NUMBER"):
         task_name("carry:own.json")
-
-
-def test_the_old_option_names_the_new_one_and_old_files_may_hold_it_empty(tmp_path: Path):
-    (tmp_path / "old.yaml").write_text("task: {type: lift, reward: ''}")
-    assert from_yaml(tmp_path / "old.yaml", EvalOptions).env["task"] == "lift"
-    (tmp_path / "old.yaml").write_text("task: {type: carry, reward: low}")
-    with pytest.raises(UsageError, match=r"reward is now --task.type=carry:REWARD"):
-        from_yaml(tmp_path / "old.yaml", EvalOptions)
-    with pytest.raises(UsageError, match=r"--task.reward is now --task.type=carry:REWARD"):
-        parse(EvalOptions, ["--task.reward=low"])

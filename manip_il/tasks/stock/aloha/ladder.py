@@ -186,7 +186,7 @@ def _within(off: F64, box: tuple[float, float, float]) -> bool:
 
 
 class HandTarget(NamedTuple):
-    """HandTarget pose of a hand, (3,) [m] and (3, 3), its gripper's command, and the longest step of a joint [rad]."""
+    """Target pose of a hand, (3,) [m] and (3, 3), its gripper's command, and the longest step of a joint [rad]."""
 
     position: F64
     rotation: F64
