@@ -12,7 +12,7 @@ import os
 from importlib import import_module
 from typing import Any
 
-from manip_il.tasks.register import register_envs
+from manip_il.tasks import register_envs
 
 if not os.environ.get("MUJOCO_GL") and ctypes.util.find_library("EGL"):
     os.environ["MUJOCO_GL"] = "egl"

@@ -20,10 +20,10 @@ from manip_il.option import option_of
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.tasks import ENV_IDS, TASK_IDS
 from manip_il.tasks.config import EnvConfig as SimConfig
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
-from manip_il.tasks.register import ENV_IDS, TASK_IDS
 from manip_il.tasks.table import SUFFIX, get_task
 
 TASKS = {env_id.removeprefix("manip_il/"): names for env_id, names in ENV_IDS.items()}

@@ -192,8 +192,8 @@ def find_home(robot: Robot, turns: bool) -> Robot:
     halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
     heights = [min(_HIGHEST, robot.workspace.height / 2) * share for share in _LOWER]
     found = (max((_best(one, height) for one in halves), key=lambda one: one[0]) for height in heights)
-    best = next((one for one in found if math.isfinite(one[0])), (-math.inf, robot))
-    if not math.isfinite(best[0]):
+    best = next((one for one in found if math.isfinite(one[0])), None)
+    if best is None:
         x, y = robot.workspace.centre
         mount = " gripper.quaternion (how the gripper is mounted)," if robot.gripper.files else ""
         raise UsageError(

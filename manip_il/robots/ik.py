@@ -149,7 +149,7 @@ class ArmIK:
         position, rotation = self.ee_pose(q)
         position, rotation = position + motion[:3], rotation_matrix(motion[3:]) @ rotation
         dq = self.displacement(position, rotation, _LARGEST)
-        q = self._within(q if dq is None else q + dq)
+        q = np.clip(q if dq is None else q + dq, *self.limits.T)
         for _ in range(_CORRECTIONS):
             at, turned = self.ee_pose(q)
             error = np.append(position - at, rotation_vector(rotation @ turned.T))
@@ -157,11 +157,8 @@ class ArmIK:
                 break
             jacobian = np.ascontiguousarray(self._site_jacobian())
             dq = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _LEVENBERG * np.eye(6), error)
-            q = self._within(q + dq * (_LARGEST / max(np.abs(dq).max(), _LARGEST)))
+            q = np.clip(q + dq * (_LARGEST / max(np.abs(dq).max(), _LARGEST)), *self.limits.T)
         return q
-
-    def _within(self, q: F64) -> F64:
-        return np.minimum(np.maximum(q, self.limits[:, 0]), self.limits[:, 1])
 
     def _site_jacobian(self) -> F64:
         """Jacobian of `ee`, position over rotation, by the arm's joints at the last `ee_pose`, (6, arm)."""

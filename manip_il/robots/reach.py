@@ -68,13 +68,8 @@ class Reach:
         return self.arrives.tolist()
 
     @cached_property
-    def _corner(self) -> tuple[float, float, float]:
-        return tuple(self.origin.tolist())
-
-    @cached_property
-    def _middle(self) -> tuple[float, float]:
-        x, y, _ = (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist()
-        return x, y
+    def _corner(self) -> list[float]:
+        return self.origin.tolist()
 
     def error(self, position: Sequence[float] | F64) -> float:
         """Return how far from `position` [m], (3,), the hand ends; plus its distance from the map if beyond it [m]."""
@@ -117,7 +112,7 @@ class Reach:
         """Return whether a hand that may lean gets near `position` [m], (3,), as an upright one does farther in."""
         if self.nearly(position):
             return True
-        (x, y, z), (in_x, in_y) = position, self._middle
+        (x, y, z), (in_x, in_y, _) = position, (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist()
         inwards = _LEAN / max(_LEAN, math.hypot(in_x - x, in_y - y))
         return self.nearly((x + inwards * (in_x - x), y + inwards * (in_y - y), z))
 

@@ -149,7 +149,6 @@ class LeRobotConfig:
 
 UPRIGHT = Costs()
 SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # for an arm that cannot hold its hand upright
-TABLE = TableTop()
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,7 @@ class Robot:
     workspace: Workspace
     wrist_camera: tuple[float, float, float] | str = WRIST_CAMERA
     cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
-    table: TableTop = TABLE
+    table: TableTop = TableTop()
     base: tuple[float, float, float] | None = None
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     max_joint_step: float = JOINT_STEP

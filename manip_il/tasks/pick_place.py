@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -14,14 +14,13 @@ from manip_il.sim.rests import LEAST_HEIGHT
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.grasp import Lie, is_cube, lie_of
+from manip_il.tasks.grasp import is_cube, lie_of
 from manip_il.tasks.ladder import held, pick_progress, pick_rungs
 from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
 
 OBJECT = "object"
-UNDER = np.array([0.0, 0.0, -1.0])  # out of any hand's reach [m]
 ANY_SHAPE = Limits(horizon=200)  # small or rolling objects take more attempts than a cube
 
 
@@ -100,14 +99,12 @@ class Lift(PickPlace):
         """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""
         low, high = np.array(LIFT) * min(1.0, world.scene.robot.workspace.height / LIFT_HEIGHT)
 
-        def draw_both() -> F64:
+        def draw_both() -> tuple[Any, F64, F64]:
             at, turn = draw_lying(rng, world, OBJECT)
             goals = (at + [0.0, 0.0, rng.uniform(low, high)] for _ in range(FEW_DRAWS))
-            goal = next((goal for goal in goals if world.reach.has(goal)), UNDER)
-            return np.concatenate([goal, at, turn])
+            return next((goal for goal in goals if world.reach.has(goal)), None), at, turn
 
-        both = draw_until(draw_both, lambda one: world.reach.has(one[:3]), world, "the goal")
-        goal, at, turn = np.split(both, [3, 6])
+        goal, at, turn = draw_until(draw_both, lambda drawn: drawn[0] is not None, world, "the goal")
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
 
@@ -121,32 +118,23 @@ def observe_cube(world: World, name: str) -> Observed:
 def observe_object(world: World, name: str) -> Observed:
     """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the vector to it from the hand."""
     position, lie = world.pose(name).position, lie_of(world, name)
-    if world.scene.draws_shape or not is_cube(world, name):
-        seen = _observe_lie(name, lie, mesh=world.hull(name) is not None)
-    else:
-        seen = {
+    if not world.scene.draws_shape and is_cube(world, name):
+        seen: Observed = {
             f"{name}.cos4yaw": math.cos(4 * lie.yaw),
             f"{name}.sin4yaw": math.sin(4 * lie.yaw),
             f"{name}.tilt": lie.tilt,
             f"{name}.width": world.extents(name)[0],
         }
+    else:  # by its narrowest grasp, so that the numbers change continuously as it turns
+        yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
+        seen = {
+            f"{name}.folds": float(lie.folds),
+            f"{name}.cosyaw": math.cos(lie.folds * yaw),
+            f"{name}.sinyaw": math.sin(lie.folds * yaw),
+            f"{name}.tilt": lie.tilt,
+            f"{name}.width": width,
+            f"{name}.length": length,
+            f"{name}.height": lie.tall,
+            **({f"{name}.grasp": np.array(centre)} if world.hull(name) else {}),
+        }
     return {name: position, **seen, f"{name}_from_ee": position - world.ee.position}
-
-
-def _observe_lie(name: str, lie: Lie, *, mesh: bool) -> Observed:
-    """Return how a non-cube lies, by its narrowest grasp, so that the numbers change continuously as it turns.
-
-    mesh: include the vector from its centre of mass to the middle of that grasp.
-    """
-    yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
-    of_mesh = {f"{name}.grasp": np.array(centre)} if mesh else {}
-    return {
-        f"{name}.folds": float(lie.folds),
-        f"{name}.cosyaw": math.cos(lie.folds * yaw),
-        f"{name}.sinyaw": math.sin(lie.folds * yaw),
-        f"{name}.tilt": lie.tilt,
-        f"{name}.width": width,
-        f"{name}.length": length,
-        f"{name}.height": lie.tall,
-        **of_mesh,
-    }

@@ -112,8 +112,8 @@ def product(first: F64, second: F64) -> F64:
     return turn
 
 
-def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: World, what: str) -> F64:
-    """Return the first draw that fits, (3,). Raises `UsageError` after a thousand draws."""
+def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World, what: str) -> T:
+    """Return the first draw that fits. Raises `UsageError` after a thousand draws."""
     for _ in range(_MOST_DRAWS):
         drawn = draw()
         if fits(drawn):

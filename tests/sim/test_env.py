@@ -15,8 +15,8 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import GOAL
+from manip_il.tasks import ENV_IDS, TASK_IDS, register_envs
 from manip_il.tasks.envs import make_env
-from manip_il.tasks.register import ENV_IDS, TASK_IDS, register_envs
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
 

@@ -7,9 +7,11 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from manip_il.errors import ManipError
 from manip_il.mdp import F64, State
+from manip_il.robots.action_space import ActionSpace
 
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -31,11 +33,28 @@ class StockBase:
     """An environment of another package, whose reset and step are its own."""
 
     world: ClassVar[None] = None  # its expert restores states itself
+    actions: ActionSpace
     model: mujoco.MjModel
     data: mujoco.MjData
+    _env: Any
 
     def __reduce__(self) -> NoReturn:
         raise ManipError("a stock environment cannot be copied or pickled; use get_state()")
+
+    def start(self, seed: int) -> None:
+        """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
+        self._env.reset(seed=seed)
+        self._begin()
+
+    def advance(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Apply one action (n,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
+        _, reward, _, _, info = self._env.step(self.actions.clip(action, self._step))
+        solved = bool(info["is_success"])
+        self.reward = float(reward)
+        self._step += 1
+        self._streak = self._streak + 1 if solved else 0
+        self._ever = self._ever or solved
+        return action
 
     def begin_step(self) -> None:
         """Do nothing: stock environments have no disturbances."""
@@ -49,13 +68,6 @@ class StockBase:
         """Start counting from 0, or from a state's counts."""
         self._step, self._streak, self._ever = (state.step, state.streak, state.ever) if state else (0, 0, False)
         self.reward = 0.0
-
-    def _count(self, reward: float, solved: bool) -> None:
-        """Count a step, its reward and whether it solved the task."""
-        self.reward = reward
-        self._step += 1
-        self._streak = self._streak + 1 if solved else 0
-        self._ever = self._ever or solved
 
     def _physics(self) -> F64:
         """MuJoCo's integration state."""

@@ -50,19 +50,14 @@ class StockEnv(StockBase):
 
     def start(self, seed: int) -> None:
         """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
-        self._env.reset(seed=seed)
-        self._begin()
+        super().start(seed)
         self._remember()
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (4,) for one control step; returns it.
-
-        Raises `NotFiniteError`, `MismatchError`.
-        """
-        _, reward, _, _, info = self._env.step(ACTIONS.clip(action, self._step))
+        """Apply one action (4,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
+        super().advance(action)
         if self.task.blocked:  # its step has recomputed all poses
             self._remember()
-        self._count(float(reward), bool(info["is_success"]))
         return action
 
     @property

@@ -58,17 +58,6 @@ class AlohaEnv(StockBase):
         self.actions = _actions(self.model)
         self.start(0)
 
-    def start(self, seed: int) -> None:
-        """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
-        self._env.reset(seed=seed)
-        self._begin()
-
-    def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (14,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
-        _, reward, _, _, info = self._env.step(self.actions.clip(action, self._step))
-        self._count(float(reward), bool(info["is_success"]))
-        return action
-
     @property
     def progress(self) -> float:
         """Reward of the state as a share of the environment's highest."""
