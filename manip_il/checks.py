@@ -23,7 +23,6 @@ from manip_il.errors import ManipError, UsageError, shorten
 
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
-LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; fits an eval.json of half a million episodes
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
@@ -111,9 +110,9 @@ def parse_json(what: str, data: str | bytes) -> Any:
         raise ManipError(f"{what} is not valid JSON: {error}") from error
 
 
-def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
-    """Return the object in a JSON file of at most `largest` bytes. what: what is expected, for the message."""
-    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """Return the object in a JSON file. what: what is expected, for the message."""
+    return mapping(str(path), parse_json(str(path), read_bytes(path, what)))
 
 
 def parse_yaml(text: str) -> Any:
@@ -129,21 +128,17 @@ def parse_yaml(text: str) -> Any:
 def read_yaml(path: Path, what: str) -> Any:
     """Return the value of a YAML file; `UsageError` if it cannot be read. what: what is expected, for the message."""
     try:
-        return parse_yaml(read_bytes(path, what, LARGEST_JSON, UsageError).decode())
+        return parse_yaml(read_bytes(path, what, UsageError).decode())
     except ValueError as error:  # UnicodeDecodeError is one
         raise UsageError(f"{path} is not YAML: {error}") from error
 
 
-def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a file's content; raises `refusal` if it cannot be read or has more than `largest` bytes."""
+def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError) -> bytes:
+    """Return a file's content; raises `refusal` if it cannot be read. what: what is expected, for the message."""
     try:
-        with path.open("rb") as file:
-            data = file.read(largest + 1)
+        return path.read_bytes()
     except OSError as error:
         raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
-    if len(data) > largest:
-        raise refusal(f"{path} has more than {largest} bytes; expected {what}")
-    return data
 
 
 def without_link(path: str, flags: int) -> int:

@@ -21,11 +21,11 @@ def option(default: Any, help_text: str, **metadata: Any) -> Any:
     return field(default=default, metadata=metadata)
 
 
-def option_of(cls: type, name: str, default: Any = MISSING, help_text: str = "") -> Any:
-    """Return a field like `name` of another dataclass. default, help_text: replace those of that field."""
+def option_of(cls: type, name: str) -> Any:
+    """Return a field with the default and the help of `name` of another dataclass."""
     [theirs] = [one for one in fields(cls) if one.name == name]
     own = theirs.default if theirs.default_factory is MISSING else theirs.default_factory
-    return option(own if default is MISSING else default, help_text or theirs.metadata["help"])
+    return option(own, theirs.metadata["help"])
 
 
 def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:

@@ -142,7 +142,7 @@ class CompareOptions(Tested, Seeded, Trusting):
         from manip_il.evaluation.tables import print_table
 
         write_json(folder / FILE_NAME, study.to_json())
-        compare_report(study, title, command_line("compare", self), config).write(folder / REPORT_FILE)
+        compare_report(study, title, command_line(), config).write(folder / REPORT_FILE)
         for table in (*study.result_tables(), *study.cost_tables()):
             print_table(table)
         say(study.verdict, *study.facts, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

@@ -124,7 +124,7 @@ class DaggerOptions(Varied, Trusting):
             title=f"{kind} on {config.env.robot} {config.env.task}",
             verdict=f"{chosen}: {success} success on {success.n:,} validation episodes.",
             facts=facts,
-            command=command_line("dagger", self),
+            command=command_line(),
             config=to_plain(self),
         )
 

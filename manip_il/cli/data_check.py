@@ -37,7 +37,7 @@ class CheckOptions(OfDataset):
 
     @property
     def _root(self) -> Path:
-        """The folder, whose name also the folders beside it have: `.` has none."""
+        """The dataset's folder, as a path with a name, because folders beside it are named after it."""
         return self.dataset if self.dataset.name else self.dataset.absolute()
 
     def _examine(self) -> list[Finding]:
@@ -105,7 +105,7 @@ class ScoreOptions(OfDataset):
     """
 
     example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"
-    reward: str = option(MISSING, "a folder of manip-il reward fit, or progress: the true progress")
+    reward: str = option(MISSING, "a folder from manip-il reward fit, or progress for the true progress")
     output: Output = group(Output(Path("runs/scores")), prefix="")
 
     def run(self) -> None:

@@ -38,8 +38,7 @@ class BuildOptions(Replacing):
         """Build the dataset."""
         from manip_il.data.build import build
 
-        if self.overwrite and self.dataset.exists():
-            require_replaceable(self.dataset, self.overwrite)
+        require_replaceable(self.dataset, self.overwrite)
         with exclusive(self.dataset):
             info, failed = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
         say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")
@@ -95,8 +94,7 @@ class Edit(Replacing):
 
         root = root or self.source
         folder = self.target or root.with_name(f"{root.absolute().name}_{what}")
-        if folder.exists() and any(folder.iterdir()):
-            require_replaceable(folder, self.overwrite, [root])
+        require_replaceable(folder, self.overwrite, [root])
         source = open_source(root, self.robot, self.task, self.object)
         warn(*source.warnings)
         with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:

@@ -64,7 +64,7 @@ class DemoOptions:
         )
         facts.append(f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.")
         title = f"Demo: {config.env.robot} {config.env.task}"
-        parts = {"title": title, "verdict": verdict, "facts": tuple(facts), "command": command_line("demo", self)}
+        parts = {"title": title, "verdict": verdict, "facts": tuple(facts), "command": command_line()}
         write_page(folder, folder / "dagger", rows, "DAgger", *films, config=to_plain(self), **parts)
         print_table(policy_table(rows), empty="-")
         say(verdict, *facts)

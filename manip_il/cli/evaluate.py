@@ -134,7 +134,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         from manip_il.evaluation.tables import evaluation_table, print_table
 
         result.write(folder / FILE_NAME)
-        page = eval_report(result, command_line("eval", self), to_plain(self), films, no_films)
+        page = eval_report(result, command_line(), to_plain(self), films, no_films)
         page.write(folder / REPORT_FILE)
         print_table(evaluation_table(result))
         say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

@@ -47,7 +47,7 @@ class Learning:
             with Stages(kept) as stages, self.engine.open() as engine:
                 self._learn(config, folder, engine, stages)
             title, found = f"{self.method.upper()} on {config.env.robot} {config.env.task}", validations(folder)
-            records, command = read_lines(folder / METRICS_FILE), command_line(f"rl {self.method}", self)
+            records, command = read_lines(folder / METRICS_FILE), command_line()
             learning_report(title, found, records, command, to_plain(self)).write(folder / REPORT_FILE)
         best = folder / "best" / "pretrained_model"
         say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
@@ -130,7 +130,7 @@ class PpoOptions(Learning):
 
     method: ClassVar[str] = "ppo"
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
-    reward: Path = option(MISSING, "the reward, a folder of manip-il reward fit", exists="")
+    reward: Path = option(MISSING, "the reward: a folder from manip-il reward fit", exists="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/ppo")), prefix="")
 
     def learning_config(self) -> LearningConfig:

@@ -17,7 +17,7 @@ from manip_il import __version__
 from manip_il.cli import progress
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import check_paths, parse
-from manip_il.errors import ManipError, UnknownName, UsageError, printable
+from manip_il.errors import ManipError, UnknownName, UsageError, printable, silence_ffmpeg_warning
 
 PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
@@ -131,16 +131,10 @@ def _dispatch(words: list[str]) -> None:
         if {*HELP} & {*words}:
             print(_command_help(name, load(name), words))
         else:
-            _run(name, words)
-
-
-def _run(name: str, words: list[str]) -> None:
-    options = parse(load(name), words, command=name)
-    check_paths(options)
-    from manip_il.errors import silence_ffmpeg_warning
-
-    silence_ffmpeg_warning()
-    options.run()
+            options = parse(load(name), words, command=name)
+            check_paths(options)
+            silence_ffmpeg_warning()
+            options.run()
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:

@@ -138,19 +138,9 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) or hasattr(value, "parse") else value
 
 
-def command_line(name: str, options: Any) -> str:
-    """Return the command line, with every option that differs from its default, to copy."""
-    words = ["manip-il", *name.split()]
-    for one in options_of(type(options)):
-        value = one.value(options)
-        if one.positional:
-            words += map(str, value if isinstance(value, list) else [] if value is None else [value])
-        elif one.is_open:
-            texts = {key: text if isinstance(text, str) else json.dumps(text) for key, text in value.items()}
-            words += [f"--{one.name}.{key}={text}" for key, text in texts.items()]
-        elif value != one.default and one.name not in ("resume", "overwrite"):
-            words.append(f"--{one.name}={word(value)}")
-    return shlex.join(words)
+def command_line() -> str:
+    """Return the command that was typed, to copy."""
+    return shlex.join(["manip-il", *sys.argv[1:]])
 
 
 def word(value: Any) -> str:

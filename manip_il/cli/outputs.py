@@ -84,13 +84,15 @@ def prepare_output(
         for left in folder.rglob(f".*{PARTIAL}"):  # partial files of a killed writer; folders have locks
             if left.is_file():
                 left.unlink()
-    elif folder.exists() and any(folder.iterdir()):
+    elif folder.exists():
         require_replaceable(folder, overwrite, sources)
         clear(folder)
 
 
 def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] = ()) -> None:
-    """Raise `UsageError` unless `overwrite` is set and `folder` is this program's output."""
+    """Raise `UsageError` unless `folder` is absent or empty, or `overwrite` is set and it is this program's output."""
+    if not folder.exists() or not any(folder.iterdir()):
+        return
     if not overwrite:
         raise FolderExistsError(folder)
     if source := next((one for one in sources if one.resolve().is_relative_to(folder.resolve())), None):

@@ -49,7 +49,7 @@ def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
 
     command: its name, for error messages.
     """
-    known = _known(cls)
+    known = {option.name: option for option in options_of(cls)}
     raw, paths = _read_words(words, known, command)
     trees = [(str(path), read_yaml(path, "a YAML file of options")) for path in map(Path, paths)]
     return from_layers(cls, trees, raw)
@@ -65,7 +65,7 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mappi
 
     layers: pairs of a tree's origin, for error messages, and the tree. Raises `UsageError` as `parse` does.
     """
-    known, raw = _known(cls), dict[str, _RawValue]()
+    known, raw = {option.name: option for option in options_of(cls)}, dict[str, _RawValue]()
     for origin, tree in layers:
         raw |= _read_tree(tree, known, origin)
     raw |= words or {}
@@ -102,10 +102,6 @@ def dump_yaml(options: Any) -> str:
 
     header = f"{CONFIG_HEADER} {__version__}: resolved options ({type(options).__name__})\n"
     return header + yaml.safe_dump(to_plain(options), sort_keys=False)
-
-
-def _known(cls: type) -> Known:
-    return {option.name: option for option in options_of(cls)}
 
 
 def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[str, _RawValue], list[str]]:

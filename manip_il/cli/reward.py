@@ -19,7 +19,7 @@ from manip_il.option import Seeded, option
 class OfPairs:
     """Options of a command on pairs of clips."""
 
-    pairs: Path = option(MISSING, "pairs.json of manip-il reward pairs", positional=True, exists="")
+    pairs: Path = option(MISSING, "pairs.json from manip-il reward pairs", positional=True, exists="")
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class IrlOptions(OfDataset, Seeded):
         learnt = learn(self.method, [one.demonstration for one in carried], rng)
         found = inverse.Inverse(str(self.dataset), tuple(carried), learnt)
         with self.output.open(self) as folder:
-            page = inverse.inverse_report(found, command_line("reward irl", self), to_plain(self))
+            page = inverse.inverse_report(found, command_line(), to_plain(self))
             page.write(folder / REPORT_FILE)
             write_json(folder / inverse.FILE_NAME, found.to_json())
         print_table(inverse.weight_table(found))
@@ -151,7 +151,7 @@ class FitOptions(OfPairs, Seeded):
     """
 
     example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
-    answers: list[Path] = option(MISSING, "preferences.json of ask or answer", positional=True, exists="")
+    answers: list[Path] = option(MISSING, "preferences.json from ask or answer", positional=True, exists="")
     more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length", exists="")
     members: int = option(8, "networks in the ensemble, and folds of the pairs", at_least=3, at_most=64)
     output: Output = group(Output(Path("runs/reward")), prefix="")

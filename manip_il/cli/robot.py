@@ -25,7 +25,7 @@ class RobotNewOptions(Replacing):
     """Write a first YAML file for an arm's MJCF, with hand, fingers and workspace as suggested by the model.
 
     A comment explains every line. Omitted values (joints, home, gains, the hand's frame) are taken from the model, and
-    can be added. Then checks the robot, like `robot check --episodes=0`, and prints what to change. The exit code is 1
+    can be added. Then checks the robot, like `robot check --episodes=0`, and prints what to change. Ends with an error
     if the robot cannot do any task yet.
     """
 
@@ -94,8 +94,8 @@ class RobotCheckOptions:
                 pictures, no_pictures = robot_check.looks(self.robot), ""
             except RenderError as error:
                 pictures, no_pictures = (), str(error)
-            made_by = (command_line("robot check", self), to_plain(self))
-            robot_check.check_report(found, pictures, no_pictures, *made_by).write(folder / PAGE)
+            page = robot_check.check_report(found, pictures, no_pictures, command_line(), to_plain(self))
+            page.write(folder / PAGE)
         print_table(robot_check.task_table(found))
         say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
         say(f"page: {folder / PAGE}")

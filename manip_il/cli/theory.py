@@ -43,7 +43,7 @@ class TheoryOptions:
             shift = self._shift(self.source) if self.source else None
             theory = Theory(tuple(all_curves()), tuple(drifts()), shift)
             write_json(folder / FILE_NAME, theory.to_json())
-            theory_report(theory, command_line("theory", self), to_plain(self)).write(folder / REPORT_FILE)
+            theory_report(theory, command_line(), to_plain(self)).write(folder / REPORT_FILE)
         print_table(slope_table(theory))
         say(f"policies above their bound: {theory.above}", f"report: {folder / REPORT_FILE}")
 

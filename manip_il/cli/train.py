@@ -51,7 +51,7 @@ class TrainOptions(Seeded, Trusting):
     first: ClassVar[str] = "dataset.root policy observation action_space steps batch_size output_dir resume"
     dataset: SourceGroup
     weights: Path | None = option(
-        None, "rabc.parquet of manip-il data score: sampling weights of frames, as in LeRobot's RA-BC", exists=""
+        None, "rabc.parquet from manip-il data score: sampling weights of frames, as in LeRobot's RA-BC", exists=""
     )
     fit: Given = given(FitConfig, prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/train")), prefix="")

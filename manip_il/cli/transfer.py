@@ -75,8 +75,7 @@ class PullOptions(Replacing):
 
         from manip_il.store.transfer import open_remote, pull
 
-        if self.overwrite and self.target.exists():
-            require_replaceable(self.target, self.overwrite)
+        require_replaceable(self.target, self.overwrite)
         remote = open_remote(self.remote, revision=self.revision, quiet=not has_bars())
         manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
         if self.dry_run:

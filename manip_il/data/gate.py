@@ -74,7 +74,7 @@ def _open_file(path: Path, pictures: Mapping[str, tuple[bytes, ...]]) -> None:
             for _ in container.demux(container.streams.video):
                 pass
     elif path.suffix == ".json":
-        checks.parse_json(str(path), checks.read_bytes(path, "JSON", checks.LARGEST_JSON))
+        checks.parse_json(str(path), checks.read_bytes(path, "JSON"))
 
 
 def _is_picture(column: pa.Field, pictures: Collection[str]) -> bool:

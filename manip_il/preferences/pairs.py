@@ -26,7 +26,6 @@ POOL = 10  # candidates per pair when choosing by disagreement
 _TRIES = 100  # attempts to draw a new pair
 FILE_NAME = "pairs.json"
 FORMAT, VERSION = "manip_il pairs", 1
-_LARGEST = 64 * 1024 * 1024  # largest file read [bytes]
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ class Pairs:
 
 def read_file[Read](path: Path, form: str, version: int, make: Callable[[dict[str, Any]], Read]) -> Read:
     """Return `make(content)` for a JSON file of a format and version. Raises `ManipError` for any other file."""
-    data = checks.read_json(path, form, _LARGEST)
+    data = checks.read_json(path, form)
     try:
         if (data["format"], data["version"]) != (form, version):
             raise ValueError(f"version {data['version']} of {data['format']}")

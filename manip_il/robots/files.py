@@ -15,7 +15,6 @@ from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
 KEYS = ("model", "includes", "meshes", "mend")  # keys of a YAML
-_LARGEST = 16 * 1024**2  # largest MJCF [bytes]
 
 
 @dataclass(frozen=True)
@@ -43,14 +42,14 @@ class ModelFiles:
         robot: its name.
         """
         try:
-            model = self._mended(checks.read_bytes(self.model, "an MJCF", _LARGEST))
+            model = self._mended(checks.read_bytes(self.model, "an MJCF"))
             home = self.includes or self.model.parent
             name = str(home / f"mended {self.model.name}")
             spec = mujoco.MjSpec.from_file(name, include={name: model})
             if self.meshes is not None:
                 # MuJoCo prefixes names in an included file with its folder
                 meshes = [mesh.file.removeprefix(spec.modelfiledir) for mesh in spec.meshes if mesh.file]
-                assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh", _LARGEST) for mesh in sorted(meshes)}
+                assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in sorted(meshes)}
                 included = {path: (home / path).read_bytes() for path in _included(model, home)}
                 spec = mujoco.MjSpec.from_string(model.decode(), include=included, assets=assets)
                 spec.meshdir = ""

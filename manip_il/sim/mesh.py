@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import UsageError, shorten
 
-_LARGEST = 256 * 1024**2  # largest file [bytes]
 _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P<length>:\d*\.?\d+)?", re.DOTALL)
 
 
@@ -79,7 +78,7 @@ def moved(text: str, path: Path) -> str:
 @cache
 def _read(name: str, length: float) -> Mesh:
     path = Path(name)
-    content = checks.read_bytes(path, "a mesh, an STL or OBJ file", _LARGEST, UsageError)
+    content = checks.read_bytes(path, "a mesh, an STL or OBJ file", UsageError)
     solid = _solid(name, content, path.suffix.lower())
     scale = length / solid.extents.max() if length else 1.0
     vertices, volume = (solid.vertices - solid.center_mass) * scale, float(solid.volume) * scale**3

@@ -15,10 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import load, main
-from manip_il.cli.options import command_line, options_of
-from manip_il.cli.outputs import ResumableOutput
+from manip_il.cli.options import options_of
 from manip_il.cli.parsing import from_yaml, parse
 from manip_il.data.dataset import Dataset
 from manip_il.data.json_lines import read_lines
@@ -138,8 +136,3 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
     assert main([*words, "--resume=true", "--rounds=2"]) == 0
     assert [record["round"] for record in read_lines(run / "metrics.jsonl")] == [0, 1, 2]
     assert Dataset.open(run / "dataset").info.episodes == 3 + 2 * 2
-
-
-def test_a_command_line_can_be_copied_from_a_report():
-    options = DaggerOptions(settings={"rounds": 2}, output=ResumableOutput(Path("runs/a b")))
-    assert command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"

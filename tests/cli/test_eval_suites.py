@@ -136,17 +136,6 @@ def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys, 
     assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error()
 
 
-def test_overwrite_empties_the_folder_in_place_as_it_may_be_a_mount(here):
-    assert evaluate("e", *REACH, "--eval.n_episodes=2") == 0
-    Path("e/more").mkdir()
-    Path("e/more/file").touch()
-    inode = Path("e").stat().st_ino
-    assert evaluate("e", *REACH, "--eval.n_episodes=1", "--overwrite=true") == 0
-    assert Path("e").stat().st_ino == inode
-    assert not Path("e/more").exists()
-    assert len(EvalResult.read(Path("e")).episodes) == 1
-
-
 def test_every_line_of_eval_json_can_be_replayed_alone(act, here, capsys):
     assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=4", *SMALL) == 0
     result = EvalResult.read(Path("e"))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.cli.options import Given, Open, command_line, options_of, word
+from manip_il.cli.options import Given, Open, options_of, word
 from manip_il.cli.options import given as given_of
 from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml, parse
 from manip_il.errors import UsageError
@@ -182,7 +182,6 @@ def test_of_a_group_of_anothers_options_only_what_was_given_is_held(tmp_path):
     assert parse(Command, []) == Command()
     command = parse(Command, ["--env.hz=30", "--robot.type=fetch", "--crf=null"])
     assert command == Command(env={"robot": "fetch", "hz": 30}, more={"crf": None})
-    assert command_line("x", command) == "manip-il x --env.hz=30 --robot.type=fetch --crf=null"
     (tmp_path / "c.yaml").write_text(dump_yaml(Command()))
     assert from_yaml(tmp_path / "c.yaml", Command).env == {"robot": None, "hz": 20, "crf": 23.0}
     (tmp_path / "c.yaml").write_text("env: {hz: null}\n")  # of a file in which it was not given

@@ -67,8 +67,10 @@ def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(t
 def test_overwrite_deletes_what_this_program_made_and_nothing_else(tmp_path, name, content, is_ours):
     write_file(tmp_path / "run" / name, content.encode())
     if is_ours:
+        inode = (tmp_path / "run").stat().st_ino
         overwrite(tmp_path / "run")
         assert list((tmp_path / "run").iterdir()) == []
+        assert (tmp_path / "run").stat().st_ino == inode, "it may be a mount point"
     else:
         with pytest.raises(UsageError, match="did not make"):
             overwrite(tmp_path / "run")

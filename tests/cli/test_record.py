@@ -115,5 +115,5 @@ def test_without_opengl_what_was_there_stays(demos, error, monkeypatch):
     shutil.copytree("demos", "x")
     before = files(Path())
     assert main(["data", "render", "demos", "x", "--workers=1", "--overwrite=true", "--quiet"]) == 1
-    assert "no off-screen OpenGL (ImportError: cannot load libEGL.so.1); on Debian: apt" in error()
+    assert "no off-screen OpenGL (ImportError: cannot load libEGL.so.1); " in error()
     assert files(Path()) == before

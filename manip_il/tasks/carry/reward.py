@@ -21,7 +21,6 @@ FEATURES = (
     "near_edge",  # 1 at the edge of the table or beyond it, 0.6 at 5 cm
 )
 MOST = 1e6  # largest weight
-_LARGEST = 1 << 20  # largest file [bytes]
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Reward:
         try:
             if text.endswith(".json"):
                 wanted = "names, and a number for each in weights"
-                tree = checks.read_json(Path(text), "a reward: names and weights", _LARGEST)
+                tree = checks.read_json(Path(text), "a reward: names and weights")
                 pairs = list(zip(tree["names"], tree["weights"], strict=True))
             else:
                 pairs = [word.split("=") for word in text.split(",")]
