@@ -80,7 +80,7 @@ class ArmIK:
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
         self._data = data = self._program.data  # views that follow the posture
         self._ee, self._ee_flat = data.site_xpos[self._site], data.site_xmat[self._site]
-        self._qpos = data.qpos
+        self._ee_rotation, self._qpos = self._ee_flat.reshape(3, 3), data.qpos
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._jacobian = np.zeros((6, model.nv))
         self._robot, self._shoulder = robot, joints[0].id
@@ -104,7 +104,7 @@ class ArmIK:
         """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
         self._qpos[self._address] = q
         self._program.update()
-        return self._ee.copy(), self._ee_flat.reshape(3, 3).copy()
+        return self._ee.copy(), self._ee_rotation.copy()
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
         """Return only the displacement of `step`, (arm,) [rad]; weight: of the rotation, by default as upright."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Concatenate, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import mujoco
 
@@ -100,14 +100,14 @@ def is_cube(world: World, name: str) -> bool:
     return world.kind(name) == _BOX and len(set(world.extents(name))) == 1
 
 
-def once_per_state[T, **P](compute: Callable[Concatenate[World, P], T]) -> Callable[Concatenate[World, P], T]:
+def once_per_state[F: Callable[..., Any]](compute: F) -> F:
     """Return a function of a world, and of names in it, whose result is kept until the world changes."""
 
     @wraps(compute)
-    def read(world: World, *args: P.args, **kwargs: P.kwargs) -> T:
-        return world.remember((compute, *args, *kwargs.values()), lambda: compute(world, *args, **kwargs))
+    def read(world: World, *names: str) -> Any:
+        return world.remember((compute, names), lambda: compute(world, *names))
 
-    return read
+    return cast(F, read)
 
 
 @once_per_state
