@@ -50,9 +50,8 @@ def serve(
         stack.callback(weigh_session, weigh_session() or "0")
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
-        shown = None
-        if cameras is not None:
-            shown = Cameras(station, cameras, config.camera_port)
+        shown = Cameras(station, cameras, config.camera_port) if cameras is not None else None
+        if shown is not None:
             stack.callback(shown.close)
             if shown.rate < RATE:
                 warn(f"pictures are drawn {shown.rate:.0f} times a second here; {RATE} need smaller or fewer ones")
@@ -68,14 +67,7 @@ def serve(
         if command:
             operator = Operator(command, station, episodes, config.intervene)
             stack.callback(operator.kill)
-            try:
-                station.run(operator.each_step)
-            except KeyboardInterrupt:
-                operator.press(INTERRUPT)
-                station.run(operator.each_step)
-            say(f"{command[0]} ended; episodes solved {operator.solved}, not solved {operator.failed}")
-            if operator.status:
-                raise ManipError(f"{command[0]} failed with exit code {operator.status}")
+            _operate(operator, station, command[0], say)
         else:
             _stand(station, episodes, config.reset == "solved", say)
 
@@ -97,6 +89,18 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
         f"--teleop.id=leader --teleop.calibration_dir={root} --dataset.repo_id=local/so101 "
         f'--dataset.single_task="{station.env.task_description}" --dataset.push_to_hub=false',
     ]
+
+
+def _operate(operator: Operator, station: Station, program: str, say: Say) -> None:
+    """Run a program to its end; on Ctrl-C it may save what is complete."""
+    try:
+        station.run(operator.each_step)
+    except KeyboardInterrupt:
+        operator.press(INTERRUPT)
+        station.run(operator.each_step)
+    say(f"{program} ended; episodes solved {operator.solved}, not solved {operator.failed}")
+    if operator.status:
+        raise ManipError(f"{program} failed with exit code {operator.status}")
 
 
 def _stand(station: Station, episodes: ServedEpisodes, renews: bool, say: Say) -> None:
