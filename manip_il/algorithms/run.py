@@ -8,6 +8,7 @@ by running its loop again.
     dataset/             imitation: all rounds' labels, once the run has ended
     checkpoints/last/    reinforcement learning: the last finished iteration, see `agent`
     validation/          reinforcement learning: every validated policy and its eval.json, by iteration
+    metrics.jsonl        a line per round or iteration
     best/                the policy with the highest validation success; among equals the latest
 """
 
@@ -50,7 +51,9 @@ from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
+from manip_il.data.json_lines import append_line, read_lines
 from manip_il.evaluation.results import FILE_NAME, EvalResult
+from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.learn.training_state import PRETRAINED_MODEL, last_checkpoint
 from manip_il.seeding import stream_seeds
@@ -87,8 +90,11 @@ class Run:
 
         Rounds that were already finished are yielded again. At the end, `dataset` holds the labels of all rounds.
         """
-        rounds: list[Result] = []
+        rounds, path = list[Result](), self.folder / METRICS_FILE
+        written = {record.get("round", record.get("iteration")) for record in read_lines(path)}
         for result in results:
+            if result.number not in written:  # else written before an interruption, with its measured seconds
+                append_line(path, result.to_json())
             yield result
             if result.unit == "round":
                 rounds.append(result)

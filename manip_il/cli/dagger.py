@@ -11,7 +11,7 @@ from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trus
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
-from manip_il.data.json_lines import append_line, read_lines
+from manip_il.data.json_lines import read_lines
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.sim.config import CameraConfig
@@ -130,19 +130,15 @@ class DaggerOptions(Varied, Trusting):
 
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Result]:
-    """Run all rounds in `folder`, with progress, and a printed line and a line of `metrics.jsonl` per round."""
+    """Run all rounds in `folder`, with progress and a printed line per round."""
     from manip_il.algorithms.run import Run
     from manip_il.collect.environments import env_fingerprint
     from manip_il.evaluation.results import write_json
-    from manip_il.evaluation.rounds import METRICS_FILE
 
     write_json(folder / "fingerprint.json", env_fingerprint(config.env, config.cameras))
     results: list[Result] = []
-    there = {record["round"] for record in read_lines(folder / METRICS_FILE)}
     for result in Run(config, folder, engine, stages.watch()).results():
         stages.close()
-        if result.number not in there:  # else written before an interruption, with its measured seconds
-            append_line(folder / METRICS_FILE, result.to_json())
         results.append(result)
         success, took = f"validation success {result.validation.success}", f"{sum(result.seconds.values()):.0f} s"
         say(f"round {result.number}: {result.labels:,} labels, {success}, {took}")

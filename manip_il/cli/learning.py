@@ -11,7 +11,7 @@ from manip_il.cli.common_options import DatasetRoots, EngineOptions
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, warn
-from manip_il.data.json_lines import append_line, read_lines
+from manip_il.data.json_lines import read_lines
 from manip_il.errors import UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
@@ -66,15 +66,10 @@ class Learning:
     def _learn(self, config: LearningConfig, folder: Path, engine: Engine, stages: Stages) -> None:
         from manip_il.algorithms.results import Watch
         from manip_il.algorithms.run import Run
-        from manip_il.evaluation.rounds import METRICS_FILE
 
-        watch, metrics = Watch(on_episode=lambda _: stages.check(), on_step=stages.check), folder / METRICS_FILE
-        results = Run(config, folder, engine, watch).results()
+        watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
         stages.start(f"{self.method.upper()}, steps", config.steps)
-        written = {record["iteration"] for record in read_lines(metrics)}
-        for result in results:
-            if result.number not in written:
-                append_line(metrics, result.to_json())
+        for result in Run(config, folder, engine, watch).results():
             stages.log({"step": result.steps} | result.metrics)
             if result.validated is not None:
                 say(f"{result.steps:,} steps: validation success {result.validated.success}")

@@ -16,6 +16,7 @@ from manip_il.algorithms.rounds import round_folder
 from manip_il.algorithms.run import Run
 from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
@@ -141,6 +142,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
         list(Run(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)).results())
     again = list(Run(CONFIG, tmp_path, Engine()).results())
     assert [result.validation for result in again] == [result.validation for result in results]
+    assert [line["round"] for line in read_lines(tmp_path / "metrics.jsonl")] == [one.number for one in results]
     check_same_data(tmp_path, whole)
 
 
