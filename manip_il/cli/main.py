@@ -95,12 +95,13 @@ _GLOBAL_HELP = """\
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0 (done), 1 (the work failed), 2 (invalid command line) or 130 (interrupted)."""
     given = list(sys.argv[1:] if argv is None else argv)
-    words = [word for word in given if word not in ("--debug", "--quiet")]
-    progress.set_quiet("--quiet" in given)
+    own = _own(given)
+    words = [word for word in own if word not in ("--debug", "--quiet")] + given[len(own) :]
+    progress.set_quiet("--quiet" in own)
     try:
         _dispatch(words)
     except (Exception, KeyboardInterrupt) as error:
-        if "--debug" in given:
+        if "--debug" in own:
             print(_clean(traceback.format_exc(), words), file=sys.stderr, end="")
         return _report(error, words)
     return 0
@@ -128,13 +129,18 @@ def _dispatch(words: list[str]) -> None:
         print(_group_help(words[0]))
     else:
         name, words = _split(words)
-        if {*HELP} & {*words}:
+        if {*HELP} & {*_own(words)}:
             print(_command_help(name, load(name), words))
         else:
             options = parse(load(name), words, command=name)
             check_paths(options)
             silence_ffmpeg_warning()
             options.run()
+
+
+def _own(words: list[str]) -> list[str]:
+    """Return the words before `--`; those after it are another program's."""
+    return words[: words.index("--")] if "--" in words else words
 
 
 def _split(words: list[str]) -> tuple[str, list[str]]:

@@ -70,6 +70,11 @@ def test_help_holds_options_defaults_and_an_example(words, capsys):
     assert "example: manip-il fake --act=say" in out
 
 
+def test_words_behind_two_dashes_are_another_programs(capsys):
+    assert main(["serve", "--speed=0", "--", "lerobot-record", "--help", "--debug"]) == 2
+    assert capsys.readouterr().err == "manip-il: error: --speed is 0.0; expected 0.1 to 10\n"
+
+
 @pytest.mark.parametrize("words", [["--debug", "fake", "--act=bug"], ["fake", "--act=bug", "--debug"]])
 def test_debug_shows_the_traceback(words, capsys):
     assert main(words) == 1
