@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.names import MLP
 from manip_il.option import Seeded, check_bounds, option
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, make_config
@@ -172,7 +173,7 @@ class RunConfig(Seeded):
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
     """Return how many actions a policy plans at once, and how many final frames of an episode it does not learn."""
-    if fit.is_mlp:  # avoids importing LeRobot, which takes seconds
+    if fit.kind == MLP:  # avoids importing LeRobot, which takes seconds
         return 1, 0
     from manip_il.learn.lerobot_config import policy_config
 

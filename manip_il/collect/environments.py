@@ -62,6 +62,7 @@ def make_expert(config: EnvConfig) -> Labeller:
 def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
     """Return the names, sizes and rate that a dataset or policy for this environment must share."""
     check_cameras(config.robot, cameras)
+    pictures: dict[str, Any] = {"cameras": cameras.names, "image_size": cameras.size} if cameras else {}
     if config.robot in STOCK:
         stock, robot = get_stock(config.task, config.robot), STOCK[config.robot]
         return RobotTaskSpec(
@@ -74,8 +75,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
             instruction=stock.instruction,
             action_meaning=robot.action_meaning,
             phases=stock.phases,
-            cameras=cameras.names if cameras else (),
-            image_size=cameras.size if cameras else (0, 0),
+            **pictures,
         )
     scene, task = config_scene(config), get_task(config.task, config.object)
     servos = scene.robot.lerobot
@@ -91,9 +91,8 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
         object=stored(config.object),
         action_meaning=SERVOS if servos else OPENINGS,
         robot_type=servos.robot_type if servos else "",
-        cameras=cameras.names if cameras else (),
-        image_size=(cameras.height, cameras.width) if cameras else (0, 0),
         keypoints=point_names(scene) if cameras else (),
+        **pictures,
     )
 
 

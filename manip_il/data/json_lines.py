@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from manip_il import checks
 from manip_il.data.atomic import writing
@@ -22,13 +23,15 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     """
     lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
     whole = [line for line in lines if line.endswith(b"\n")]
-    return [_record(f"{path}, line {number}", line) for number, line in enumerate(whole, start=1)]
+    names = (f"{path}, line {number}" for number in itertools.count(1))
+    return [checks.mapping(name, checks.parse_json(name, line)) for name, line in zip(names, whole, strict=False)]
 
 
 def append_line(path: Path, record: Record) -> None:
     """Append a record, replacing a truncated last line; non-finite numbers become null."""
     line = json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n"
-    with writing(path), _open(path) as file:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path), open(path, "ab+", opener=checks.without_link) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 1, 0))
         if file.read(1) not in (b"", b"\n"):
@@ -37,15 +40,6 @@ def append_line(path: Path, record: Record) -> None:
         file.seek(0, os.SEEK_END)
         file.write(line)
         file.flush()  # inside `writing`, which names a full disk
-
-
-def _open(path: Path) -> BinaryIO:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return open(path, "ab+", opener=checks.without_link)
-
-
-def _record(what: str, line: bytes) -> dict[str, Any]:
-    return checks.mapping(what, checks.parse_json(what, line))
 
 
 def _finite(record: Record) -> dict[str, Any]:

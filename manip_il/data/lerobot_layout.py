@@ -40,11 +40,6 @@ PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's con
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
-def all_features(own: Features) -> Features:
-    """Return a dataset's own features and LeRobot's five, in column order."""
-    return {**own, **{key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in INDEX_DTYPES.items()}}
-
-
 def data_schema(features: Features) -> pa.Schema:
     """Return the Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
 

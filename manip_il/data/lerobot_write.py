@@ -86,7 +86,10 @@ class TableWriter:
         robot_type: str | None,
         video: VideoConfig | None = None,
     ):
-        self.features, self.folder = layout.all_features(features), folder
+        index: layout.Features = {
+            key: {"dtype": kind, "shape": (1,), "names": None} for key, kind in layout.INDEX_DTYPES.items()
+        }
+        self.features, self.folder = {**features, **index}, folder
         self._fps, self._robot_type = fps, robot_type
         self._schema = layout.data_schema(self.features)
         self._data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)

@@ -111,11 +111,12 @@ def robot_of(robot_type: str) -> dict[str, str]:
 
 def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
-    joints = list(spec.joint_names)
+    joints, pictured = list(spec.joint_names), "video" if spec.video else "image"
+    pictures = {"dtype": pictured, "shape": (*spec.image_size, 3), "names": ["height", "width", "channels"]}
     return {
         STATE: _feature("float32", joints),
         ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
-        **{key: _image_feature(spec.image_size, "video" if spec.video else "image") for key in spec.image_keys},
+        **{key: dict(pictures) for key in spec.image_keys},
         **{key: _feature("float32", keypoint_numbers(spec)) for key in spec.keypoint_keys},
         ACTION: _feature("float32", joints),
         EXECUTED_ACTION: _feature("float32", joints),
@@ -136,10 +137,6 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
 def keypoint_numbers(spec: RobotTaskSpec) -> list[str]:
     """Return the names of the numbers (3 K,) of a camera's keypoints."""
     return [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
-
-
-def _image_feature(size: tuple[int, int], dtype: str) -> dict[str, Any]:
-    return {"dtype": dtype, "shape": (*size, 3), "names": ["height", "width", "channels"]}
 
 
 def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:

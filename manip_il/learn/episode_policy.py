@@ -47,7 +47,7 @@ class EpisodePolicy:
         policy.reset()
         self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
-        self._shared = _shared(policy)
+        self._shared = {id(part): part for part in (policy.config, *policy.parameters(), *policy.buffers())}
         self._instructions: dict[int, str] = {}
         self._steps = Counter[int]()  # steps taken in every episode
         self._memories: dict[int, Any] = {}  # a copy of the policy; for diffusion only its queues
@@ -125,20 +125,13 @@ class EpisodePolicy:
                     batch.setdefault(key, asked.new_zeros((ROWS, *asked.shape[1:])))[row] = asked[0]
         shape = (config.horizon, *config.action_feature.shape)
         noise = [torch.randn(shape, generator=one, device=weight.device, dtype=weight.dtype) for one in generators]
-        with _drawing_from(model.noise_scheduler, generators):
-            plans = model.generate_actions(batch, noise=torch.stack(noise))
+        seen = model._prepare_global_conditioning(batch)
+        # each row's own generator also draws the noise of the steps, which LeRobot's `generate_actions` does not let it
+        plans = model.conditional_sample(ROWS, seen, generators, torch.stack(noise))
+        start = config.n_obs_steps - 1
+        plans = plans[:, start : start + config.n_action_steps]
         for row, (episode, _) in block.items():
             self._memories[episode][ACTION].extend(plans[row : row + 1].transpose(0, 1))
-
-
-def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
-    """Return the parts that copies share, as a memo for `deepcopy`: weights, buffers, torch's layers, configuration."""
-    layers = (
-        module
-        for module in policy.modules()
-        if all(type(part).__module__.startswith(("torch.", "torchvision.")) for part in module.modules())
-    )
-    return {id(part): part for part in (policy.config, *policy.parameters(), *policy.buffers(), *layers)}
 
 
 @contextlib.contextmanager
@@ -152,18 +145,3 @@ def _drawing(seed: int, device: torch.device) -> Iterator[None]:
             with torch.cuda.device(device):
                 torch.cuda.manual_seed(seed)
         yield
-
-
-@contextlib.contextmanager
-def _drawing_from(scheduler: Any, generators: Sequence[torch.Generator]) -> Iterator[None]:
-    """Let a noise scheduler draw the noise of each row from its own generator."""
-    own = scheduler.step
-
-    def step(*args: Any, generator: None = None, **kwargs: Any) -> Any:
-        return own(*args, generator=generators, **kwargs)
-
-    scheduler.step = step
-    try:
-        yield
-    finally:
-        del scheduler.step

@@ -92,7 +92,7 @@ class FitConfig:
                 "--policy.path and --policy.type exclude each other: a checkpoint has its own type; give one of them"
             )
         check_convertible(self.kind, self.action_space or JOINT_TARGET)
-        if self.is_mlp and self.takes_images:
+        if self.kind == MLP and self.takes_images:
             raise UsageError(
                 f"--observation={self.observes} needs a policy that takes images, unlike mlp; use --policy.type=cnn"
             )
@@ -110,11 +110,6 @@ class FitConfig:
     def kind(self) -> str:
         """The type of the policy."""
         return self.start.kind if self.start else str(self.policy.get("type", MLP))
-
-    @property
-    def is_mlp(self) -> bool:
-        """Whether the policy is an mlp."""
-        return self.kind == MLP
 
     @property
     def observes(self) -> str:

@@ -106,13 +106,9 @@ def option_lines(kind: str) -> list[tuple[str, str]]:
             continue
         missing = field.default is dataclasses.MISSING
         default = field.default_factory() if missing and callable(field.default_factory) else field.default
-        rows.append((f"--policy.{field.name}", _printed(default)))
+        typed = json.dumps(draccus.encode(default)).replace('"', "")  # as a user would type it
+        rows.append((f"--policy.{field.name}", typed))
     return rows
-
-
-def _printed(value: Any) -> str:
-    """Return the default as a user would type it."""
-    return json.dumps(draccus.encode(value)).replace('"', "")
 
 
 def policy_features(

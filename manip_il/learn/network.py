@@ -185,12 +185,9 @@ class MLPNetwork(nn.Module):
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so the learner's must not either.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
-        return self._absolute(inputs, target)
-
-    def _absolute(self, inputs: Tensor, targets: Tensor) -> Tensor:
         if not self.adds_joints:
-            return targets
-        return torch.cat([inputs[:, : self.n - 1] + targets[:, ARM], targets[:, GRIPPER:]], dim=1)
+            return target
+        return torch.cat([inputs[:, : self.n - 1] + target[:, ARM], target[:, GRIPPER:]], dim=1)
 
 
 @contextmanager

@@ -144,13 +144,11 @@ class _Perceptron:
 
         The mlp's processors are the identity (see MLPConfig), except for the conversion of an action space.
         """
-        targets = self.module.act(self._inputs(batch))
+        inputs = torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
+        targets = self.module.act(inputs)
         if self._conversion.space == JOINT_TARGET:
             return targets
         return torch.from_numpy(self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy()))
 
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Do nothing: the mlp has no memory, and does not read language."""
-
-    def _inputs(self, batch: Batch) -> torch.Tensor:
-        return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)

@@ -61,10 +61,9 @@ def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
     if STATE not in info.features:
         raise ManipError(f"{about} {STATE}: every policy needs the measured joints")
     if observes != "images" and ENVIRONMENT_STATE not in info.features:
-        other = f"--policy.type={CNN} or act with --observation=images" if config.is_mlp else "--observation=images"
-        hint = f"choose {other}, or" if cameras else "record pictures, or"
+        hint = f"choose --policy.type={CNN} or act with --observation=images, or " if cameras else ""
         raise ManipError(
-            f"{about} {ENVIRONMENT_STATE}, which --observation={observes} needs; {hint} record with manip-il record"
+            f"{about} {ENVIRONMENT_STATE}, which --observation={observes} needs; {hint}record with manip-il record"
         )
     if config.takes_images and not cameras:
         raise ManipError(
