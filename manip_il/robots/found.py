@@ -16,7 +16,7 @@ from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import Body, at_tip, nearest, outline
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.robot import EndEffector, Robot
+from manip_il.robots.robot import EndEffector, Robot, costs_of, yaw_of
 from manip_il.robots.rotations import hand_down, rotation_vector
 from manip_il.robots.spec import arm_spec, bare_spec, require
 
@@ -46,6 +46,8 @@ def complete(said: Mapping[str, Any]) -> dict[str, Any]:
     spec = bare_spec(said["name"], said["files"], said["hand"], said["gripper"])
     joints = said.setdefault("joints", arm_joints(said["name"], spec, said["hand"], said["gripper"].joints))
     require(said["name"], "joint", joints, spec.joints)
+    said.setdefault("costs", costs_of(len(joints)))
+    said.setdefault("yaw", yaw_of(len(joints)))
     forces, armature = motor_limits(said["name"], said["files"], spec, joints)
     said.setdefault("forces", forces)
     said.setdefault("armature", armature)

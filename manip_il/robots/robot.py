@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from manip_il import checks
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UnknownName
 from manip_il.mdp import F64
 from manip_il.robots.files import ModelFiles, require_lengths
 
@@ -20,6 +20,7 @@ GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
 FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # found on the model if the YAML does not give them
 UPRIGHT_JOINTS = 6  # with fewer, a hand cannot point down everywhere
+YAWS = ("world", "shoulder")
 WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, in the frame `ee` [m]
 
 
@@ -159,6 +160,7 @@ class Robot:
     the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest torque [N m] and added inertia
     [kg m^2]. base: position of the root body [m]. fixed: positions of the joints that are neither the arm's nor the
     gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
+    costs: of inverse kinematics. yaw: where it is zero, along the world's x or straight ahead of the shoulder.
     wrist_camera: name of the model's own, on its hand, or position of an added one in the frame `ee` [m]. cameras: of
     the scene, if not in the default places: front, side. table: the scene's.
     colours: red, green and blue of meshes without contacts, by patterns of names, of which later ones win. lerobot:
@@ -176,6 +178,8 @@ class Robot:
     ee: EndEffector
     gripper: GripperConfig
     workspace: Workspace
+    costs: Costs = UPRIGHT
+    yaw: str = "world"
     wrist_camera: tuple[float, float, float] | str = WRIST_CAMERA
     cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
     table: TableTop = TableTop()
@@ -192,6 +196,8 @@ class Robot:
             raise ManipError(f"joints and gripper.joints both name {min(both)!r}; expected each in only one")
         if (named := len(self.joint_names)) != count + 1:
             raise ManipError(f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the gripper's")
+        if self.yaw not in YAWS:
+            raise UnknownName("yaw", self.yaw, YAWS)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -204,14 +210,21 @@ class Robot:
         return self.lerobot.fps if self.lerobot is not None else RATE
 
     @property
-    def leans(self) -> bool:
-        """Whether the arm has too few joints to hold its hand upright everywhere.
-
-        The hand then leans, and its yaw counts from straight ahead of the shoulder, not from the world's x.
-        """
-        return len(self.joints) < UPRIGHT_JOINTS
+    def faces_ahead(self) -> bool:
+        """Whether the hand's yaw counts from straight ahead of the shoulder, not from the world's x."""
+        return self.yaw != "world"
 
     @property
-    def costs(self) -> Costs:
-        """Costs of inverse kinematics."""
-        return SOFT if self.leans else UPRIGHT
+    def leans(self) -> bool:
+        """Whether the hand leans everywhere, as the arm has too few joints to hold it upright."""
+        return self.costs.orientation == self.costs.leaning
+
+
+def costs_of(joints: int) -> Costs:
+    """Return the costs that suit an arm with that many joints."""
+    return UPRIGHT if joints >= UPRIGHT_JOINTS else SOFT
+
+
+def yaw_of(joints: int) -> str:
+    """Return the direction of zero yaw for an arm with that many joints."""
+    return YAWS[int(joints < UPRIGHT_JOINTS)]

@@ -35,7 +35,7 @@ def hand_down(yaw: float) -> F64:
 
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
     """Return the yaw that counts as zero for a robot's hand at a position (3,), its shoulder at (3,) [m]; [rad]."""
-    return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.leans else 0.0
+    return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.faces_ahead else 0.0
 
 
 def angle_ahead(rotation: F64) -> float:

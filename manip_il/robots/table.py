@@ -15,7 +15,7 @@ from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles, read
-from manip_il.robots.robot import FOUND, GRIPPER, CameraPose, GripperConfig, Robot
+from manip_il.robots.robot import FOUND, GRIPPER, UPRIGHT, CameraPose, Costs, GripperConfig, Robot, costs_of, yaw_of
 
 SUFFIXES = (".yaml", ".yml")
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
@@ -78,11 +78,16 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         "files": ModelFiles.read("", tree, path.parent),
         "gripper": _gripper(checks.mapping("gripper", tree["gripper"]), path.parent),
     }
-    cameras = checks.mapping("cameras", tree.pop("cameras", {}))
+    costs, cameras = tree.pop("costs", {}), checks.mapping("cameras", tree.pop("cameras", {}))
     if unknown := [name for name in cameras if name not in SCENE_CAMERAS]:
         raise UnknownName("camera in a robot's YAML:", unknown[0], SCENE_CAMERAS)
     said["cameras"] = {name: read(f"cameras.{name}", CameraPose, one) for name, one in cameras.items()}
     said |= {key: read(key, kinds[key], value) for key, value in tree.items() if key not in (*KEYS, "gripper")}
+    if "joints" in said:
+        said.setdefault("yaw", yaw_of(len(said["joints"])))
+    if "joints" in said or costs:
+        found = costs_of(len(said["joints"])) if "joints" in said else UPRIGHT
+        said["costs"] = read("costs", Costs, vars(found) | checks.mapping("costs", costs))
     return said
 
 

@@ -117,7 +117,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
 
 def _yaws(robot: Robot, model: mujoco.MjModel, roll: Any) -> tuple[float, float]:
     """Least and greatest yaw to which its last joint turns the hand, from the one that counts as zero [rad]."""
-    if not robot.leans or not roll.limited[0]:
+    if not robot.faces_ahead or not roll.limited[0]:
         return -np.inf, np.inf
     data, yaws = mujoco.MjData(model), []
     for turn in (0.0, _TURN):

@@ -184,7 +184,7 @@ def _nearest(
     go around [m]. neighbours: offsets of what stands around the object; grasps that they obstruct come last.
     """
     grasps, at, ahead = lie.grasps[lie.level], world.hand_yaw, world.ahead(position)
-    if world.robot.leans:
+    if world.robot.faces_ahead:
         at = world.turned(position)
         grasps = [
             (way, width, length, centre)
