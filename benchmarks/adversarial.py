@@ -275,7 +275,7 @@ def demonstrations(name: str, settings: Settings, seed: int) -> Demonstrations:
     """Return episodes of the expert."""
     seeds = stream_seeds("demonstrations", settings.demonstrations, seed)
     inputs, targets, _ = play(name, ENVIRONMENTS[name].expert, seeds, settings.episode_steps)
-    return Demonstrations(tuple(inputs.swapaxes(0, 1)), tuple(targets.swapaxes(0, 1)), 0)
+    return Demonstrations(tuple(inputs.swapaxes(0, 1)), tuple(targets.swapaxes(0, 1)), None)
 
 
 def play(name: str, acting: Acting, seeds: Sequence[int], steps: int) -> tuple[F32, F32, F64]:

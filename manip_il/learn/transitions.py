@@ -58,12 +58,12 @@ class Transitions:
 class Demonstrations:
     """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, in a policy's action space.
 
-    hold: steps from success to the end.
+    hold: steps from success to the end; None for episodes that do not end, as in a benchmark's environments.
     """
 
     inputs: tuple[F32, ...]
     targets: tuple[F32, ...]
-    hold: int
+    hold: int | None
 
     @property
     def longest(self) -> int:
@@ -78,14 +78,14 @@ class Demonstrations:
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
         """Return all episodes as `steps` transitions each. encode: normalises raw targets (T, n).
 
-        Raises `UsageError` if one is longer.
+        Without a `hold` nothing is padded. Raises `UsageError` if one is longer.
         """
         if self.longest > steps:
             raise UsageError(
                 f"episode_steps is {steps}; expected at least {self.longest}, the steps of the longest demonstration"
             )
         made = [
-            padded_episode(inputs, encode(targets), steps)
+            padded_episode(inputs, encode(targets), 0 if self.hold is None else steps)
             for inputs, targets in zip(self.inputs, self.targets, strict=True)
         ]
         return Transitions(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
@@ -94,9 +94,11 @@ class Demonstrations:
 def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32]:
     """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode with T steps that ended.
 
-    N is the larger of T and `steps`: the rest is absorbing.
+    N is the larger of T and `steps`: the rest is absorbing. With `steps` 0 the episode did not end and N is T - 1.
     """
     states = np.pad(inputs, ((0, 0), (0, 1)))
+    if not steps:
+        return states[:-1], actions[:-1], states[1:]
     rest = np.zeros((max(1, steps - len(states) + 1), states.shape[1]), np.float32)
     rest[:, -1] = 1.0
     states = np.concatenate([states, rest])
