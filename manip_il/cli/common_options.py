@@ -41,6 +41,15 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
     return make_config(**values)
 
 
+def own_files(env: EnvConfig) -> str:
+    """Return the options that name a user's own robot and task; no dataset or policy holds their paths."""
+    from manip_il.robots.table import SUFFIXES
+    from manip_il.tasks.table import SUFFIX
+
+    named = {"robot": env.robot, "task": env.task}
+    return "".join(f" --{what}.type={name}" for what, name in named.items() if name.endswith((SUFFIX, *SUFFIXES)))
+
+
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:
     """Return the cameras used if none are named: all, or the first one of a stock robot."""
     return (stock.ROBOTS[env.robot].cameras[:1] if env.robot in stock.ROBOTS else ()) or CAMERAS

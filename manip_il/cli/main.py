@@ -170,7 +170,9 @@ def _report(error: BaseException, words: list[str]) -> int:
     elif isinstance(error, OSError) and error.strerror and error.filename:
         text = f"error: {error.strerror}: {error.filename}"
     else:
-        text = f"error: {type(error).__name__}: {error}; run again with --debug for the traceback"
+        from manip_il.tasks.table import told
+
+        text = f"error: {told(error)}; run again with --debug for the traceback"
     print(f"{PROGRAM}: {' '.join(_clean(text, words).split())}", file=sys.stderr, flush=True)
     return code
 

@@ -68,7 +68,10 @@ def collect_successes(
     while good < count:
         more = seeds[tried : tried + count - good]
         if tried + count - good > min(len(seeds), MAX_TRIES * count):
-            raise ManipError(f"only {good} of {tried} demonstrations succeeded; {count} are needed")
+            raise ManipError(
+                f"only {good} of {tried} demonstrations succeeded; {count} are needed; "
+                "measure the expert first: manip-il eval --policy.type=expert"
+            )
         tried += len(more)
         for journal, episode in collect(engine, job, more, journals, on_episode):
             good += episode.success

@@ -24,6 +24,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
+from manip_il.tasks.table import told
 
 if TYPE_CHECKING:
     from manip_il.collect.ray_pool import RayPool
@@ -227,7 +228,7 @@ def run_task(job: RolloutJob, seeds: Seeds, journal: Journal | None) -> list[Epi
     except ManipError:
         raise
     except Exception as error:  # may not be picklable
-        raise ManipError(f"{type(error).__name__}: {error}") from None
+        raise ManipError(told(error)) from None
 
 
 def split(job: RolloutJob, seeds: Sequence[int], workers: int) -> deque[Seeds]:

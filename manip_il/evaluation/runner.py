@@ -209,6 +209,9 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
         return {}
     for key, now in common.items():
         if (before := records[0].get(key)) != now:
+            if isinstance(before, dict) and isinstance(now, dict):  # name only what differs
+                differ = [name for name in before | now if before.get(name) != now.get(name)]
+                before, now = ({name: one.get(name) for name in differ} for one in (before, now))
             what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
             raise MismatchError(what, "then", before, "now", now)
     return {result.seed: result for result in results}

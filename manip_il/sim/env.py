@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import Observation, State
 from manip_il.robots.robot import Robot
 from manip_il.seeding import rng_for
@@ -291,5 +291,8 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
     world, names = World(scene), list[str]()
     world.update()
     for name, value in scene.task.observe(world).items():
+        if np.ndim(value) and np.shape(value) != (3,):
+            shape = np.shape(value)
+            raise UsageError(f"observe of task {scene.task.name}: {name} has shape {shape}; expected a number or (3,)")
         names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
     return tuple(names)

@@ -9,6 +9,7 @@ import hashlib
 import importlib.util
 import inspect
 import sys
+import traceback
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -31,6 +32,7 @@ from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
 
 SUFFIX = ".py"
+OWN = "manip_il_own_"  # prefix of the modules of users' files
 GROUP = "manip_il.tasks"  # entry points: a name, and a class that is a task
 _MEMBERS = (
     *("name", "instruction", "limits", "objects", "grasped", "sizes", "rungs"),
@@ -124,7 +126,7 @@ def _of_file(path: Path) -> Task:
 
 
 def _run(path: Path) -> ModuleType:
-    name = f"manip_il_own_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise UsageError(f"{path} cannot be read as Python")
@@ -146,9 +148,22 @@ def _made(what: str, cls: Any) -> Task:
     try:
         task: Any = cls() if inspect.isclass(cls) else cls
         checks.name(f"{what}: its name", task.name)
+        for name in ("objects", "grasped"):
+            if isinstance(getattr(task, name), str):
+                raise UsageError(f"{what}: {name} is {getattr(task, name)!r}; expected a tuple of names")
     except (ManipError, TypeError) as error:
         raise UsageError(str(error) if what in str(error) else f"{what}: {checks.one_line(error)}") from error
     return task
+
+
+def told(error: BaseException) -> str:
+    """Return an unexpected error as text, with file, line and function if a user's own file raised it."""
+    frames = [one for one in traceback.walk_tb(error.__traceback__) if one[0].f_globals["__name__"].startswith(OWN)]
+    text = f"{type(error).__name__}: {error}"
+    if not frames:
+        return text
+    frame, line = frames[-1]
+    return f"{frame.f_code.co_filename}, line {line} ({frame.f_code.co_name}): {text}"
 
 
 def _who(protocol: type) -> str:

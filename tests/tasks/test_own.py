@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 
 import gymnasium
@@ -109,6 +110,11 @@ def test_a_node_gets_the_file(touch):
 MISTAKES = {
     "is not Python": ("def (", "line 1 cannot be run: SyntaxError"),
     "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
+    "has one object": (TOUCH.replace('("cube",)', '("cube")'), "objects is 'cube'; expected a tuple of names"),
+    "observes two": (
+        TOUCH.replace('"cube": cube,', '"cube": cube[:2],'),
+        "cube has shape (2,); expected a number or (3,)",
+    ),
 }
 
 
@@ -120,6 +126,16 @@ def test_a_file_that_holds_no_task_is_one_line(case, tmp_path, capsys):
     assert main(["eval", "--policy.type=expert", f"--task.type={path}", f"--output_dir={tmp_path / 'e'}"]) == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_bug_in_a_task_names_its_file_line_and_function(workers, tmp_path, capsys):
+    path = tmp_path / "own.py"
+    path.write_text(TOUCH.replace("return math.dist(world.ee.position[:2]", "return math.dits(world.ee.position[:2]"))
+    words = ["--policy.type=expert", f"--task.type={path}", f"--output_dir={tmp_path / 'e'}", f"--workers={workers}"]
+    assert main(["eval", *words]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(r"own\.py, line \d+ \(beside\): AttributeError: module 'math' has no attribute 'dits'", error)
 
 
 def test_a_package_brings_names(touch, monkeypatch):
