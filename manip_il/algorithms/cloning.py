@@ -1,4 +1,4 @@
-"""Behaviour cloning: fit a policy to the expert's own demonstrations; every round adds some."""
+"""Behaviour cloning: fit a policy to the expert's own demonstrations; every round adds demonstrations."""
 
 import math
 import shutil

@@ -89,7 +89,7 @@ class RunConfig(Seeded):
     rounds: int = option(
         5, "DAgger rounds after round 0; a resumed run may have more", at_least=0, at_most=99, grows=True
     )
-    episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones", at_least=1)
+    episodes_per_round: int = option(50, "rollouts per round; demonstrations with --method=cloning", at_least=1)
     label_budget: int | None = option(None, "total number of expert labels at which the run ends", at_least=1)
     beta: BetaSchedule = option(
         lambda: _LEARNER_ALONE, "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B"
@@ -155,7 +155,7 @@ class RunConfig(Seeded):
 
     @property
     def steps_of_branch(self) -> int:
-        """Control steps of a branch; by default enough to learn one whole plan from."""
+        """Control steps of a branch; by default just enough to learn one whole plan."""
         return self.branch_steps or sum(plan_of(self.fit))
 
     @property

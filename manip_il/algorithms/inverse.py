@@ -131,7 +131,7 @@ class Inverse:
         return float(shown @ self.weights / (planned @ self.weights) - 1)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `reward.json`; a reward is read from `names` and `weights`."""
+        """Return the content of `reward.json`; only `names` and `weights` are needed to load it."""
         known = [k for k in range(len(FEATURES)) if k not in self.learnt.open]
         intervals = self.learnt.intervals
         return {

@@ -11,7 +11,7 @@ from manip_il.learn.transitions import F32
 
 
 def ppo(run: Run, c: LearningConfig, reward: Callable[..., F32] | None = None) -> Iterator[Result]:
-    """Yield each iteration: roll out the agent, improve it by the reward, by default the one in `c.reward`.
+    """Yield each iteration: roll out the agent and improve it by `reward`; the default is the one in `c.reward`.
 
     reward: maps joint states (N, n), environment states (N, k) and absolute actions (N, n) to rewards (N,).
     """

@@ -80,7 +80,7 @@ class Run:
         self._fitted: Fitted | None = None
 
     def results(self) -> Iterator[Result]:
-        """Run or resume the method's loop: the function with the method's name, in the module of that name."""
+        """Run or resume the method's loop; the function and its module are named after the method."""
         name = self.config.method
         loop = getattr(importlib.import_module(f"manip_il.algorithms.{name}"), name)
         return self.follow(loop(self, self.config))
@@ -93,7 +93,7 @@ class Run:
         rounds, path = list[Result](), self.folder / METRICS_FILE
         written = {record.get("round", record.get("iteration")) for record in read_lines(path)}
         for result in results:
-            if result.number not in written:  # else written before an interruption, with its measured seconds
+            if result.number not in written:  # else an interrupted run wrote it, with the seconds measured then
                 append_line(path, result.to_json())
             yield result
             if result.unit == "round":

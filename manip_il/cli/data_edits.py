@@ -68,7 +68,7 @@ class MergeOptions(Replacing):
 
 @dataclass(frozen=True)
 class Edit(Replacing):
-    """Options of an edit of a dataset's states."""
+    """Options for editing a dataset's states."""
 
     source: Path = option(MISSING, "a manip-il dataset; for redraw, also a run", positional=True, exists="datasets/")
     target: Path | None = option(

@@ -49,7 +49,7 @@ class EvalGroup:
     batch_size: int = option(
         25, "episodes that run in lockstep and share policy calls; does not change results", at_least=1, free=True
     )
-    stream: Literal["test", "validation"] = option("test", "which seeds; the test seeds never select a policy")
+    stream: Literal["test", "validation"] = option("test", "which seeds; no policy is selected on the test seeds")
     films: int = option(2, "failures to film, and as many successes", at_least=0, free=True)
 
 

@@ -28,7 +28,7 @@ _METAVARS = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: 
 
 
 def group(default: Any, prefix: str | None = None) -> Any:
-    """Return a field of nested options. prefix: of their names, by default the field's name and a dot."""
+    """Return a field of nested options. prefix: how their names begin, by default the field's name and a dot."""
     metadata = {} if prefix is None else {"prefix": prefix}
     return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
 
@@ -60,7 +60,7 @@ class Option:
 
     @property
     def positional(self) -> bool:
-        """Whether its value is given without a name."""
+        """Whether the value is given without the option's name."""
         return self.metadata.get("positional", False)
 
     @property
@@ -170,7 +170,7 @@ def from_word(option_type: Any, word: str) -> Any:
 
 
 def decode(option_type: Any, value: Any) -> Any:
-    """Return `value`, read by YAML or text, as the declared type; raises one of several errors if it is invalid.
+    """Convert `value`, from YAML or text, to the declared type; raises one of several errors if it is invalid.
 
     Unlike draccus, refuses a boolean as a number or text, NaN as a number, and "" as a path (the current folder).
     """

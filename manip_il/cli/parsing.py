@@ -194,7 +194,7 @@ def _decode_raw(option: Option, raw: _RawValue) -> Any:
         return raw.value
     try:
         value = decode(kind, raw.value)
-    except ManipError:  # of a class that parses itself
+    except ManipError:  # from a class with its own `parse`
         raise
     except Exception:  # draccus also raises plain Exception
         hint = nearest(raw.value, choices(kind)) if isinstance(raw.value, str) else ""

@@ -58,7 +58,7 @@ class RecordOptions(Varied, Seeded, Resumable):
         job = RolloutJob(env, hold=HOLD, cameras=cameras, conditions=varied(self.vary, env, sees=cameras is not None))
         if cameras:
             try_encoder(VideoConfig(**self.dataset.rgb_encoder), cameras.size, env.control_hz)
-        env_spec(env, cameras)  # raises, before anything is written, if no scene can be made
+        env_spec(env, cameras)  # raises if no scene can be made, before anything is written
         repo_id = checks.repo_id("repo_id", self.dataset.repo_id or f"local/{env.name}")
         root = self.dataset.root or Path("datasets") / repo_id.rpartition("/")[2]
         journals = root.with_name(f"{root.name}.journals")

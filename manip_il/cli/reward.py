@@ -146,8 +146,8 @@ class AnswerOptions(OfPairs, Seeded):
 class FitOptions(OfPairs, Seeded):
     """Fit a reward of state and action to answers about pairs (Bradley-Terry), as an ensemble of small networks.
 
-    Every pair is held out from one network; fit.json holds the agreement on these. ANSWERS are files of ask or answer,
-    by one person or several, about PAIRS or --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
+    Each pair is held out from one network; fit.json has the agreement on held-out pairs. ANSWERS are files from ask or
+    answer, by one person or several, about PAIRS or --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
     """
 
     example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"

@@ -32,7 +32,7 @@ class TheoryOptions:
     output: Output = group(Output(Path("runs/theory")), prefix="")
 
     def run(self) -> None:
-        """Compute, measure, write the report and the file, print the slopes."""
+        """Compute and measure; write the report and the JSON file; print the slopes."""
         from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
         from manip_il.theory.bounds import all_curves

@@ -68,7 +68,7 @@ class ViewOptions(Tested, Seeded, Trusting):
             raise UsageError("--policy.type=sliders needs a window: a DISPLAY, and no --output")
         env, driver, cameras = open_driver(self.policy.path, self.policy.type or "expert", self.env, trust=self.trust)
         in_window = in_window and env.robot not in STOCK
-        if cameras is None and not in_window:  # for people; shadows only in files, which need not be real time
+        if cameras is None and not in_window:  # for people to watch; shadows only in files, which may take longer
             cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if self.output else Look())
         if sliders and not self.env.get("horizon"):
             env = replace(env, horizon=LONGEST_EPISODE)  # people are slower than the expert

@@ -32,7 +32,7 @@ _AGAIN = "correct the recorder, and record again"
 
 
 def check_motions(dataset: Dataset) -> Iterator[Finding]:
-    """Check for idle time, lagging actions, changed joint zeros, unreached commands, and texts of two motions."""
+    """Check for idle time, lagging actions, changed joint zeros, unreached commands, and texts that fit two motions."""
     features = [dataset.features.get(key) for key in (s.STATE, s.ACTION)]
     if not all(one and one.dtype in NUMBERS and len(one.shape) == 1 and one.size for one in features):
         return
@@ -45,7 +45,7 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
         return  # reported by another check
     yield from _check_idle(dataset, rows, np.hstack([state, action]))
     yield from _check_texts(dataset, rows, state)
-    if action.shape == state.shape:  # of the same joints, as for LeRobot's robots
+    if action.shape == state.shape:  # both list the same joints, as for LeRobot's robots
         names = np.array(dataset.features[s.ACTION].labels)
         gripper = np.array([bool(_GRIPPER.search(name)) for name in names])
         arm = ~gripper if gripper.any() else np.arange(len(names)) < len(names) - 1

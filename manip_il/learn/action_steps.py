@@ -3,7 +3,7 @@
 `MeasuredJointsStep`, in the preprocessor, stores the measured joints of an observation; `JointTargetsStep`, at the end
 of the postprocessor, uses them to convert the policy's output to joint targets. A checkpoint with both works wherever
 LeRobot calls each once per step, as lerobot-eval does. LeRobot connects the two on loading, as it does its own steps
-of this kind, which are their base classes; those convert a whole plan relative to the joints at its start.
+of this kind. Ours derive from LeRobot's steps, which convert a whole plan relative to the joints at its start.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class MeasuredJointsStep(RelativeActionsProcessorStep):
         return transition
 
     def get_config(self) -> dict[str, Any]:
-        """Return an empty configuration: the postprocessor's step holds the robot."""
+        """Return an empty configuration: the robot is stored with the postprocessor's step."""
         return {}
 
 
@@ -83,7 +83,7 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
 
 
 def is_in_processors(kind: str, found: Conversion) -> bool:
-    """Return whether the processors of a policy type do a conversion, rather than its network or nothing."""
+    """Return whether a policy type's processors do a conversion; if not, its network does, or none is needed."""
     return found.space == EE_DELTA or (found.space == JOINT_DELTA and kind not in OWN_SPACE)
 
 

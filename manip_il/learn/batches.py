@@ -27,7 +27,7 @@ def generator_of(*key: int) -> torch.Generator:
 class Order:
     """Row numbers in batches: a new shuffle of all rows every epoch, or draws in proportion to weights.
 
-    weights: of the rows, (N,), for drawing with replacement; None for epochs. A batch depends only on the seed and the
+    weights: one per row, (N,), to draw with replacement; None for epochs. A batch depends only on the seed and the
     step, so there is no state to save.
     """
 

@@ -50,7 +50,7 @@ class Discriminator(nn.Module, ABC):
 
     @abstractmethod
     def build(self, e: int, n: int) -> None:
-        """Build the layers, for encoded states of e numbers and actions of n."""
+        """Build the layers, for encoded states of e numbers and actions of n numbers."""
 
     @abstractmethod
     def logits(self, batch: Batch) -> Tensor:

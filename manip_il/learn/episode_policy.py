@@ -126,7 +126,7 @@ class EpisodePolicy:
         shape = (config.horizon, *config.action_feature.shape)
         noise = [torch.randn(shape, generator=one, device=weight.device, dtype=weight.dtype) for one in generators]
         seen = model._prepare_global_conditioning(batch)
-        # each row's own generator also draws the noise of the steps, which LeRobot's `generate_actions` does not let it
+        # each row's own generator also draws the noise of the steps; LeRobot's `generate_actions` does not allow that
         plans = model.conditional_sample(ROWS, seen, generators, torch.stack(noise))
         start = config.n_obs_steps - 1
         plans = plans[:, start : start + config.n_action_steps]

@@ -1,4 +1,4 @@
-"""The options of a fit, by LeRobot's names. Help imports this module, so it imports neither torch nor LeRobot."""
+"""The options of a fit, by LeRobot's names. Imports neither torch nor LeRobot, so that help is fast."""
 
 from __future__ import annotations
 

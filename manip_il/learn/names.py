@@ -1,4 +1,4 @@
-"""Names of policy types, observations and action spaces. Help imports this module, so it imports nothing."""
+"""Names of policy types, observations and action spaces. Imports nothing, so that help is fast."""
 
 JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
 MLP, CNN = OWN_SPACE = ("mlp", "cnn")  # policies that do their own conversion: joint_delta by default

@@ -40,11 +40,11 @@ CONSTANT_TARGET = 1e-6
 class Shape:
     """Sizes and kinds that a network is built from: the options of the `mlp` policy, and so of `MLPConfig`.
 
-    loss: one of `LOSSES`. components: of `mixture`. bins: per dimension, for `categorical`, over the range of the data.
-    sigma: how far `categorical` smears a target, in bins; 0: over the two nearest. clamp: bound on the normalised
-    inputs, in standard deviations, so that states far from the data cannot blow up the outputs. action_space: one of
-    `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among the inputs (`object_from_ee.x`,
-    ...), tanh(x / s) is an input, too. scaled: the columns of these offsets, taken from the dataset.
+    loss: one of `LOSSES`. components: number in `mixture`. bins: number per dimension in `categorical`, over the range
+    of the data. sigma: how far `categorical` smears a target, in bins; 0: over the two nearest. clamp: bound on the
+    normalised inputs, in standard deviations, so that states far from the data cannot blow up the outputs.
+    action_space: one of `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among the inputs
+    (`object_from_ee.x`, ...), tanh(x / s) is an input, too. scaled: their columns, from the dataset.
 
     Raises `UnknownName` for an unknown loss or activation, `UsageError` for a size out of range.
     """
@@ -154,11 +154,11 @@ class MLPNetwork(nn.Module):
         return torch.cat([inputs, *(torch.tanh(inputs[:, self.scaled] / scale) for scale in self.scales)], dim=1)
 
     def encode(self, inputs: Tensor) -> Tensor:
-        """Return the perceptron's inputs for raw ones, (B, n + k)."""
+        """Return the perceptron's inputs for raw inputs (B, n + k)."""
         return ((self.expanded(inputs) - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
 
     def encode_targets(self, targets: Tensor) -> Tensor:
-        """Return the head's targets for raw relative ones, (B, n); 0 if the scale is 0."""
+        """Return the head's targets for raw relative targets (B, n); 0 if the scale is 0."""
         inverse = torch.where(self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale))
         return (targets - self.target_mean) * inverse
 
@@ -181,7 +181,7 @@ class MLPNetwork(nn.Module):
         return torch.cat([self.actions(block) for block in padded.split(ROWS)])[:rows]
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """Return actions, (B, n), for all rows in one product, so that the last bits depend on their number."""
+        """Return actions, (B, n), for all rows in one product; the last bits depend on the number of rows."""
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so the learner's must not either.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)

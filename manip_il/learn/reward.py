@@ -125,7 +125,7 @@ class RewardNetwork(nn.Module):
                 weight.copy_(spread * torch.randn(weight.shape, generator=generator))
 
     def features(self, inputs: Tensor) -> Tensor:
-        """Return the columns of inputs (B, d) that are used, with the lengths of their offsets, (B, up to d + K)."""
+        """Return the used columns of the inputs (B, d), then the lengths of the offsets, (B, up to d + K)."""
         lengths = [inputs[:, way].norm(dim=-1, keepdim=True) for way in self.ways]
         if self.logarithms:
             lengths = [(one + self.NEAR).log() for one in lengths]
@@ -242,7 +242,7 @@ class Compared:
 class Fit:
     """The networks, and the held-out prediction for every answer.
 
-    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs: of training.
+    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs: number trained.
     """
 
     network: RewardNetwork
@@ -322,7 +322,7 @@ def _train(
 
 
 def answer_losses(logits: Tensor, better: Tensor) -> Tensor:
-    """Return the negative log-likelihood of answers, (M, A), for logits (M, A) and better (A,)."""
+    """Return the negative log-likelihood of answers, (M, A), for logits (M, A) and targets `better` (A,)."""
     p = (1 - BY_CHANCE) * torch.sigmoid(logits) + BY_CHANCE / 2
     return nn.functional.binary_cross_entropy(p, better.expand_as(p), reduction="none")
 

@@ -1,7 +1,7 @@
 """Training on several datasets as one: what must agree between them, and how often each is sampled.
 
-Normalisation statistics are those of the union of the datasets' frames, each counted once, whatever the weights: so the
-weights can change without changing the units in which a policy observes and acts.
+Normalisation statistics cover the frames of all datasets, each counted once, whatever the weights. The weights can thus
+change without changing the units in which a policy observes and acts.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def check_same_sources(
 def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
     """Return the columns of a dataset that a policy observes, by LeRobot's names.
 
-    Raises `ManipError`, which says what to do, for a column that the dataset lacks.
+    Raises `ManipError`, with a remedy, for a column that the dataset lacks.
     """
     cameras = [key for key, feature in info.features.items() if feature.is_rgb]
     about, observes = f"{root}: the dataset has no", config.observes

@@ -60,7 +60,7 @@ _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 class Trainer:
     """Policy, processors, optimiser and data of one run that clones the labels of datasets.
 
-    shares: of the samples drawn from each dataset. weights: how often each frame is drawn, relative to the others,
+    shares: share of the samples from each dataset. weights: how often each frame is drawn, relative to the others,
     (N,); without either, each is drawn once per epoch. on_frames: called with the number of newly decoded pictures. On
     one CPU the same data, config and threads give the same bits, resumed or not. If started by `accelerate launch` or
     `torchrun`, every process takes `batch_size` samples per step.
@@ -159,7 +159,7 @@ class Trainer:
                 try:
                     if on_step is not None:
                         on_step(record)
-                except KeyboardInterrupt:  # by the user, between two steps: nothing is lost
+                except KeyboardInterrupt:  # raised between two steps, so nothing is lost
                     if not saved:
                         self.save()
                     raise

@@ -62,7 +62,7 @@ def new_checkpoint(final: Path) -> Generator[Path]:
     """
     with new_folder(final, replace=True) as new:  # replaces the folder of a run killed before it switched `last`
         yield new
-        for path in new.rglob("*.safetensors"):  # otherwise hidden from other users, such as a container's
+        for path in new.rglob("*.safetensors"):  # else other users, such as a container's, cannot read them
             path.chmod(new.stat().st_mode & 0o666)
     link = final.parent / ".last.tmp"
     link.unlink(missing_ok=True)

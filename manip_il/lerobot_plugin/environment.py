@@ -60,7 +60,7 @@ class ManipILEnv(EnvConfig):
     tolerance: float = option_of(SimConfig, "tolerance")
     success_steps: int = option_of(SimConfig, "success_steps")
     object: str = option_of(SimConfig, "object")
-    reward: str = ""  # of the task carry, only in files of older versions
+    reward: str = ""  # for the task carry; only in files of older versions
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)

@@ -65,7 +65,7 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
         columns[source.topic][key] = source
     found: dict[str, dict[int, Any]] = {key: {} for key in mapping.sources}
     for topic, stamp, content in read_messages(path, columns):
-        for key, source in columns[topic].items():  # of messages with equal stamps the last one counts
+        for key, source in columns[topic].items():  # if stamps are equal, the last message counts
             where = f"{path}, topic {topic}, {key} at {stamp} ns"
             found[key][stamp] = None if source.is_camera else _value(where, source, content)
     stamps: dict[str, I64] = {}

@@ -62,7 +62,7 @@ def read_pictures(path: Path, topic: str, stamps: Sequence[int]) -> Iterator[U8]
     """
     frames = Counter(stamps)
     for stamp, messages in itertools.groupby(read_messages(path, [topic]), lambda message: message[1]):
-        *_, (_, _, content) = messages  # of messages with equal stamps the last one counts
+        *_, (_, _, content) = messages  # if stamps are equal, the last message counts
         if stamp in frames:
             try:
                 picture = _picture(content)

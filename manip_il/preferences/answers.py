@@ -27,7 +27,7 @@ FILE_NAME = "preferences.json"
 FORMAT, VERSION = "manip_il preferences", 1
 LEFT, RIGHT, EQUAL, SKIP = ANSWERS = ("left", "right", "equal", "skip")
 BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # probability that the left clip is better
-_ROUNDING = 1e-9  # largest difference between equal returns
+_ROUNDING = 1e-9  # returns that differ by less than this are equal
 
 
 @dataclass(frozen=True)

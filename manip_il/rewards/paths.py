@@ -21,7 +21,7 @@ from manip_il.errors import ManipError
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 NOWHERE = -1  # next node if there is none
 LENGTH = 0  # feature that every edge has; other weights are given relative to its weight
-_EVERY, _FEW = 5, 5  # the first stage takes every fifth demonstration, if these are at least five
+_EVERY, _FEW = 5, 5  # the first stage takes every fifth demonstration, if that leaves at least five
 _DIGITS = 6  # decimals [m] to which the features of equal paths agree
 _SAME = 1e-6  # largest difference between equal feature sums [m]
 
@@ -136,7 +136,7 @@ def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
 
 
 def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64) -> list[F64]:
-    """Return the sums (m, K) of each demonstration's alternatives, extended by new ones for more tastes (n, K)."""
+    """Add alternatives for more tastes (n, K); return the sums (m, K) of each demonstration's alternatives."""
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
         more = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]

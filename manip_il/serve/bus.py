@@ -117,7 +117,7 @@ class Bus:
     def show(self, q: F64, velocity: ArrayLike = 0.0, load: ArrayLike = 0.0, *, settled: bool = False) -> None:
         """Set what the servos measure, (n,): angle [rad], velocity [rad/s], share of the stall torque, -1 to 1.
 
-        settled: whether to set their goals there, too.
+        settled: whether their goals are set to the same angles.
         """
         with self.lock:
             self["Present_Position"] = encoder_steps(q) - self["Homing_Offset"]

@@ -65,7 +65,7 @@ class SessionConfig(Seeded):
 
     output_dir: Path = option(Path("runs/serve"), "folder for the links follower and leader and their calibrations")
     leader: str = option(
-        "expert", "who moves the leader: expert, sliders (of a window), none, or a policy (a checkpoint or a run)"
+        "expert", "who moves the leader: expert, sliders (in a window), none, or a policy (a checkpoint or a run)"
     )
     speed: float = option(
         1.0, "how fast time passes in the world; 2: twice as fast as real time", at_least=0.1, at_most=10

@@ -56,7 +56,7 @@ class ServedEpisodes:
         self.driver = driver if not leads or self._leader == self._station.expert else Actor.LEARNER
 
     def frame(self, read: Read) -> None:
-        """Log a moment at which the client has read the follower's position."""
+        """Log one read of the follower's position by the client."""
         if not self._running:
             return
         if self._reads and self._reads[-1][0].commands == read.commands:  # the client asks again, as it got no answer

@@ -18,7 +18,7 @@ from manip_il.serve.station import Mover, Station
 from manip_il.sim.window import Window
 from manip_il.tasks.config import EnvConfig
 
-_UNPACED = 1e6  # frame rate of a window that need not wait for real time, as the station does [Hz]
+_UNPACED = 1e6  # a window's frame rate, so high that it never waits: the station keeps real time [Hz]
 
 
 def mover_of(leader: str, policy: LearnedPolicy | None, station: Station, cameras: Cameras | None) -> Mover:

@@ -27,7 +27,7 @@ FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
 HELD = 1.0  # how long the task must stay solved before it counts [s]
 _SLICES = 4  # most updates of motors and registers per control step
 _LATE = 0.25  # largest lag behind the wall clock; beyond it the clock is reset [s]
-_FULL_TURN = "wrist_roll"  # LeRobot's calibration gives it a full turn
+_FULL_TURN = "wrist_roll"  # the joint to which LeRobot's calibration gives a full turn
 
 
 Mover = Callable[[], F64 | None]

@@ -68,7 +68,7 @@ def policy_facts(root: Path) -> dict[str, Any]:
         raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
     found = {name: root / inside / f"{name}.json" for name in ("config", "manip_il", "train_config")}
     facts = {name: checks.read_json(path, "JSON") if path.is_file() else {} for name, path in found.items()}
-    evaluations = [  # that of a round is not a test, because it chose the policy
+    evaluations = [  # a round's evaluation is not a test, because it chose the policy
         {**checks.read_json(path, "JSON"), "is_test": not path.parent.name.startswith("round_")}
         for path in root.rglob("eval.json")
     ]
@@ -79,7 +79,7 @@ def policy_facts(root: Path) -> dict[str, Any]:
 
 
 def options(folder: Path) -> str:
-    """Return the folder's `config.yaml`, without paths, options of one machine and secrets; "" if it is not ours."""
+    """Return the folder's `config.yaml` without paths, machine-specific options and secrets; "" if it is not ours."""
     path = folder / "config.yaml"
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     shown = [line for line in text.splitlines() if not _NOT_SHOWN.search(line)]

@@ -19,7 +19,7 @@ from manip_il.store.errors import RemoteError
 MANIFEST_FILE = "manip_il_manifest.json"
 JOURNALS = "journals"  # folder of journals, of a pushed dataset or anywhere in a run
 CHECKPOINTS, LAST = "checkpoints", "last"  # the link `last` to the newest checkpoint is not pushed; a pull creates it
-CARD, CONFIG = "README.md", "config.json"  # of a repository, of every policy
+CARD, CONFIG = "README.md", "config.json"  # one per repository, one per policy
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
 _PICKLE_OR_CODE = re.compile(
@@ -61,7 +61,7 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Files by path. version: its id on the remote. copies: of a run's policy, which a pull leaves out."""
+    """Files by path. version: its id on the remote. copies: files copied from a run's policy, not pulled."""
 
     kind: Kind
     files: Mapping[str, File]
@@ -116,7 +116,7 @@ def check_path(path: object) -> None:
 def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
     """Return the files of a dataset or run by their paths in the manifest, except hidden and unfinished ones.
 
-    journals: include a dataset's `<root>.journals` as `journals/`, and those inside a run. Raises `RemoteError` for
+    journals: include a dataset's `<root>.journals`, as `journals/`, and the journals in a run. Raises `RemoteError` for
     links.
     """
     local: dict[str, Path] = {}

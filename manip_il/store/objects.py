@@ -28,7 +28,7 @@ from manip_il.store.errors import RemoteError, explained
 from manip_il.store.manifest import MANIFEST_FILE, Kind, Manifest, PushPlan
 
 TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
-_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # object stores: see others' pushes
+_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # for object stores: no stale listings
 _S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
 _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, "sftp": {}}
 _SFTP = re.compile(
@@ -42,10 +42,10 @@ class Sftp(SFTPFileSystem):
     """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only; fsspec's class accepts any host key."""
 
     cachable = False
-    put: Any = fsspec.AbstractFileSystem.put  # that of fsspec's SFTP takes a single file
+    put: Any = fsspec.AbstractFileSystem.put  # fsspec's SFTP class has one that takes only a single file
 
     def _connect(self) -> None:
-        logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # its errors are also raised
+        logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # paramiko also raises the errors that it logs
         config, login = Path.home() / ".ssh" / "config", self.ssh_kwargs
         known = dict(paramiko.SSHConfig.from_path(str(config)).lookup(self.host)) if config.is_file() else {}
         self.client = paramiko.SSHClient()

@@ -98,10 +98,10 @@ def curves(process: Process, horizons: Sequence[int], draws: int) -> Iterator[Lo
 
 
 def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
-    """Return error, gap and bound, (3, B), of each policy (B, H, S) by the learner's theorem.
+    """Return error, gap and bound, (3, B), of each policy (B, H, S), as the learner's theorem defines them.
 
-    cloning: error in the expert's states, Theorem 8.1; DAgger: in the policy's own, Theorem 8.2. The gap is the cost of
-    the policy's wrong actions in the states that it visits (the performance difference lemma).
+    The error is measured in the states of the expert (cloning, Theorem 8.1) or the policy (DAgger, Theorem 8.2). The
+    gap is the cost of the policy's wrong actions in the states that it visits (the performance difference lemma).
     """
     horizon, own = policies.shape[1], process.visits(policies) * policies
     gaps = (own * process.wrong_costs(horizon)).sum(axis=(1, 2))
