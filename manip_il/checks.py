@@ -81,7 +81,7 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
     """Return a finite float within [low, high]."""
-    most = sys.float_info.max  # a larger int has no float
+    most = sys.float_info.max  # a larger int does not fit in a float
     if isinstance(value, int | float) and not isinstance(value, bool) and max(low, -most) <= value <= min(high, most):
         return float(value)
     limits = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
@@ -129,7 +129,7 @@ def read_yaml(path: Path, what: str) -> Any:
     """Return the value of a YAML file; `UsageError` if it cannot be read. what: what is expected, for the message."""
     try:
         return parse_yaml(read_bytes(path, what, UsageError).decode())
-    except ValueError as error:  # UnicodeDecodeError is one
+    except ValueError as error:  # UnicodeDecodeError is a ValueError
         raise UsageError(f"{path} is not YAML: {error}") from error
 
 

@@ -72,7 +72,7 @@ class ExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class NoisyExpertDriver(Driver):
-    """Executes the label with Gaussian noise: DART (Laskey et al. 2017). covariance: of the actions, (n, n)."""
+    """Executes the label plus Gaussian noise: DART (Laskey et al. 2017). covariance: noise covariance, (n, n)."""
 
     covariance: tuple[tuple[float, ...], ...]
     kind = "noisy_expert"
@@ -150,5 +150,5 @@ def policy_actions(policy: LearnedPolicy, turns: Sequence[Turn]) -> F64:
 
 
 def generators(stream: str) -> Callable[[int], np.random.Generator]:
-    """Return a function from an episode's seed to its own random generator."""
+    """Return a function that maps an episode's seed to its random generator."""
     return cache(lambda seed: rng_for(seed, stream))

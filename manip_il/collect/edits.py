@@ -58,7 +58,7 @@ class EditSource:
 def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> EditSource:
     """Open a dataset whose states are to be restored.
 
-    robot, task: files of the user's own robot and task. shape: of its object, if that is a mesh. Raises `ManipError` if
+    robot, task: files of the user's own robot and task. shape: the object's, if it is a mesh. Raises `ManipError` if
     the folder is not a dataset of ours, or its robot or task is unknown, `MismatchError` if its states do not fit them.
     """
     dataset = Dataset.open(root)

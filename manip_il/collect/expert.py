@@ -56,7 +56,7 @@ class Expert:
                     kind = type(target).__name__
                     raise ManipError(f"{self._scene.name}: rung {rung.name!r} returned a {kind}; expected a Target")
                 return self._towards(q, world.opening, target, phase)
-        raise ManipError(f"{self._scene.name}: no rung holds; expected the last to hold everywhere")
+        raise ManipError(f"{self._scene.name}: no rung holds; expected the last rung to hold in every state")
 
     def _unsound(self, world: World) -> str:
         hand = world.ee.position.tolist()

@@ -108,7 +108,7 @@ def run_steps(
     policies = tuple(_load(job, path, envs[0]) for path in job.driver.policies)
     setting = Setting(env_actions(job.env), job.env.horizon, policies)
     takeover = job.label == "takeover"
-    horizon = (2 if takeover else 1) * job.env.horizon  # for learner and expert each
+    horizon = (2 if takeover else 1) * job.env.horizon  # one horizon each for learner and expert
     rules = Rules(horizon, job.hold, job.patience, takeover)
     gate = gate_of(job.label, job.query, setting)
     return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)

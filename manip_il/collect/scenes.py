@@ -40,7 +40,7 @@ _TRIES = 5  # scenes drawn for a state, before it is kept as visited
 class Scenes:
     """How scenes are drawn from a dataset's states, and their cameras.
 
-    anew: also draw goals and objects, not only looks. conditions: from which the looks of every frame are drawn.
+    anew: also draw goals and objects, not only looks. conditions: those that the looks are drawn from.
     branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
     of the first scene in the random stream, so that several datasets of one seed have different scenes.
     """
@@ -81,7 +81,7 @@ class SceneDrawer:
     def frames(self, visited: State, number: int, seed: int, lead: F64 | float = 0.0) -> list[Transition]:
         """Return the scene of one visited state: one labelled frame, or those of a branch; [] without a valid label.
 
-        number: of the scene in the random stream. seed: of the column. lead: added to a single frame's label, (n,).
+        number: scene number in the random stream. seed: value of the column. lead: added to a lone frame's label, (n,).
         """
         rng = rng_for(number, "redraw")
         visited = self._with_look(replace(visited, streak=0, ever=False), number)
@@ -100,7 +100,7 @@ class SceneDrawer:
 
     def _with_look(self, state: State, number: int) -> State:
         """Return the state with randomised looks, if the environment has any."""
-        if not isinstance(self._env, ManipEnv):  # has fixed looks
+        if not isinstance(self._env, ManipEnv):  # its looks are fixed
             return state
         conditions, shape = self._scenes.conditions, self._shape
         drawn = draw(conditions, number, shape) if conditions else {}

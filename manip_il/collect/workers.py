@@ -70,7 +70,7 @@ class Engine:
             raise
 
     def warm_up(self, learned: bool) -> None:
-        """Start the workers' server in the background. learned: whether policies will drive."""
+        """Start the workers' server in the background. learned: whether the workers will run policies."""
         if self._backend == "local" and self.workers != 1:
             start_server(learned)
 
@@ -182,14 +182,14 @@ def kill_pool(pool: ProcessPoolExecutor) -> None:
 
 
 def start_server(learned: bool) -> None:
-    """Start the server from which workers are forked, in the background, once per process.
+    """Start, once per process, the background server that workers are forked from.
 
     learned: also import policies. The server keeps the current environment variables, except for a single OpenMP
     thread.
     """
     _CONTEXT.set_forkserver_preload(["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])])
     threads = os.environ.get("OMP_NUM_THREADS")
-    resource_tracker.ensure_running()  # first, because its start would undo the mask
+    resource_tracker.ensure_running()  # first, because starting it would undo the mask
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # only this process handles Ctrl-C
     os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
     try:

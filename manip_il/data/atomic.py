@@ -40,7 +40,7 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     if not (replace and root.is_dir()):
         _require_empty(root)
     partial = root.with_name(f".{root.name}{PARTIAL}")
-    if partial.is_symlink():  # planted: what it leads to must not be cleared
+    if partial.is_symlink():  # a planted link: its target must not be cleared
         partial.unlink()
     with writing(root), exclusive(partial) as handle:
         clear(partial)
@@ -104,7 +104,7 @@ def write_file(path: Path, data: bytes) -> None:
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
-        sync(path.parent)  # else a power cut may undo the rename
+        sync(path.parent)  # otherwise a power cut may undo the rename
 
 
 def sync(path: Path) -> None:

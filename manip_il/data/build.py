@@ -39,8 +39,8 @@ class Recording:
     """How rollouts become a dataset: `recording.json` in the folder of their journals.
 
     A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes. only_labelled:
-    leave out episodes without a valid label. episodes: keep at most the first so many in seed order; None: all. labels:
-    keep at most so many valid labels; later ones have `label_valid` 0, and later episodes are left out. provenance: who
+    leave out episodes without a valid label. episodes: number of episodes to keep, in seed order; None: all. labels:
+    number of valid labels to keep; later ones have `label_valid` 0, and later episodes are left out. provenance: who
     drove, stored in the dataset. video: fields of `VideoConfig`. stills: store pictures as PNGs in the data files, for
     frames that are independent scenes.
     """

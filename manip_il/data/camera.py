@@ -126,7 +126,7 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
     """
     shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
-        os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # else a full disk kills the process
+        os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # otherwise a full disk kills the process
         decoded = np.memmap(file, np.uint8, "r+", shape=shape)
 
     def fill(camera: Camera, start: int, rows: I64) -> int:
@@ -168,7 +168,7 @@ def read_frames(container: InputContainer, first: int, count: int, fps: float) -
     """
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]
-    container.seek(round(first / fps / tick), stream=stream)  # to the last key frame up to there
+    container.seek(round(first / fps / tick), stream=stream)  # to the last key frame at or before it
     pictures: list[NDArray[np.uint8]] = []
     for frame in itertools.islice(container.decode(stream), first + count):  # bounded even if the file is malicious
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)

@@ -108,7 +108,7 @@ class Dataset:
         actions.
         """
         if self.own is not None:
-            one = len(self.tasks) == 1  # else episodes have different instructions
+            one = len(self.tasks) == 1  # otherwise episodes have different instructions
             return dataclasses.replace(self.own.spec, instruction=self.instruction) if one else self.own.spec
         features = self.features
         if s.ACTION not in features:
@@ -149,7 +149,7 @@ class Dataset:
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Statistics by column and name, (n,), or (channels, 1, 1) of pictures; computed if the dataset has none."""
+        """Statistics by column and name: (n,), or (channels, 1, 1) for pictures; computed if the dataset has none."""
         if (self.root / layout.STATS).exists():
             return read_statistics(self.root)
         return column_statistics(self.columns())

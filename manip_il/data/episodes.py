@@ -33,7 +33,7 @@ def to_episode(
     """Return an episode with the schema's columns, (T, 1) or (T, d).
 
     labelled: include the columns of labels; frames without a label have `label_valid` 0, phase 0, and the executed
-    action as label. path: number of first frames that decide success; by default all.
+    action as label. path: number of leading frames that decide success; by default all.
     """
     count = len(frames)
     columns: dict[str, NDArray[Any]] = {

@@ -106,7 +106,7 @@ def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> d
 
 
 def add_channels(writer: Writer, channels: Mapping[str, Messages], times: Times) -> None:
-    """Write all messages, frame by frame. channels: by topic."""
+    """Write all messages, frame by frame. channels: topic -> messages."""
     kinds: dict[type, int] = {}  # class of messages -> its schema
     ids: dict[str, int] = {}
     for frame, (time, messages) in enumerate(zip(times, zip(*channels.values(), strict=True), strict=bool(channels))):
@@ -127,7 +127,7 @@ def _register_scalars(writer: Writer) -> int:
 def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8]:
     """Return the pictures that `images` wrote, by camera; a camera without pictures is left out.
 
-    chunks: of a file, in order. shape: of each camera's pictures, (T, height, width, 3).
+    chunks: a file's, in order. shape: shape of each camera's pictures, (T, height, width, 3).
     """
     pictures: dict[str, U8] = {}
     cameras: dict[int, str] = {}  # by the id of their channel

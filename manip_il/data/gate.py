@@ -32,7 +32,7 @@ _BATCH = 64  # rows in memory at once
 def check_arrived(root: Path, *, strict: bool = True) -> None:
     """Open every file of a dataset in a child process. Raises `ManipError` naming a file that is refused.
 
-    strict: refuse damaged files, too; else only files that need too much memory or time or crash the process.
+    strict: refuse damaged files, too; otherwise only files that need too much memory or time or crash the process.
     """
     checks.in_child(str(root), open_files, root, strict)
 

@@ -28,7 +28,7 @@ _MOST = 2**53  # frames or episodes
 
 @dataclass(frozen=True)
 class Feature:
-    """One column or camera. shape: of one frame."""
+    """One column or camera. shape: shape of one frame."""
 
     key: str
     dtype: str

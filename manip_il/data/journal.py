@@ -143,7 +143,7 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
     spec, fingerprint = RobotTaskSpec.from_json(values.pop("spec")), values.pop("fingerprint")
     frames = values.pop("frames")
-    if spec.cameras:  # else the messages are not needed
+    if spec.cameras:  # otherwise the messages are not needed
         pictures = foxglove.read_images(chunks, (frames, *spec.image_size, 3))
         columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
     # journals of older versions have neither instruction nor draws

@@ -39,7 +39,7 @@ def append_line(path: Path, record: Record) -> None:
             file.truncate(file.read().rfind(b"\n") + 1)
         file.seek(0, os.SEEK_END)
         file.write(line)
-        file.flush()  # inside `writing`, which names a full disk
+        file.flush()  # inside `writing`, which reports a full disk
 
 
 def _finite(record: Record) -> dict[str, Any]:

@@ -82,7 +82,7 @@ def tasks_table(instructions: Sequence[str]) -> pa.Table:
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
-    """Return path, chunk index and file index of the `number`-th file. names: other fields of the template."""
+    """Return path, chunk index and file index of the `number`-th file. names: the template's other fields."""
     chunk, file = divmod(number, CHUNKS_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **names), chunk, file
 

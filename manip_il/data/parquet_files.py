@@ -110,7 +110,7 @@ def _to_png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return those of the columns that a file has. Raises `ManipError` if it is damaged."""
+    """Return the requested columns that a file has. Raises `ManipError` if it is damaged."""
     with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
         # one thread: distributing pieces of one episode costs more than reading them
         return file.read(list(columns), use_threads=False).replace_schema_metadata(None)

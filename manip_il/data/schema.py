@@ -62,7 +62,7 @@ class RobotTaskSpec:
     phases: tuple[str, ...] = ()  # names of the values of `expert_phase`: none, then the rungs of the task's ladder
     object: str = ""  # shape and size of the object that the task moves; empty for the task's own
     robot_type: str = ""  # LeRobot's name of the robot; empty if it is `robot`
-    video: bool = True  # whether pictures are in video files; else they are PNGs in the data files
+    video: bool = True  # whether pictures are in video files; otherwise they are PNGs in the data files
     keypoints: tuple[str, ...] = ()  # points of the scene with columns of their image coordinates, for every camera
     schema: int = VERSION
 

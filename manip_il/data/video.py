@@ -143,7 +143,7 @@ def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoC
 
 
 def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: int) -> None:
-    os.environ.setdefault("SVT_LOG", "1")  # errors only; else it prints its version for every encoder
+    os.environ.setdefault("SVT_LOG", "1")  # errors only; otherwise it prints its version for every encoder
     encoder.height, encoder.width = size
     encoder.pix_fmt = config.pix_fmt
     encoder.framerate, encoder.time_base = Fraction(fps), Fraction(1, fps)
@@ -158,7 +158,7 @@ def _video_frame(picture: NDArray[np.uint8], number: int, fps: int) -> av.VideoF
 def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
     """Encode one picture of this height and width; raises `UsageError` with the encoder's reason if it fails."""
     level = av.logging.get_level()
-    av.logging.set_level(av.logging.ERROR)  # else the reason is not logged
+    av.logging.set_level(av.logging.ERROR)  # otherwise the reason is not logged
     with av.logging.Capture() as log:
         try:
             if len(av.VideoFormat(config.pix_fmt).components) < 3:

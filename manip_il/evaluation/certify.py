@@ -55,7 +55,7 @@ class Case(NamedTuple):
 class Row:
     """The cases of one kind. kind, words: short and full name; horizon: [control steps].
 
-    left_out: number of episodes without a case, as the perturbation could not be placed or changed nothing.
+    left_out: number of episodes without a case, because the perturbation could not be placed or changed nothing.
     """
 
     group: Group
@@ -67,7 +67,7 @@ class Row:
 
     @property
     def success(self) -> Proportion | None:
-        """The share solved within a horizon from the moment on; None without cases."""
+        """Share of cases solved within a horizon from their moment; None if there are no cases."""
         return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
 
     @property

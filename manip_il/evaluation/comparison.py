@@ -88,7 +88,7 @@ class Comparison:
 
     @cached_property
     def p_value(self) -> float:
-        """Two-sided exact p over test episodes, all training seeds together; McNemar's for one training seed.
+        """Exact two-sided p over test episodes, each summed over training seeds; McNemar's if there is only one.
 
         It holds for these trained policies; `interval` also covers other training seeds.
         """
@@ -192,7 +192,7 @@ class Study:
         return (self.results_table(), *([self.condition_table()] if several else []))
 
     def cost_tables(self) -> tuple[Table, ...]:
-        """Return costs to reach the target; nothing unless all arms are runs."""
+        """Return the costs to reach the target; empty unless all arms are runs."""
         return (self.target_table(),) if all(arm.has_histories for arm in self.arms) else ()
 
     def results_table(self) -> Table:

@@ -123,7 +123,7 @@ def failures_sections(
 def curve_sections(
     curves: Sequence[Curve], target: float | None = None, tables: tuple[Table, ...] = ()
 ) -> list[Section]:
-    """Return a section on success against every cost; nothing without curves."""
+    """Return a section on success against every cost; empty if there are no curves."""
     if not curves:
         return []
     note = curve_note(curves)

@@ -70,7 +70,7 @@ def drawing(
 ) -> Iterator[tuple[Any, Any]]:
     """Yield a figure and its axes (rows, columns) in the reports' style.
 
-    size: of one panel [inches]. share: whether the panels of a row share their axes.
+    size: size of one panel [inches]. share: whether the panels of a row share their axes.
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG

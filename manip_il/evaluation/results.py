@@ -211,7 +211,7 @@ class EvalResult:
         return cls(
             policy=data["policy"],
             robot=str(data["robot"]),
-            # Paths are refused, as they would run code. The reward was once a separate setting.
+            # Paths are refused because they would run code. The reward was once a separate setting.
             task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),

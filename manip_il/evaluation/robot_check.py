@@ -100,7 +100,7 @@ class RobotCheck:
 def check_robot(
     name: str, tasks: Sequence[str], episodes: int, engine: Engine, on_result: Callable[[EpisodeResult], object]
 ) -> RobotCheck:
-    """Measure a robot, given by name or YAML, on tasks. episodes: per task, without and again with random actions.
+    """Measure a robot, given by name or YAML, on tasks. episodes: number per task, with and without random actions.
 
     on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
     """

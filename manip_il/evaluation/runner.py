@@ -34,7 +34,7 @@ from manip_il.tasks.stock.envs import described_stock
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 _LOG = logging.getLogger(__name__)
-HOLD = 10  # control steps that an episode continues after success, to see whether it lasts
+HOLD = 10  # control steps for which an episode continues after success, to see whether it lasts
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
 FOLDER = "evaluations"  # folder for the evaluations of several policies
@@ -102,7 +102,7 @@ def evaluate(
 
 
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
-    """Return how long after success an evaluation's episodes end; stock environments define their own end."""
+    """Return the control steps from success to an episode's end; stock environments define their own end."""
     if env.robot not in STOCK:
         return hold
     return 0 if STOCK[env.robot].ends_solved else None

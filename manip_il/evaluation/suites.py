@@ -69,7 +69,7 @@ def read_condition(name: str) -> Condition:
 
 def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
     """Return the part of a condition that affects an environment, see `Condition.for_world`."""
-    from manip_il.tasks.table import get_task  # imported here, as a wrong name is found without the simulator
+    from manip_il.tasks.table import get_task  # imported here because a wrong name is found without the simulator
 
     if env.robot in STOCK:  # stock environments take no ranges
         return None if condition.ranges else condition

@@ -51,7 +51,7 @@ def print_table(table: Table, console: Console | None = None, empty: str = "") -
         drawn.add_column(Text(name), justify="right" if index else "left")
     for index, row in enumerate(table.rows):
         style = table.colours[index] if terminal and table.colours else None
-        # Text objects, as Rich would parse the brackets of an interval as markup
+        # Text objects, because Rich would parse the brackets of an interval as markup
         drawn.add_row(*(Text(printable(cell or empty)) for cell in row), style=style)
     console.print(drawn)
 

@@ -73,7 +73,7 @@ def outcome(step: Transition) -> str:
 class RerunLog:
     """Steps of episodes, written to a file, or sent in real time to viewers that open `address`.
 
-    address: URL of the viewer, for a browser; empty if a file is written. ports: of the viewer and the stream.
+    address: URL of the viewer, for a browser; empty if a file is written. ports: those of the viewer and the stream.
     Raises `OSError` if the file cannot be written.
     """
 

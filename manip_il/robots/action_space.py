@@ -17,7 +17,7 @@ from manip_il.mdp import F64
 class ServoUnits:
     """Conversion from [rad] and [m] to degrees and 0 to 100, and back.
 
-    openings: of the gripper [m], rising, (c,). percents: its servo's positions there, 0 to 100, (c,).
+    openings: gripper openings [m], rising, (c,). percents: its servo's positions there, 0 to 100, (c,).
     """
 
     openings: F64

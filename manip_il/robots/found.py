@@ -23,14 +23,14 @@ from manip_il.robots.spec import arm_spec, bare_spec, require
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
 FREQUENCY = 2 * math.pi * 6.0  # natural frequency of a joint with its motor as a spring [rad/s]
-_AT_OBJECT = 0.7  # share of the way from closed to open at which turning fingers stand as at an object
+_AT_OBJECT = 0.7  # share of the way from closed to open at which turning fingers stand as if around an object
 _SETTLE, _STEP = 1000, 0.002  # physics steps, and their length [s]
 FROM_TIP = 0.012  # distance of the frame from the fingertips [m]
-_CLEAR = 0.006  # clearance of the fingertips over the table at the frame's lowest [m]
-_SQUARE = 0.95  # cosine of the largest angle at which the fingers' motion counts as along an axis of the hand's body
+_CLEAR = 0.006  # clearance of the fingertips over the table with the frame at its lowest [m]
+_SQUARE = 0.95  # cosine of the largest angle from a body axis at which the fingers' motion counts as parallel to it
 _LEAST_GAP = 1e-4  # least gap between half-closed fingers [m]
 _METRES, _TURN = 4, 6  # digits
-_STARTS, _STEPS = 40, 150  # inverse kinematics: random postures, and steps from each
+_STARTS, _STEPS = 40, 150  # inverse kinematics: number of random postures, and of steps from each
 _LONGEST = 0.2  # longest step of a joint [rad]
 _HIGHEST = 0.2  # height of the hand over the table, or half the workspace's height if that is less [m]
 _LOWER = (1.0, 0.7, 0.4)  # shares of that height, tried in order
@@ -87,8 +87,8 @@ def arm_joints(robot: str, spec: mujoco.MjSpec, hand: str, gripper: Sequence[str
 def motor_limits(
     robot: str, files: ModelFiles, spec: mujoco.MjSpec, joints: Sequence[str]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the greatest torques [N m] and the armatures [kg m^2] of joints, as the model has them."""
-    whole = files.load(robot)  # kept: MuJoCo's views of a spec do not keep it alive
+    """Return the greatest torques [N m] and the armatures [kg m^2] of joints, from the model."""
+    whole = files.load(robot)  # keep a reference: MuJoCo's views of a spec do not keep it alive
     motors = {one.target: one for one in whole.actuators}
     forces = [_greatest_torque(motors.get(name), spec.joint(name)) for name in joints]
     armature = [float(spec.joint(name).armature) or ARMATURE for name in joints]
@@ -188,8 +188,8 @@ def _along_axis(vector: F64, least: float = 0.0) -> F64:
 def find_home(robot: Robot, turns: bool) -> Robot:
     """Return the robot with its best posture for a hand that points down over the workspace's middle.
 
-    turns: the frame `ee` may be turned by half a turn about z if that suits the arm better. Raises `UsageError` if
-    inverse kinematics arrives from none of forty random postures.
+    turns: whether `ee` may be turned by half a turn about z if that suits the arm better. Raises `UsageError` if
+    inverse kinematics converges from none of forty random postures.
     """
     halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
     heights = [min(_HIGHEST, robot.workspace.height / 2) * share for share in _LOWER]

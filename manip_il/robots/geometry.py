@@ -79,7 +79,7 @@ class Body:
         self._at_home = self.meeting(np.asarray(robot.home))
 
     def meets_itself(self, q: F64) -> bool:
-        """Return whether parts collide at joints (arm,) [rad] that do not at home."""
+        """Return whether parts that are apart at home collide at joints (arm,) [rad]."""
         return not self.meeting(q) <= self._at_home
 
     def meeting(self, q: F64) -> frozenset[frozenset[int]]:
@@ -94,8 +94,8 @@ class Body:
 def meeting_at(robot: Robot, model: mujoco.MjModel, prefix: str, posture: F64) -> dict[Pair, float]:
     """Return the pairs of bodies that overlap in a posture of the arm (arm,) [rad], the gripper open, and how deep [m].
 
-    Pairs are within the robot, or of the robot and what is fixed in the world, which is named by its geom.
-    prefix: of the robot's names in a scene's model.
+    A pair is two bodies of the robot, or one and a fixed part of the world, which is named by its geom.
+    prefix: prefix of the robot's names in a scene's model.
     """
     data, gripper = mujoco.MjData(model), robot.gripper
     for names, values in ((robot.joints, posture), (gripper.joints, gripper.open)):
@@ -118,7 +118,7 @@ def meeting_at(robot: Robot, model: mujoco.MjModel, prefix: str, posture: F64) -
 def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
     """Raise `UsageError` for a `home` beyond a joint's limits, or in which parts overlap.
 
-    Two of the robot's own may overlap if they also do so at zero, as neighbours do in many models.
+    Two parts of the robot may overlap if they also do so at zero, as neighbours do in many models.
     """
     for name, value in zip(robot.joints, robot.home, strict=True):
         joint = model.joint(prefix + name)

@@ -23,10 +23,10 @@ from manip_il.robots.spec import arm_spec
 Geoms = Sequence[Sequence[int]]  # geom ids of each finger
 TOUCH = 0.0015  # a finger this near to an object touches it [m]
 _COMMANDS = 15  # commands of the sweep from closed to open
-_SETTLE = 250  # physics steps at each
+_SETTLE = 250  # physics steps at each command
 _STEP = 0.002  # [s]
 _PAD = 0.004  # a geom this much farther from the other finger than the nearest at the tip is no pad [m]
-_LOPSIDED = 0.004  # the middle of the pads moves by more if only one of two fingers moves [m]
+_LOPSIDED = 0.004  # if only one of two fingers moves, the middle of the pads moves by more than this [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
@@ -34,9 +34,10 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 class Sweep:
     """Measured relation of command and opening.
 
-    shares: of the way from closed to open, commanded and measured, rising, (c,). openings: gaps between the pads at
-    rest [m], rising, (c,). middles: of the pads along the hand's y [m], (c,); all 0 if both sides move alike. pads: for
-    each finger the indices of its pads, nearest to the other finger first; holding: of those that may hold.
+    shares: how far from closed to open, 0 to 1, commanded and measured, rising, (c,). openings: gaps between the pads
+    at rest [m], rising, (c,). middles: positions of the middle between the pads along the hand's y [m], (c,); all 0 if
+    both sides move alike. pads: for each finger the indices of its pads, nearest to the other finger first; holding:
+    the same for the pads that may hold.
     """
 
     shares: F64
@@ -47,7 +48,7 @@ class Sweep:
 
 
 class Gripper:
-    """The gripper of a robot within a compiled model. prefix: of the robot's names there."""
+    """A robot's gripper within a compiled model. prefix: prefix of the robot's names there."""
 
     def __init__(self, robot: Robot, model: mujoco.MjModel, prefix: str = ""):
         config, self._sweep = robot.gripper, sweep(robot)
@@ -193,7 +194,7 @@ def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
 def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = "") -> list[tuple[int, ...]]:
     """Return for each finger the ids of the solid geoms of it and of its child bodies except other fingers.
 
-    prefix: of the bodies' names. Raises `UsageError` for a finger without such a geom.
+    prefix: prefix of the bodies' names. Raises `UsageError` for a finger without such a geom.
     """
     roots = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
     owners, touching = dict(roots), (model.geom_contype != 0) | (model.geom_conaffinity != 0)

@@ -39,7 +39,7 @@ class PoseProgram:
         orientation, posture = costs
         self.frame = mink.FrameTask(site, "site", _POSITION_COST, orientation, lm_damping=_LM_DAMPING)
         self._target = self.frame.transform_target_to_world = mink.SE3.identity()
-        self.posture = mink.PostureTask(model, posture)  # else a label would depend on the path to the posture
+        self.posture = mink.PostureTask(model, posture)  # otherwise a label would depend on the path to the posture
         self.posture.set_target(home)
         limit = mink.ConfigurationLimit(model)
         self._bounded, self._gain = limit.indices.astype(int), limit.gain
@@ -60,7 +60,7 @@ class PoseProgram:
         program: Any = mink.build_ik(self._configuration, [self.frame, self.posture], 1.0, _DAMPING, [])
         q = self.data.qpos[self._bounded]
         upper = self._gain * np.concatenate([self._high - q, q - self._low])
-        # DAQP directly: with qpsolvers and mink's limits a label takes half as long again.
+        # DAQP directly: with qpsolvers and mink's limits a label takes 1.5 times as long.
         x, _, exit_flag, _ = daqp.solve(program.P, program.q, self._rows, upper, self._lower, self._sense)
         return x if exit_flag > 0 else None
 
@@ -107,7 +107,7 @@ class ArmIK:
         return self._ee.copy(), self._ee_rotation.copy()
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
-        """Return only the displacement of `step`, (arm,) [rad]; weight: of the rotation, by default as upright."""
+        """Return only the displacement of `step`, (arm,) [rad]; weight: rotation cost, by default an upright hand's."""
         self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(position, rotation)
         if x is None:
@@ -120,7 +120,7 @@ class ArmIK:
         """Return one step from the last `ee_pose` posture towards a pose of `ee`; `largest`: longest joint step [rad].
 
         lean: how far the hand may lean from the rotation to reach the position, 0 to 1.
-        Returns the joint displacement [rad] (arm,), scaled down as a whole if a joint's is too long, and the share of
+        Returns the joint displacement [rad] (arm,), scaled down as a whole if one joint's is too long, and the share of
         the weighted pose error that it leaves; None if the quadratic program has no solution.
         """
         costs = self._costs
@@ -138,7 +138,7 @@ class ArmIK:
     def moved(self, q: F64, motions: F64) -> F64:
         """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), that move `ee` by `motions`.
 
-        motions: of its position [m] and rotation vectors [rad] in the world's axes, (B, 6). The first step is
+        motions: its translations [m] and rotation vectors [rad] in the world's axes, (B, 6). The first step is
         `displacement`, which resolves redundancy (the elbow of an arm with seven joints) as for the expert; the
         corrections after it are the shortest of the linearised kinematics (damped least squares). A pose out of reach
         is approached.

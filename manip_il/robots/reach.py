@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _CELL = 0.05  # grid spacing [m]
 _BEYOND = 0.3  # how far the map extends around the workspace [m]
-_ABOVE = 0.05  # and above it [m]
+_ABOVE = 0.05  # how far it extends above the workspace [m]
 _VERSION = 2  # version of the map's computation
 _STEPS = 80  # most steps of inverse kinematics
 _NEAR, _ANGLE = 1e-3, 0.05  # error at which it has converged [m], and what a radian adds to that [m/rad]
@@ -49,7 +49,7 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 class Reach:
     """Errors on a grid: how far from each point the downward hand ends [m], (x, y, z).
 
-    origin: of the grid [m], (3,).
+    origin: the grid's origin [m], (3,).
     """
 
     origin: F64
@@ -121,7 +121,7 @@ class Reach:
 def reach_of(robot: Robot) -> Reach:
     """Return a robot's map: read from its file, else computed (some seconds) and stored if possible."""
     path = _place(robot)
-    with contextlib.suppress(Exception), np.load(path) as kept:  # numpy raises many kinds for a file that is no map
+    with contextlib.suppress(Exception), np.load(path) as kept:  # a file that is no map raises many kinds of errors
         return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
     reach, partial = _solve(robot), path.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):

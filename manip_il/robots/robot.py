@@ -13,13 +13,13 @@ from manip_il.errors import ManipError, UnknownName
 from manip_il.mdp import F64
 from manip_il.robots.files import ModelFiles, require_lengths
 
-TABLE_BEYOND = 0.08  # offset of the table's middle from the workspace's, away from the robot [m]
+TABLE_BEYOND = 0.08  # offset of the table's middle from the workspace's middle, away from the robot [m]
 RATE = 20  # default control steps per second
 _MOST_HZ = 500
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
 FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # found on the model if the YAML does not give them
-UPRIGHT_JOINTS = 6  # with fewer, a hand cannot point down everywhere
+UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
 YAWS = ("world", "shoulder")
 WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, in the frame `ee` [m]
 
@@ -100,7 +100,7 @@ class CameraPose:
 
     @property
     def quaternion(self) -> tuple[float, ...]:
-        """Axes of the camera as MuJoCo has them, wxyz: x right, y up, z back."""
+        """Camera axes in MuJoCo's convention, as a quaternion wxyz: x right, y up, z back."""
         back = np.subtract(self.position, self.target)
         back = back / np.linalg.norm(back)
         right = np.cross([0.0, 0.0, 1.0], back)
@@ -127,7 +127,7 @@ class Costs:
 class LeRobotConfig:
     """A robot as LeRobot's recorder knows it.
 
-    robot_type: in `meta/info.json`. names: its servos', the arm's from base to hand, then the gripper's. gripper:
+    robot_type: as in `meta/info.json`. names: servo names, the arm's from base to hand, then the gripper's. gripper:
     positions of the gripper's driven joint at 0 and at 100 [rad]. fps: frames per second.
     """
 
@@ -160,9 +160,9 @@ class Robot:
     the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest torque [N m] and added inertia
     [kg m^2]. base: position of the root body [m]. fixed: positions of the joints that are neither the arm's nor the
     gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
-    costs: of inverse kinematics. yaw: where it is zero, along the world's x or straight ahead of the shoulder.
-    wrist_camera: name of the model's own, on its hand, or position of an added one in the frame `ee` [m]. cameras: of
-    the scene, if not in the default places: front, side. table: the scene's.
+    costs: those of inverse kinematics. yaw: zero direction, along the world's x or straight ahead of the shoulder.
+    wrist_camera: name of the model's camera on its hand, or position of an added one in the frame `ee` [m]. cameras:
+    the scene's, if not in the default places: front, side. table: the scene's.
     colours: red, green and blue of meshes without contacts, by patterns of names, of which later ones win. lerobot:
     how LeRobot's recorder writes it, if its servos' units replace [rad] and [m].
     """

@@ -15,11 +15,11 @@ from manip_il.errors import UnknownName
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
 
-PLAIN = mujoco.MjSpec()  # defaults for what we add to a model, as its own may set a material or a range
+PLAIN = mujoco.MjSpec()  # defaults for what we add to a model, because its own defaults may set a material or a range
 _KV_PER_KP = 1 / 20  # [s]: a time constant of one control step at 20 Hz
 _DAMPING = 1.0  # damping of an arm joint [N m s/rad]
 _FINGER_GAINS = (800.0, 20.0, 40.0)  # kp [N/m], kv [N s/m], force [N] of a sliding finger
-_HINGE_GAINS = (20.0, 0.5, 10.0)  # kp [N m/rad], kv [N m s/rad], torque [N m] of a turning one
+_HINGE_GAINS = (20.0, 0.5, 10.0)  # kp [N m/rad], kv [N m s/rad], torque [N m] of a turning finger
 _FINGER_ARMATURE, _FINGER_DAMPING = 0.2, 10.0  # [kg], [N s/m]
 _LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # for a linkage's joint [kg m^2], [N m s/rad]
 _HINGE_ARMATURE, _HINGE_DAMPING = 0.005, 0.1  # [kg m^2], [N m s/rad]
@@ -260,7 +260,7 @@ def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
     for name, kp, force, armature in zip(robot.joints, robot.gains, robot.forces, robot.armature, strict=True):
         joint = spec.joint(name)
         joint.damping, joint.stiffness, joint.armature = np.array([_DAMPING, 0, 0]), np.zeros(3), armature
-        joint.frictionloss = 0.0  # a servo's own control overcomes it
+        joint.frictionloss = 0.0  # a servo's own controller overcomes friction
         _position_actuator(spec, joint, (kp, kp * _KV_PER_KP, force))
     for name, ends in zip(
         robot.gripper.joints, zip(robot.gripper.closed, robot.gripper.open, strict=True), strict=True

@@ -46,7 +46,7 @@ _BOUNDS: dict[str, Range] = {
     "picture_delay": (0, 100),
 }
 _WHOLE = ("knock_step", "delay", "picture_delay", "clutter")
-_SEEDS = 2**31  # seeds of clutter, which a state holds exactly
+_SEEDS = 2**31  # number of clutter seeds, each of which a state stores exactly
 _KNOCK_STEP = (5, 24)  # default for a condition with a knock
 _BODY = ("mass", "size", "friction")  # the object's physics
 _MODEL = (*_BODY, "joint_damping", "actuator_gain")
@@ -64,10 +64,10 @@ class Condition:
     knock: distance by which the object is moved once [m], at a control step from knock_step, by default 5 to 24.
     joint_noise [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position
     in a policy's observations. delay: control steps by which those are late. mass [kg], size (edge or width [m]) and
-    sliding friction of the object. colour: each of its red, green and blue; table: of the table's. joint_damping:
+    sliding friction of the object. colour: each of the object's red, green and blue; table: the table's. joint_damping:
     factor on the damping of every arm joint; actuator_gain: factor on its actuators' kp, and its square root on kv.
     posture: largest offset of every joint from home at the start [rad]. camera_shift [m], camera_turn [deg]: of every
-    camera, in a random direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
+    camera, in a random direction. brightness: factor on every lamp; light_turn: the lamps' about the vertical [deg].
     clutter: number of visual objects around the workspace. picture_delay: control steps by which pictures alone are
     late.
 
@@ -89,7 +89,7 @@ class Condition:
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
         """Return the condition without the ranges that have no effect; None if none is left.
 
-        has_object, sees: whether the task has an object, the policy cameras. sizes: object sizes that the task can
+        has_object, sees: whether the task has an object, the policy has cameras. sizes: object sizes that the task can
         take [m]; None: only its own.
         Raises `UsageError` if none of the condition's sizes is among them.
         """
@@ -129,7 +129,7 @@ def merged(conditions: Sequence[Condition]) -> Condition:
 
 
 def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
-    """Return the condition of a seed's episode; conditions take turns, and without any it is nominal."""
+    """Return the condition of a seed's episode: conditions take turns; if there are none, it is nominal."""
     return conditions[seed % len(conditions)] if conditions else NOMINAL
 
 

@@ -43,7 +43,7 @@ _BRIGHTNESS = (0.1, 2.0)
 class Look:
     """Lighting of a scene: part of a dataset's fingerprint, and adjustable when pictures are rendered again.
 
-    shadows: of the main lamp; a picture then takes two to six times as long. brightness: factor on every lamp.
+    shadows: draw the main lamp's; a picture then takes two to six times as long. brightness: factor on every lamp.
     light_turn: rotation of the lamps about the vertical through the world's origin, -180 to 180 [deg].
     Raises `UsageError` for a value out of range.
     """

@@ -160,7 +160,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.ctrl[scene.arm_ctrl], opening = scene.actions.split(action)
         data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
         mujoco.mj_step(world.model, data, self.config.physics_steps)
-        world.update()  # else poses are as of the last physics step's start
+        world.update()  # otherwise poses are those at the start of the last physics step
         self.count_step()
         return executed
 
@@ -199,7 +199,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
 
     def observe(self) -> Observation:
-        """Return what a policy observes now, late and noisy if the episode is; call it once per control step.
+        """Return what a policy observes now, with the episode's delay and noise; call it once per control step.
 
         It has pictures only if the environment has cameras.
         """

@@ -111,7 +111,7 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
 
 
 def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
-    """Return the pairs of geoms that touch, one of them the robot's; those that overlap also with True behind them."""
+    """Return the robot's touching pairs of geoms, marked False; a pair that overlaps is there again, marked True."""
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
     roots = model.body_rootid[model.geom_bodyid]

@@ -90,7 +90,7 @@ def _read(name: str, length: float) -> Mesh:
 
 def _solid(name: str, content: bytes, suffix: str) -> Any:
     """The closed surface in a file, with its faces outwards; raises `UsageError`."""
-    import trimesh  # imported here, as it takes a third of a second
+    import trimesh  # imported here because it takes a third of a second
 
     try:
         found = trimesh.load_mesh(

@@ -83,7 +83,7 @@ def _renderer(scene: Scene, look: Look) -> _Renderer:
     try:
         _context().make_current()
         return _prepared(scene, look)
-    except Exception as error:  # mujoco raises many kinds, from ImportError to its own
+    except Exception as error:  # mujoco raises many kinds of errors, from ImportError to its own
         raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}") from error
 
 

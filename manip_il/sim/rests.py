@@ -27,15 +27,15 @@ _LEVEL = 0.004  # spacing of the heights at which widths are measured [m]
 _TIP = 0.001  # height of the lowest of these over the fingertips [m]
 _APART = math.radians(25)  # least angle between two grasps [rad]
 _SLOPE = 0.1  # slope of the sides at the fingertips above which the object is grasped as low as possible
-_STEEP = 0.2  # slope at the fingertips in excess of the best grasp's at which a grasp is dropped
-_WIDER = 0.02  # width in excess of the narrowest grasp's at which a grasp is dropped [m]
+_STEEP = 0.2  # grasps whose slope at the fingertips exceeds the smallest by more than this are dropped
+_WIDER = 0.02  # grasps wider than the narrowest by more than this are dropped [m]
 _ROUND = 0.03  # share of the width by which a round object's may vary
 
 
 class Rest(NamedTuple):
     """A side on which an object rests.
 
-    down: unit vector, (3,). height: of the body's origin; tall: of the object; above: of its top over the grasp [m].
+    down: unit vector, (3,). height: the body origin's; tall: the object's; above: its top's over the grasp [m].
     For each of w grasps: across (w, 3), unit vector along the fingers' motion; centre (w, 3), between the fingers;
     sizes: width between them and length across them [m]. fits: the fingers go around it, and it is not too low for
     them. round: any yaw will do.
@@ -153,7 +153,7 @@ def _cut(hull: ConvexHull, heights: F64, flat: F64, level: float) -> F64:
     """Segments (n, 2, 2) [m] of the outline at a height."""
     z, xy = heights[hull.simplices], flat[hull.simplices]
     after_z, after_xy = np.roll(z, -1, axis=1), np.roll(xy, -1, axis=1)
-    crossing = (z > level) != (after_z > level)  # two edges of a triangle, or none
+    crossing = (z > level) != (after_z > level)  # true for two edges of a triangle, or for none
     share = (level - z[crossing]) / (after_z - z)[crossing]
     return (xy[crossing] + share[:, None] * (after_xy - xy)[crossing]).reshape(-1, 2, 2)
 

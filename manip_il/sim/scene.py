@@ -33,8 +33,8 @@ SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of a workspace that came
 # From the workspace's middle on the table; cameras look at a point over that, with a vertical field of view.
 _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
 _LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
-_ON_TABLE = 0.02  # distance of a robot's lowest point from the table's top at which it stands there [m]
-_PEDESTAL = 0.13  # half its width [m]
+_ON_TABLE = 0.02  # a robot stands on the table only if its lowest point is this near to the table's top [m]
+_PEDESTAL = 0.13  # half the pedestal's width [m]
 _SHADOW_SIZE = 1024  # the shadow map is the main cost on a software renderer
 
 

@@ -81,7 +81,7 @@ class Shape:
 
     @classmethod
     def of_width(cls, kind: str, width: float) -> Shape:
-        """Return a cube, a sphere, a cylinder as long as wide, or a capsule half as long again; raises `UsageError`."""
+        """Return a cube, a sphere, a cylinder as long as wide, or a capsule 1.5 times as long; raises `UsageError`."""
         return cls(kind, _lengths(kind, width))
 
     def __str__(self) -> str:
@@ -151,7 +151,7 @@ def draws_shape(text: str) -> bool:
 
 
 def stored(text: str) -> str:
-    """Return the text of an object as datasets have it: a mesh's has its file's name and hash, and no folder."""
+    """Return an object's text as datasets store it: for a mesh with its file's name and hash, but no folder."""
     mesh = Shape.parse(text).mesh if text else None
     return text if mesh is None else mesh.stored
 

@@ -21,8 +21,8 @@ Observed = Mapping[str, "F64 | float"]
 class Target(NamedTuple):
     """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
 
-    max_step: how far ahead of the hand its target may run [m]; max_turn: [rad]. exact: do not let the posture cost of
-    inverse kinematics pull the hand off its target by a millimetre, for fits tighter than that.
+    max_step: how far ahead of the hand its target may run [m]; max_turn: the same for its rotation [rad]. exact: do not
+    let the posture cost of inverse kinematics pull the hand off its target by a millimetre, for tighter fits.
     lean: how far the hand may lean from its rotation to reach its position, 0 to 1.
     """
 
@@ -120,7 +120,7 @@ class Task(Protocol):
         ...
 
     def error(self, world: World) -> float:
-        """Return how far the task is from being solved [m], which it is within the tolerance."""
+        """Return how far the task is from being solved [m]; within the tolerance it is solved."""
         ...
 
     def progress(self, world: World) -> float:

@@ -30,7 +30,7 @@ PER_OBJECT = 5
 _SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
 _OWN = -1.0  # no shape or colour is drawn: objects keep their own
 _WORLD: dict[str, tuple[float, ...]] = {  # after the objects' numbers: values if nothing is drawn
-    "shape": (_OWN,),  # else MuJoCo's geom type
+    "shape": (_OWN,),  # otherwise MuJoCo's geom type
     "joint_damping": (1.0,),
     "actuator_gain": (1.0,),
     "posture": (0.0,),
@@ -42,7 +42,7 @@ _WORLD: dict[str, tuple[float, ...]] = {  # after the objects' numbers: values i
     # States recorded before the side camera end here.
     "camera_shift.side": (0.0,) * 3,
     "camera_turn.side": (0.0,) * 3,
-    "clutter": (0.0, 0.0),  # how many things, and the seed of what they are and where
+    "clutter": (0.0, 0.0),  # number of things, and the seed of their kinds and places
 }
 _STARTS = np.cumsum([0, *map(len, _WORLD.values())]).tolist()
 _PLACES = {name: slice(*ends) for name, *ends in zip(_WORLD, _STARTS[:-1], _STARTS[1:], strict=True)}
@@ -176,14 +176,14 @@ def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, sh
         inertia = _inertia(kind, size, mass)
     changed.geom_type[geom], changed.geom_condim[geom] = kind, condim
     changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
-    # Of two geoms that touch, the larger friction counts unless one has priority, as the drawn one gets here.
+    # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn friction gets it.
     drawn = friction != plain.geom_friction[geom, 0]
     changed.geom_friction[geom, 0], changed.geom_friction[geom, 2] = friction, rolling
     changed.geom_priority[geom] = 1 if drawn else plain.geom_priority[geom]
 
 
 def extents(kind: int, size: F64) -> F64:
-    """Return the lengths of a geom along its own axes [m], (3,), from MuJoCo's `geom_size`; a mesh's are its box's."""
+    """Return the lengths of a geom along its own axes [m], (3,), from MuJoCo's `geom_size`; for a mesh, its box's."""
     geom = mujoco.mjtGeom
     if kind in (int(geom.mjGEOM_BOX), _MESH):
         return 2 * size

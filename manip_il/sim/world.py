@@ -192,9 +192,9 @@ class World:
         return yaw_ahead(self.robot, self.data.xanchor[self.scene.shoulder], position)
 
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
-        """Return the turns from straight ahead by which a hand at a position (3,) [m] can reach a yaw [rad].
+        """Return how far a hand at a position (3,) [m] may be turned from straight ahead to have a yaw [rad].
 
-        alike: a turn after which the grasp looks the same [rad].
+        alike: turn after which the grasp looks the same [rad].
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)

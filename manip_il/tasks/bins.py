@@ -20,7 +20,7 @@ DROP = 0.02  # height of an object's bottom over a box's floor at release [m]
 OVER_WALL = LiftProfile(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)  # over a box's wall
 OVER = 0.11  # height of the hand over an object on approach [m]
 AWAY = 0.2  # height of the hand over a box once its work there is done [m]
-_AT = (0.035, 0.05)  # the hand is still at an object in a box within this: sideways, above [m]
+_AT = (0.035, 0.05)  # offsets within which the hand is still at an object in a box: sideways, above [m]
 _RISE = 0.10  # height of the hand over an object after release [m]
 
 

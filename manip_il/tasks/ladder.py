@@ -29,8 +29,8 @@ AT_GRASP_ANGLE = 0.3  # [rad]
 EMPTY = 0.4  # share of a mesh's width below which the fingers have nothing between them
 LEAST_DEEP, DEEP_SHARE = 0.004, 0.15  # tolerated height over a mesh's grasp [m], and as a share of its height
 IN_HAND = (0.009, 0.020, 0.011)  # bounds on a held object's centre in the ee frame, x and z beyond half its size [m]
-RELEASE = 0.03  # opening beyond an object's width that releases it, if the hand opens so far [m]
-FREED = 0.4  # share of that at which it is free
+RELEASE = 0.03  # how much wider than an object the hand opens to release it, if it can [m]
+FREED = 0.4  # share of that extra opening at which the object is free
 AT_GOAL = 0.01  # [m]
 CLOSED = 0.0  # commanded opening of a hand that grips [m]
 _HALFWAY = 0.2  # distance left at which half of a part's progress is made [m]
@@ -138,7 +138,7 @@ def let_go(world: World, name: str, height: float) -> Target:
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
     up = world.pose(name).position[2] + height if free else ee.position[2]
     at = np.array([*ee.position[:2], up])
-    if world.gripper.lopsided:  # the fixed jaw leaves the object, as the moving one does
+    if world.gripper.lopsided:  # the fixed jaw also leaves the object
         along = g.offset[1] + world.gripper.middle(g.width) - world.gripper.middle(g.width + beyond)
         at[:2] += along * ee.rotation[:2, 1]
     return Target(at, hand_down(world.hand_yaw), g.width + beyond)

@@ -24,8 +24,8 @@ LOWEST = 0.024  # least height of the hand over the table at a lying peg [m]
 BACK = 0.05  # distance of a point behind the hand; the peg's end nearer to that point is the upper one [m]
 STANDS = 0.4  # tilt below which the peg stands and is grasped from above [rad]
 LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
-LEAN_BY_ROOM = 3.0  # limit of that lean per spare reach, as the wrist is farther out [rad/m]
-AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # error at which to close, to keep closing [m]
+LEAN_BY_ROOM = 3.0  # limit of that lean per spare reach, because the wrist is farther out [rad/m]
+AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # errors up to which to close, to keep closing [m]
 AT_ANGLE = 0.25  # [rad]
 OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # height over the grip on approach [m]; per error; tolerated error [m]
 BARE = 0.012  # how far a hand that holds the peg may be from its faces and ends [m]
@@ -33,9 +33,9 @@ ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg u
 LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m]; height per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
 SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
-FARTHER = 1.5  # factor on the distance that an exact move aims for, as the arm's weight stops it short
+FARTHER = 1.5  # factor on the distance that an exact move aims for, because the arm's weight stops it short
 TURN = 0.15  # largest lead of the target's rotation over the hand's, which need not wait for it to move [rad]
-LET_GO, RELEASE = 0.012, 0.03  # opening beyond the peg's width at which it is free, and to command [m]
+LET_GO, RELEASE = 0.012, 0.03  # opening beyond the peg's width: if the peg is free, and as commanded [m]
 CLEAR = 0.03  # clearance of the hand over the peg after release [m]
 ASIDE = (math.radians(55), math.radians(70))  # range of yaw, to either side, at which the hand sets the peg up [rad]
 NEAR_MIDDLE = 0.05  # largest distance from the workspace's middle along x at which the peg is set up [m]
@@ -81,7 +81,7 @@ def lower_end(world: World) -> F64:
 def upper_axis(world: World) -> F64:
     """Return the direction along the peg to its intended upper end, (3,).
 
-    Of a held peg that is the end that the hand points away from; of a lying peg the one away from the robot.
+    For a held peg this is the end that the hand points away from; for a lying peg, the one away from the robot.
     """
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]

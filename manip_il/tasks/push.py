@@ -22,8 +22,8 @@ PUCK_SIZE = (0.03, 0.02)  # radius, half its height [m]
 PUCK_MASS = 0.15  # [kg]
 PUSHING = (0.01, 0.12)  # range of the pushing hand's distance behind the puck's middle [m]
 BESIDE = 0.02  # largest distance of the pushing hand from the line through puck and goal [m]
-LOW = 0.004  # height of the pushing hand over its lowest [m]
-LOW_ENOUGH = 0.025  # height above that below which it pushes [m]
+LOW = 0.004  # height of the pushing hand over its lowest position [m]
+LOW_ENOUGH = 0.025  # the hand pushes below this height over `LOW` [m]
 ABOVE = 0.10  # height of the hand on its way around the puck [m]
 SLOPE = 2.0  # height of the hand per distance from its place behind the puck
 STEP = 0.03  # how far ahead of the hand its target runs while it pushes [m]
@@ -34,7 +34,7 @@ ROOM = 0.06  # reachable margin behind the puck at the start [m]
 class PushStyle(NamedTuple):
     """Dimensions of a pushing hand. behind: distance at which it starts behind the puck's middle [m].
 
-    opening: of the fingers, across the push, so that the puck rests against both [m]. touching: distance behind the
+    opening: that of the fingers across the push, so that the puck rests against both [m]. touching: distance behind the
     puck's middle at which it touches the puck [m]; lower: `LOW_ENOUGH` at the distance `behind` [m].
     """
 

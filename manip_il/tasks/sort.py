@@ -221,7 +221,7 @@ class Sort:
         return world.pose(BINS[asked(world)]).position
 
     def error(self, world: World) -> float:
-        """Return how far the named cube is from its bin's middle [m], 0 if it is in; more if another is in a bin."""
+        """Return how far the named cube is from its bin's middle [m], 0 if inside; more if another is in a bin."""
         name = asked(world)
         off = math.dist(world.pose(name).position, world.pose(BINS[name]).position)
         return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)

@@ -30,10 +30,10 @@ DOWN = 0.03  # sideways distance from the goal within which it may be lower, at 
 AHEAD = 3  # how far the descent looks ahead [cells]
 OUTSIDE = 0.12  # largest distance to a node with a path if none is nearby, at full scale [m]
 KEPT = 8  # plans cached per process
-_STEEP, _SHORT = 0.004, 0.3  # weights of the descent's mean: cost scale of a node's share [m]; price of near nodes
+_STEEP, _SHORT = 0.004, 0.3  # softmin over nodes: temperature as path length [m]; share of the price added to near ones
 _QUARTERS = np.array([0.25, 0.5, 0.75])  # shares of a line at which its room and its costs are evaluated
 _LOOK = 24  # most points of a snapped path, a quarter cell apart, that one edge may replace
-_SLACK = 0.003  # tolerated lack of room on the way from beside a node that has none to spare [m]
+_SLACK = 0.003  # lack of room that a line may have, because it may start beside a node with none to spare [m]
 _WORSE = 1e-4  # how much less room than at the start is tolerated on the way out of a tight place [m]
 
 

@@ -1,7 +1,7 @@
 """Layouts of `carry`: what stands on the table, and what a metre of path costs there, as pure geometry.
 
-Paths are those of the carried object's centre. Features are densities per metre of path, functions of a point alone; of
-a path of points, or an edge of the grid, they are integrated along it.
+Paths are those of the carried object's centre. Features are densities per metre of path, functions of a point alone;
+for a path of points, or an edge of the grid, they are integrated along it.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Reward:
     def parse(cls, text: str) -> Reward:
         """Return the reward that a text describes: a shipped one's name, a `reward.json`, or `NAME=NUMBER,...`.
 
-        Of a file only the lists `names` and `weights` are read. Raises `UsageError` for anything else.
+        Only the lists `names` and `weights` of a file are read. Raises `UsageError` for anything else.
         """
         if text in TASTES:
             return TASTES[text]

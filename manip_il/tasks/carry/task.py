@@ -47,12 +47,12 @@ APART = 0.22  # least sideways distance of the goal from the object at the start
 HIGHEST = 0.2  # greatest height of a goal over the object's resting height, at full scale [m]
 STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
 OVER, STEEP = 0.012, 8.0  # misalignment up to which an empty hand may be down beside obstacles [m]; slope beyond
-_DRAWS, _TOO_MANY = 4_000, 80  # draws of a start; after every so many, one more obstacle is left out
+_DRAWS, _TOO_MANY = 4_000, 80  # draws of a start, and draws after which one more obstacle is left out
 _GRASPED = 0.5  # progress of an object that is held
 SPARE = 0.008  # extra clearance at the start and at the goal [m]
 GAP = 0.02  # least gap between two obstacles, at full scale [m]
 BETWEEN, OFF = 0.8, 0.05  # share of obstacles between start and goal, and their standard deviation from that line [m]
-FROM_EDGE = (0.045, 0.09)  # range of the table edge's distance from the nearer of start and goal [m]
+FROM_EDGE = (0.045, 0.09)  # range of distances from the table's edge to the nearer of start and goal [m]
 TRIES = 40  # draws of an obstacle's place before the layout is drawn again
 _SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # sides that the edge may be on: away from the robot, left, right
 
@@ -187,7 +187,7 @@ class Carry(PickPlace):
         return TASTE_BODIES
 
     def progress(self, world: World) -> float:
-        """Return progress by the distance to the grasp, then by the cost-to-go as metres of path at the goal."""
+        """Return progress by the distance to the grasp, then by the cost-to-go over the cost of a metre at the goal."""
         if not held(world, OBJECT):
             return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
         if _at_goal(world):
@@ -206,7 +206,7 @@ def _draw_goal(rng: np.random.Generator, world: World, at: F64) -> F64:
 
 
 def _has_way(world: World, at: F64, goal: F64) -> bool:
-    """Whether a goal is away from the object, and the hand can carry it there over any obstacles."""
+    """Whether a goal is far enough from the object, and the hand can carry it there over any obstacles."""
     scale = scale_of(world.scene)
     if math.dist(at[:2], goal[:2]) < APART * scale or not world.reach.has(goal):
         return False

@@ -20,7 +20,7 @@ REACH = 0.032  # displacement of the gripper in one control step at an action of
 OPEN, CLOSE = 1.0, -1.0
 HALF = 0.025  # half the cube's edge length [m]
 
-# Pick and place; heights are of the gripper over the cube's middle
+# Pick and place; heights are the gripper's over the cube's middle
 GRASP_HEIGHT = 0.0145  # [m]
 CLEAR = 0.053  # height at which the fingers pass over the cube [m]
 STRADDLE = 0.042  # offset from the cube in y from which the gripper gets over it while descending [m]

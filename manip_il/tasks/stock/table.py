@@ -19,7 +19,7 @@ PHASES = ("none", "approach", "grasp", "carry", "push", "hold")
 
 @dataclass(frozen=True)
 class StockTask:
-    """One environment. has_object: the goal is a cube's, not the gripper's; blocked: the fingers stay closed."""
+    """One environment. has_object: the goal is for a cube, not the gripper; blocked: the fingers stay closed."""
 
     name: str
     instruction: str
@@ -156,7 +156,7 @@ ROBOTS = {
         ALOHA_NAMES,
         TWO_ARMS,
         400,  # as in LeRobot's environment; the one registered with gymnasium has 300
-        {"control_hz": 50, "tolerance": TOLERANCE, "success_steps": 1},  # its own reward tells when it is solved
+        {"control_hz": 50, "tolerance": TOLERANCE, "success_steps": 1},  # its own reward shows when it is solved
         OTHERS,
         ends_solved=True,
     ),

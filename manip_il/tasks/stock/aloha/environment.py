@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-# First: it chooses OpenGL before mujoco is imported.
+# Import this first: it chooses the OpenGL backend before mujoco is imported.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import F64, Observation, State

@@ -89,7 +89,7 @@ class _Arm:
         self._ik = PoseProgram(_alone(side), f"cali_{side}_site1", home, (ORIENTATION, POSTURE))
         self._gain = model.actuator_gainprm[joints, 0]
         self._breakaway = model.dof_frictionloss[joints] / self._gain  # lead at which a joint overcomes friction [rad]
-        # Below it joints creep, as MuJoCo's friction is soft: an impedance of 0.9 within 0.02 s.
+        # Below it joints creep, because MuJoCo's friction is soft: an impedance of 0.9 within 0.02 s.
         softness = self._gain * model.dof_invweight0[joints] * (0.1 / 0.9) * (CREEPS * constants.DT) / 2 * constants.DT
         self._creep = 1 - np.exp(-softness)  # step per lead [rad/rad]
 

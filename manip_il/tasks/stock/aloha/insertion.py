@@ -33,7 +33,7 @@ SLOPE, TOLERANCE = 8.0, 0.003  # funnel: retreat per sideways error of the peg, 
 ADVANCE = 0.05  # largest advance of the peg in a step [m]
 LOW, HIGH = 0.015, 0.055  # heights between which a lifted object begins to move sideways [m]
 INSERTED = 0.03  # longest step of a joint with the peg before the socket [rad]
-CARRIED = 0.04  # and before that [rad]
+CARRIED = 0.04  # longest step of a joint before that [rad]
 
 
 class Insertion(AlohaScene):

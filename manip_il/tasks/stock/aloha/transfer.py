@@ -34,7 +34,7 @@ KEPT_OFF, ARRIVED = 0.12, 0.02  # largest gap that the left hand keeps; cube's d
 LEFT_CLOSED = 0.025  # half the gap below which the left fingers hold it [m]
 OPENED, OPENING = 0.022, 0.004  # half the gap at which the right hand starts to leave, and the range to full [m]
 CLEAR = 0.12  # final distance of the right hand from the cube [m]
-CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest joint steps [rad]
+CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest joint steps: carrying, handing over, parting [rad]
 
 
 class Transfer(AlohaScene):
