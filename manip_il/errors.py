@@ -6,8 +6,10 @@ The command line prints a `ManipError` as one line on standard error and exits w
 from __future__ import annotations
 
 import difflib
+import traceback
 from collections.abc import Iterable
 
+OWN = "manip_il_own_"  # prefix of the modules of users' own files
 _MOST_OFFERED = 3  # names that an error suggests
 _LONGEST_PRINTED = 200  # [characters]
 
@@ -87,6 +89,16 @@ def nearest(name: str, known: Iterable[str], most: int = 1) -> str:
 def printable(text: str) -> str:
     """Escape control characters, which a terminal would obey, except line breaks and tabs."""
     return "".join(one if one.isprintable() or one in "\n\t" else repr(one)[1:-1] for one in text)
+
+
+def told(error: BaseException) -> str:
+    """Return an unexpected error as text, with file, line and function if a user's own file raised it."""
+    frames = [one for one in traceback.walk_tb(error.__traceback__) if one[0].f_globals["__name__"].startswith(OWN)]
+    text = f"{type(error).__name__}: {error}"
+    if not frames:
+        return text
+    frame, line = frames[-1]
+    return f"{frame.f_code.co_filename}, line {line} ({frame.f_code.co_name}): {text}"
 
 
 def shorten(value: object) -> str:

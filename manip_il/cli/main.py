@@ -19,7 +19,7 @@ from manip_il import __version__
 from manip_il.cli import progress
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import check_paths, parse
-from manip_il.errors import ManipError, UnknownName, UsageError, printable, silence_ffmpeg_warning
+from manip_il.errors import ManipError, UnknownName, UsageError, printable, silence_ffmpeg_warning, told
 
 PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
@@ -174,8 +174,6 @@ def _report(error: BaseException, words: list[str]) -> int:
     elif isinstance(error, OSError) and error.strerror and error.filename:
         text = f"error: {error.strerror}: {error.filename}"
     else:
-        from manip_il.tasks.table import told
-
         text = f"error: {told(error)}; run again with --debug for the traceback"
     print(f"{PROGRAM}: {' '.join(_clean(text, words).split())}", file=sys.stderr, flush=True)
     return code

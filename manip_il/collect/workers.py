@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING, Literal, Union
 
 from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError, UsageError, told
 from manip_il.mdp import Episode
-from manip_il.tasks.table import told
 
 if TYPE_CHECKING:
     from manip_il.collect.ray_pool import RayPool

@@ -9,7 +9,6 @@ import hashlib
 import importlib.util
 import inspect
 import sys
-import traceback
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -17,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from manip_il import checks
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import OWN, ManipError, UnknownName, UsageError
 from manip_il.sim.shape import Shape
 from manip_il.sim.task import TakesArgument, TakesShape, Task
 from manip_il.tasks.carry.task import Carry
@@ -32,7 +31,6 @@ from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
 
 SUFFIX = ".py"
-OWN = "manip_il_own_"  # prefix of the modules of users' files
 GROUP = "manip_il.tasks"  # entry points: a name, and a class that is a task
 _MEMBERS = (
     *("name", "instruction", "limits", "objects", "grasped", "sizes", "rungs"),
@@ -154,16 +152,6 @@ def _made(what: str, cls: Any) -> Task:
     except (ManipError, TypeError) as error:
         raise UsageError(str(error) if what in str(error) else f"{what}: {checks.one_line(error)}") from error
     return task
-
-
-def told(error: BaseException) -> str:
-    """Return an unexpected error as text, with file, line and function if a user's own file raised it."""
-    frames = [one for one in traceback.walk_tb(error.__traceback__) if one[0].f_globals["__name__"].startswith(OWN)]
-    text = f"{type(error).__name__}: {error}"
-    if not frames:
-        return text
-    frame, line = frames[-1]
-    return f"{frame.f_code.co_filename}, line {line} ({frame.f_code.co_name}): {text}"
 
 
 def _who(protocol: type) -> str:
