@@ -204,11 +204,14 @@ class EvalOptions(Tested, Seeded, Trusting):
 
 def machine() -> str:
     """Return the OpenGL renderer and the number of cores. Raises what an evaluation here would raise."""
+    import tempfile
+
     from manip_il.collect.workers import default_workers
     from manip_il.sim import render
     from manip_il.sim.config import CAMERAS, CameraConfig
     from manip_il.tasks.envs import make_env
 
+    tempfile.TemporaryFile().close()  # workers need a folder for temporary files
     env = make_env()
     env.start(0)
     render.pictures(env.scene, env.data, CameraConfig(CAMERAS))
