@@ -111,11 +111,16 @@ class ViewModel:
 
 @lru_cache(SCENES_KEPT)
 def _with_few_faces(scene: Scene) -> mujoco.MjModel:
-    model, finest = copy.copy(scene.model), min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL
+    model = copy.copy(scene.model)
+    simplify_meshes(model, min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL)
+    return model
+
+
+def simplify_meshes(model: mujoco.MjModel, finest: float) -> None:
+    """Reduce the faces of large meshes in a model that is only drawn. finest: least size of a cell [m]."""
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:
             _simplify(model, mesh, finest)
-    return model
 
 
 def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:

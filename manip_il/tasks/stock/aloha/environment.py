@@ -18,6 +18,7 @@ from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import REMEDY
+from manip_il.sim.view import simplify_meshes
 from manip_il.tasks.stock.aloha.ladder import AlohaScene
 from manip_il.tasks.stock.base import WHOLE, StockBase
 from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
@@ -27,6 +28,8 @@ MOST_REWARD = 4
 GRIPPERS = np.array([6, 13])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
 _DEEP = 1e-3  # tolerated overlap of a redrawn object [m]
+_COARSE = 240  # pictures up to this height are drawn from simpler meshes: 2 % of their pixels change by over 8 of 255
+_CELL, _SHADOWS = 0.004, 1024  # least size of such a mesh's cell [m]; size of the shadow map [pixels]
 _BLANK = np.zeros((1, 1, 3), np.uint8)
 
 
@@ -120,9 +123,9 @@ class AlohaEnv(StockBase):
 
     def _pictures(self) -> dict[str, NDArray[np.uint8]]:
         assert self._cameras is not None
-        painter = _painter(self.task.name)
-        painter.set_state(self.get_state())
         height, width = self._cameras.size
+        painter = _painter(self.task.name, fine=height > _COARSE)
+        painter.set_state(self.get_state())
         try:
             return {name: painter.draw(height=height, width=width, camera_id=name) for name in self._cameras.names}
         except Exception as error:  # what OpenGL and its bindings raise
@@ -130,9 +133,16 @@ class AlohaEnv(StockBase):
 
 
 @cache
-def _painter(task: str) -> AlohaEnv:
-    """The environment that draws a task's states in this process, so that one OpenGL context is enough."""
-    return AlohaEnv(task)
+def _painter(task: str, *, fine: bool) -> AlohaEnv:
+    """The environment that draws a task's states in this process, so that one OpenGL context is enough.
+
+    Unless `fine`, its meshes have fewer faces and its shadows are coarser, which is 3.5 times faster in software.
+    """
+    painter = AlohaEnv(task)
+    if not fine:
+        simplify_meshes(painter.model, _CELL)
+        painter.model.vis.quality.shadowsize = _SHADOWS
+    return painter
 
 
 def _gym_aloha() -> Any:
