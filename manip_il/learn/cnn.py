@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, interpolate
 
 from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, KEYPOINTS, STATE
@@ -94,7 +94,8 @@ class CNNPolicy(MLPPolicy):
     """LeRobot's policy interface to one `KeypointEncoder` per camera and an `MLPNetwork` on joints and keypoints.
 
     Batches hold the columns of the mlp's (`observation.environment_state` only if it is an input) and
-    `observation.images.<camera>` (B, 3, H, W), from 0 to 1.
+    `observation.images.<camera>` (B, 3, H, W), from 0 to 1, which are averaged if they are larger than those learnt
+    from: `lerobot-eval` gives an environment's own.
 
     dataset_meta: as for the mlp. In training, the environment state is then also predicted from the keypoints
     (`CNNConfig.aux_weight`), and named points of the scene have heat maps (`heatmap_weight`); each frame's ground truth
@@ -150,7 +151,9 @@ class CNNPolicy(MLPPolicy):
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
         """Return joint state, keypoints, the predicted state, and offsets at each scale, (B, d)."""
-        keypoints = [encoder(batch[key]) for encoder, key in zip(self.encoders, self.cameras, strict=True)]
+        keypoints = [
+            encoder(self._at_size(key, batch)) for encoder, key in zip(self.encoders, self.cameras, strict=True)
+        ]
         seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
         parts, around, config = [seen], batch.get(ENVIRONMENT_STATE), cast(CNNConfig, self.config)
         with torch.autocast(seen.device.type, enabled=False):
@@ -166,6 +169,11 @@ class CNNPolicy(MLPPolicy):
             if around is not None and self.offsets:
                 parts += [torch.tanh(around[:, self.offsets] / scale) for scale in config.scales]
             return torch.cat(parts, dim=-1)
+
+    def _at_size(self, key: str, batch: dict[str, Tensor]) -> Tensor:
+        """Return a camera's pictures (B, 3, H, W) at the size learnt from; larger ones are averaged."""
+        size = tuple((self.config.input_features or {})[key].shape[1:])
+        return batch[key] if batch[key].shape[2:] == size else interpolate(batch[key], size, mode="area")
 
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:

@@ -65,6 +65,12 @@ def make_batch(table, rows: int = 20, seed: int = 0) -> dict[str, torch.Tensor]:
     return batch | {"index": torch.arange(rows)}
 
 
+def test_larger_pictures_are_averaged(meta, table):
+    policy, batch = new_policy(meta).eval(), make_batch(table, rows=3)
+    larger = batch | {key: batch[key].repeat_interleave(3, 2).repeat_interleave(3, 3) for key in PICTURES}
+    assert torch.allclose(policy.select_action(larger), policy.select_action(batch), atol=1e-5)
+
+
 def test_a_spot_is_found_between_the_pixels_with_its_size():
     encoder = KeypointEncoder((1, 1), keypoints=1)
     with torch.no_grad():
