@@ -19,7 +19,7 @@ from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
-from manip_il.tasks.stock.aloha.ladder import AlohaScene
+from manip_il.tasks.stock.aloha.ladder import AlohaScene, read_hand
 from manip_il.tasks.stock.base import WHOLE, StockBase
 from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
 
@@ -27,7 +27,8 @@ INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6
 MOST_REWARD = 4
 GRIPPERS = np.array([6, 13])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
-_DEEP = 1e-3  # tolerated overlap of a redrawn object [m]
+_DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
+_STAYS, _ELSEWHERE = 0.4, 0.08  # chance that an arm stays; largest standard deviation of its joints if not [rad]
 _COARSE = 240  # pictures up to this height are drawn from simpler meshes: 2 % of their pixels change by over 8 of 255
 _CELL, _SHADOWS = 0.004, 1024  # least size of such a mesh's cell [m]; size of the shadow map [pixels]
 _BLANK = np.zeros((1, 1, 3), np.uint8)
@@ -100,26 +101,44 @@ class AlohaEnv(StockBase):
         return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
 
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
-        """Return a state with new places for the objects that no finger touches; None if these overlap something."""
+        """Return a state with new places for what rests untouched on the table, and arms that are somewhat elsewhere.
+
+        A hand takes along what it carries. None if anything overlaps.
+        """
         self.set_state(state)
-        scene, moved = self.scene(), list[int]()
         self._env.reset(seed=int(rng.integers(2**32)))
         fresh = self.data.qpos.copy()
         self.set_state(state)
-        for name in self.task.objects:
-            if not any(touch for side in scene.hands for touch in scene.touches(side, name)):
-                joint = self.model.body(name).jntadr[0]
-                at, speed = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint]
-                if scene.on_table(name):
-                    self.data.qpos[at : at + 2] = fresh[at : at + 2]
-                    self.data.qvel[speed : speed + 6] = 0
-                    moved.append(self.model.body(name).id)
+        scene = self.scene()
+        holders = {name: [side for side in scene.hands if any(scene.touches(side, name))] for name in self.task.objects}
+        for name, sides in holders.items():
+            if not sides and scene.on_table(name):
+                at, speed = self._free(name)
+                self.data.qpos[at : at + 2] = fresh[at : at + 2]
+                self.data.qvel[speed : speed + 6] = 0
+        for number, (side, hand) in enumerate(scene.hands.items()):
+            held = [name for name, sides in holders.items() if side in sides]
+            if rng.random() < _STAYS or any(len(holders[name]) > 1 or scene.on_table(name) for name in held):
+                continue
+            self.data.qpos[8 * number : 8 * number + 6] += rng.normal(0.0, _ELSEWHERE * rng.uniform() ** 2, 6)
+            mujoco.mj_kinematics(self.model, self.data)
+            moved = read_hand(side, number, self.data)
+            turn = moved.rotation @ hand.rotation.T
+            for name in held:
+                at, _ = self._free(name)
+                self.data.qpos[at : at + 3] = moved.position + turn @ (scene.things[name].position - hand.position)
+                quat = np.empty(4)
+                mujoco.mju_mat2Quat(quat, (turn @ scene.things[name].axes).ravel())
+                self.data.qpos[at + 3 : at + 7] = quat
         mujoco.mj_forward(self.model, self.data)
-        contact = self.data.contact
-        bodies = self.model.geom_bodyid[contact.geom]
-        if (np.isin(bodies, moved).any(axis=1) & (contact.dist < -_DEEP)).any():
+        if (self.data.contact.dist < -_DEEP).any():
             return None
         return replace(state, physics=self._physics())
+
+    def _free(self, name: str) -> tuple[int, int]:
+        """Addresses of an object's pose in `qpos` and of its velocity in `qvel`."""
+        joint = self.model.body(name).jntadr[0]
+        return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
 
     def _pictures(self) -> dict[str, NDArray[np.uint8]]:
         assert self._cameras is not None

@@ -84,7 +84,7 @@ class AlohaScene:
 
     def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
         self.task, self._model = task, model
-        self.hands = {side: _hand(side, number, data) for number, side in enumerate(SIDES)}
+        self.hands = {side: read_hand(side, number, data) for number, side in enumerate(SIDES)}
         self.left, self.right = self.hands.values()
         bodies = {name: data.body(name) for name in task.objects}
         self.things = {
@@ -174,7 +174,8 @@ def pitched(across: F64, pitch: float) -> F64:
     return ahead_across(math.cos(pitch) * cross(y, Z) - math.sin(pitch) * Z, y)
 
 
-def _hand(side: str, number: int, data: mujoco.MjData) -> Hand:
+def read_hand(side: str, number: int, data: mujoco.MjData) -> Hand:
+    """Return a hand as it is in `data`. number: 0 for the left one, 1 for the right one."""
     *q, one, other = data.qpos[8 * number : 8 * number + 8].tolist()
     site, gap = data.site(f"cali_{side}_site1"), 0.5 * (one - other) - FINGER_AT_TOUCH
     rotation, outward = site.xmat.reshape(3, 3).copy(), Y if side == "left" else -Y
