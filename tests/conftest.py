@@ -59,7 +59,6 @@ LONG = (
     "doctor/test_planted.py",
     "cli/test_commands.py",
     "faults/test_kills.py",
-    "lerobot_commands/test_datasets.py",
     "collect/test_workers.py",
     "lerobot_commands/test_pictures.py",
     "evaluation/test_runner.py",
@@ -116,8 +115,8 @@ def start() -> Callable[..., ForkServerProcess]:
     """Starts a command in a process of its own within milliseconds: what it imports is loaded once."""
     context = multiprocessing.get_context("forkserver")
 
-    def begin(*words: str, log: Path, warm: bool = False) -> ForkServerProcess:
-        process = context.Process(target=run_command, args=(words, str(log), warm))
+    def begin(*words: str, log: Path, warm: bool = False, largest_file: int = 0) -> ForkServerProcess:
+        process = context.Process(target=run_command, args=(words, str(log), warm, largest_file))
         process.start()
         return process
 

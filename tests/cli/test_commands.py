@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +20,6 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.results import EvalResult
 
-from ..damage import edit_table
 from .made_runs import files
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -97,14 +94,6 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
     assert process.returncode == 130
     assert "kept: every finished episode" in err
     assert err.rstrip().endswith("continue with --resume=true")
-
-
-def test_train_refuses_a_dataset_with_nan(demos, tmp_path, error):
-    broken = shutil.copytree(demos, tmp_path / "broken")
-    [path] = broken.glob("data/*/*.parquet")
-    edit_table(path, lambda columns: columns["action"][5].__setitem__(0, math.nan))
-    assert main(["train", f"--dataset.root={broken}", f"--output_dir={tmp_path / 't'}"]) == 1
-    assert "column action: nan at frame 5" in error()
 
 
 def test_train_to_eval(policy, tmp_path, capsys, error):

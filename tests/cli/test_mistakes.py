@@ -7,8 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import manip_il
 from manip_il import __version__
 from manip_il.cli.main import COMMANDS, GROUPS
@@ -61,12 +59,6 @@ def test_a_mistyped_command_or_option_imports_nothing_heavy(tmp_path):
         assert (code, err.count("\n"), err.startswith("manip-il: error: ")) == (2, 1, True)
 
 
-def test_a_dataset_that_does_not_fit_is_named_before_lerobot_and_the_simulator_are_imported(tmp_path):
-    words = ["train", f"--dataset.root={SAMPLE}", "--observation=images", "--policy.type=act"]
-    [(_, code, _, err)] = answers([words], tmp_path, ["torch", "lerobot", "mujoco", "mink", "scipy"])
-    assert (code, "the dataset has no pictures, which --observation=images needs" in err) == (1, True)
-
-
 TRAIN, EXPERT = "train --dataset.root=SAMPLE", "eval --policy.type=expert"
 MISTAKES = {
     "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: data build, ",
@@ -114,18 +106,10 @@ def test_a_mistake_is_one_line_with_the_nearest_name_and_leaves_nothing(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "imports",
-    [
-        "import manip_il, gymnasium",
-        "import gymnasium, manip_il",
-        "import manip_il.sim.env, manip_il; from gymnasium import spaces; import gymnasium",
-    ],
-)
-def test_the_environments_are_registered_in_whatever_order_one_imports(imports: str):
-    code = f"{imports}; print(gymnasium.spec('manip_il/PandaPickPlace-v0').entry_point, gymnasium.__spec__.loader)"
+def test_the_environments_are_registered_whatever_is_imported_first():
+    code = "import gymnasium, manip_il; print(gymnasium.spec('manip_il/PandaPickPlace-v0').entry_point)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("manip_il.tasks.envs:make_env <_frozen_importlib_external.SourceFileLoader")
+    assert done.stdout == "manip_il.tasks.envs:make_env\n"
 
 
 def test_the_package_shows_what_a_user_wants_and_alone_loads_no_simulator():

@@ -95,15 +95,6 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
 EVAL = ["eval", "--policy.type=expert", "--robot.type=fetch", "--task.type=reach", "--workers=1"]
 
 
-def test_a_folder_that_holds_something_is_refused(here, error):
-    words = [*EVAL, f"--output_dir={here / 'full'}"]
-    write_file(here / "full" / "thesis.tex", b"years of work")
-    assert main(words) == 2
-    assert "full already exists; " in error()
-    assert main([*words, "--overwrite=true"]) == 2
-    assert "did not make" in error()
-
-
 @pytest.mark.parametrize("how", ["", "--overwrite=true"])
 def test_a_folder_that_is_in_use_is_refused(how, here, error):
     out = here / "out"

@@ -69,18 +69,6 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
     assert not (target / "thesis.txt").exists()
 
 
-def test_no_password_and_no_token_is_said_again(url, run, capsys):
-    for words in (
-        ["pull", url, "got", "hf_HunterTwoHunterTwo"],
-        ["hunter2://me:hunter2@host"],
-        ["record", "--seed=sftp://me:hunter2@host/x", "--debug"],
-    ):
-        assert main(words) == 2
-        captured = capsys.readouterr()
-        for secret in (":hunter2", "HunterTwo"):
-            assert secret not in captured.out + captured.err
-
-
 def test_a_traceback_of_any_error_is_cleaned(run, url, monkeypatch, capsys):
     def fail(words: object):
         raise RuntimeError(

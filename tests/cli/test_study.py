@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from pathlib import Path
 
 import pytest
@@ -29,22 +28,6 @@ training_seeds: 2
 eval: {n_episodes: 2}
 at: labels
 target: 0.6
-"""
-TINY = """
-common:
-  task: {type: reach}
-  env: {horizon: 30}
-  demonstrations: 2
-  rounds: 1
-  episodes_per_round: 2
-  steps: 30
-  policy: {width: 16}
-  validation_episodes: 2
-arms:
-  cloning: {method: cloning}
-  dagger: {}
-training_seeds: 1
-eval: {n_episodes: 4}
 """
 
 
@@ -153,39 +136,6 @@ def test_arms_of_different_tasks_have_no_baseline_and_each_its_own_environment(h
     (here / "x.yaml").write_text(text + "baseline: lift\n")
     with pytest.raises(MismatchError, match="task differs: cloning has reach, lift has lift"):
         read_plan(here / "x.yaml", None)
-
-
-@pytest.mark.slow
-def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path):
-    (tmp_path / "x.yaml").write_text(TINY)
-    words = ["compare", str(tmp_path / "x.yaml"), "--workers=1"]
-    process = start(*words, f"--output_dir={tmp_path / 'cut'}", log=tmp_path / "log")
-    while process.is_alive() and not (tmp_path / "cut" / "dagger" / "seed_0" / "metrics.jsonl").is_file():
-        time.sleep(0.005)
-    process.kill()
-    process.join()
-    done = (tmp_path / "cut" / "cloning" / "seed_0" / "metrics.jsonl").read_bytes()
-    assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true"]) == 0
-    assert (tmp_path / "cut" / "cloning" / "seed_0" / "metrics.jsonl").read_bytes() == done
-    assert main([*words, f"--output_dir={tmp_path / 'whole'}"]) == 0
-    assert answer(tmp_path / "cut") == answer(tmp_path / "whole")
-    left, right = tmp_path / "cut" / "cloning", tmp_path / "whole" / "dagger"
-    compared = ["compare", str(left), str(right), "--eval.n_episodes=4", "--workers=1"]
-    assert main([*compared, f"--output_dir={tmp_path / 'c'}"]) == 0
-    assert (tmp_path / "c" / "report.html").is_file()
-
-
-def answer(folder: Path):
-    """What a study found, without times and places."""
-    data = json.loads((folder / "compare.json").read_text())
-    gone = ("seconds", "name", "policy")
-
-    def strip(value):
-        if isinstance(value, dict):
-            return {key: strip(inner) for key, inner in value.items() if key not in gone}
-        return [strip(inner) for inner in value] if isinstance(value, list) else value
-
-    return strip(data)
 
 
 def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_path):

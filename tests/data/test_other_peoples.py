@@ -168,21 +168,3 @@ def test_depth_is_left_out(tmp_path):
     check(root, tmp_path / "run")
     config = json.loads((tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text())
     assert set(config["input_features"]) == {"observation.state", TOP}
-
-
-def test_episodes_deleted_and_merged_by_lerobots_tools(recorded, tmp_path):
-    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    whole: Any = LeRobotDataset("a/b", root=recorded)
-    fewer: Any = delete_episodes(whole, [1], output_dir=tmp_path / "fewer", repo_id="a/fewer")
-    merge_datasets([whole, fewer], "a/merged", output_dir=tmp_path / "merged")
-    pictures = Dataset.open(recorded).camera(TOP)
-    row = np.arange(pictures.frames)
-    kept = np.concatenate([row, row[:12], row[25:]])
-    merged = Dataset.open(tmp_path / "merged")
-    assert len({part.path for part in merged.camera(TOP).parts}) == 1  # a video of several episodes
-    distance = merged.camera(TOP).rows(np.arange(len(merged))).astype(int) - pictures.rows(kept)
-    assert np.abs(distance).mean() < 20  # what was deleted has the rest encoded again
-    for name in ("fewer", "merged"):
-        check(tmp_path / name, tmp_path / f"run_{name}")

@@ -20,9 +20,6 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.dataset import Dataset
 from manip_il.store.cards import write_cards
 
-from ..damage import digests
-from ..data.test_other_peoples import DEPTH, NAMES, SIZE, record
-
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 PACKAGE, SAMPLE = ROOT / "manip_il", ROOT / "datasets" / "sample"
@@ -68,12 +65,3 @@ def test_a_dataset_that_lerobots_tools_changed_goes_through_every_command(change
     assert main(["push", str(new), f"file://{tmp_path}/store"]) == 0
     assert Dataset.open(new).instruction == TEXT
     assert TEXT in write_cards(root, "dataset", "a/b", tmp_path)["README.md"].read_text()
-
-
-@pytest.mark.parametrize("kind", ["image", "video"])
-def test_depth_in_lerobots_formats_is_whole_and_comes_back(tmp_path: Path, kind: str):
-    depth = {"dtype": kind, "shape": (*SIZE, 1), "names": NAMES, "info": {"is_depth_map": True}}
-    root, url = record(tmp_path / "depth", ["fold"] * 3, **{DEPTH: depth}), f"file://{tmp_path}/store"
-    for words in (("data", "check", root), ("push", root, url), ("pull", url, tmp_path / "got")):
-        assert main([*map(str, words)]) == 0
-    assert digests(tmp_path / "got") == digests(root)

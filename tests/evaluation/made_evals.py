@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +49,6 @@ def made_eval(
         episodes.append(EpisodeResult(FIRST_SEED + number, not failed, not failed, 100, -20.0, phase, detail))
     fingerprint = {"mujoco": "3.11.0", "model_sha256": "ab" * 32}
     return EvalResult(policy, "panda", "pick_place", fingerprint, tuple(episodes), EvalSettings(100, 0.02))
-
-
-def without_detail(result: EvalResult) -> EvalResult:
-    """As a file of an older version tells it."""
-    return replace(result, episodes=tuple(replace(e, detail={}, phase_at_end="") for e in result.episodes))
 
 
 def made_pair(left: Fails, right: Fails, seeds: int = 1) -> Study:

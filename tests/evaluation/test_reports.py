@@ -13,7 +13,7 @@ from manip_il.evaluation.report import Film
 from manip_il.evaluation.rounds import history
 from manip_il.evaluation.tables import CLONING, PolicyRow
 
-from .made_evals import far_corner, made_eval, made_pair, without_detail
+from .made_evals import far_corner, made_eval, made_pair
 from .page import EVIL, Page, page_of
 from .test_rounds import RUN, records
 
@@ -81,16 +81,6 @@ def test_a_comparison_tells_which_is_better_where_they_fail_and_each_condition()
     rows = {row[0]: row[1:] for row in knocked.condition_table().rows}
     assert rows["knocked"] == ("0.0 %", "100.0 %")
     assert rows["nominal"] == ("100.0 %", "100.0 %")
-
-
-def test_without_histories_and_details_the_numbers_alone_are_left():
-    def bare(arm: Arm) -> Arm:
-        members = (replace(one, history=(), chosen=None, result=without_detail(one.test)) for one in arm.members)
-        return replace(arm, members=tuple(members))
-
-    report = compare_report(replace(SELDOM, arms=tuple(map(bare, SELDOM.arms))), "t", COMMAND)
-    assert [section.heading for section in report.sections] == ["Results"]
-    assert "runs/dagger is better" in page_of(report).text
 
 
 def test_whatever_comes_from_outside_is_escaped():

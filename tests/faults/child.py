@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import os
+import resource
 import sys
 from collections.abc import Sequence
 from multiprocessing import util
 from typing import Any
 
 
-def run_command(words: Sequence[str], log: str, warm: bool = False) -> None:
+def run_command(words: Sequence[str], log: str, warm: bool, largest_file: int) -> None:
     """In a child: one command, as from a shell, in a session of its own, with all that it says in the file `log`.
 
-    warm: what its workers are forked from has loaded everything, as this process has.
+    warm: what its workers are forked from has loaded everything, as this process has. largest_file: how large a file
+    may get [bytes], 0 for any size; the kernel then refuses to write as it does when a disk is full.
     """
     from manip_il.cli.main import main
 
@@ -20,6 +22,8 @@ def run_command(words: Sequence[str], log: str, warm: bool = False) -> None:
     say_into(log)
     if warm:
         fork_instead_of_spawning()
+    if largest_file:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
     sys.exit(main(words))
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +16,8 @@ from manip_il.errors import ManipError
 from manip_il.mcap.importing import import_files, pick, read_frames
 from manip_il.mcap.mapping import TopicSource
 
-from ..damage import digests
 from ..pictures import encoded
 from .use import feature, load, ramp, write
-
-STEADY = range(0, 1000, 100)
 
 
 def test_topics_of_other_rates_meet_on_the_datasets_clock(tmp_path: Path) -> None:
@@ -90,21 +84,6 @@ def test_every_frame_gets_what_a_full_search_finds(method: Any, stamps, later, t
             pick("f, topic /t", source, *arrays)
     else:
         assert [stamps[number] for number in pick("f", source, *arrays)] == wanted
-
-
-@pytest.mark.slow
-def test_two_imports_give_the_same_bytes(tmp_path: Path) -> None:
-    big = np.zeros((64, 64, 3), np.uint8)
-    pictures = [(stamp, CompressedImage(format="png", data=encoded(big + stamp // 10))) for stamp in STEADY]
-    path = write(tmp_path / "a.mcap", {"/a": ramp(STEADY), "/c": pictures})
-    camera = {"topic": "/c", "resample": "nearest", "tolerance": 0.02}
-    stills, film = {**camera, "video": False}, {**camera, "video": True}
-    load(tmp_path, {"action": feature(), "observation.images.a": stills, "observation.images.b": film})
-    for seed in ("1", "2"):  # of the order of sets
-        words = ["data", "from-mcap", str(path), str(tmp_path / seed), f"--mapping={tmp_path}/m.yaml"]
-        command = [sys.executable, "-m", "manip_il.cli.main", *words]
-        subprocess.run(command, check=True, env={**os.environ, "PYTHONHASHSEED": seed})
-    assert digests(tmp_path / "1") == digests(tmp_path / "2")
 
 
 @pytest.mark.slow

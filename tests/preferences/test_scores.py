@@ -62,16 +62,3 @@ def test_frames_weigh_by_how_their_episode_ends(scored, tmp_path):
     assert (weights[inner] == scored.succeeded.repeat(data.lengths)[inner]).all()
     assert pq.read_table(path)["score"].to_numpy() == pytest.approx(scored.frames, abs=1e-6)
     assert [one["kept"] for one in scored.to_json()["episodes"]] == [True] * 8 + [False] * 8
-
-
-def test_lerobot_weights_a_batch_by_the_file(scored, tmp_path):
-    from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
-
-    write_weights(tmp_path / "rabc.parquet", scored)
-    config = SampleWeightingConfig(progress_path=str(tmp_path / "rabc.parquet"))
-    policy = type("Policy", (), {"config": type("Config", (), {"chunk_size": 10})()})()
-    weighter = make_sample_weighter(config, policy, torch.device("cpu"))
-    weights, stats = weighter.compute_batch_weights({"index": torch.tensor([0, 5, len(scored.frames) - 20])})
-    assert stats["num_zero_weight"] == 1
-    assert weights[2] == 0
-    assert weights[:2].tolist() == pytest.approx([1.5, 1.5], abs=1e-4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from manip_il.robots.table import get_robot
 from manip_il.tasks.grasp import LEAN
 
 from ..tables import every_robot
-from .own import ARM, JAWS, tree_of, write
+from .own import model_of, write
 
 CELL = 0.05  # of a map [m]
 rng = np.random.default_rng(0)
@@ -142,10 +143,6 @@ def solved(monkeypatch, tmp_path: Path) -> list[str]:
     return names
 
 
-def kept(tmp_path: Path) -> list[Path]:
-    return sorted((tmp_path / "cache" / "manip_il").glob("*"))
-
-
 def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypatch, tmp_path: Path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(reach, "_BEYOND", -0.05)  # a map of a few points
@@ -156,40 +153,19 @@ def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("file", "change", "maps"),
+    ("change", "maps"),
     [
-        ("own.xml", lambda text: text.replace("-2.9 2.9", "-2.9 2.8"), 2),
-        ("parts/wrist.xml", lambda text: text.replace("0.02", "0.03"), 2),
-        ("parts/foot.obj", lambda text: text.replace("v 1", "v 2"), 2),
-        ("own.xml", lambda text: f"{text}<!-- later -->", 1),
-        ("own.xml", lambda text: text, 1),  # the same robot elsewhere
+        (lambda text: text.replace("-2.9 2.9", "-2.9 2.8"), 2),
+        (lambda text: f"{text}<!-- later -->", 1),
+        (lambda text: text, 1),  # the same robot elsewhere
     ],
 )
-def test_another_model_or_yaml_has_a_map_of_its_own(file: str, change, maps: int, solved: list[str], tmp_path: Path):
-    for folder in (tmp_path / "one", tmp_path / "other"):
-        path = in_parts(folder)
-        if folder.name == "other":
-            (folder / file).write_text(change((folder / file).read_text() if (folder / file).is_file() else ""))
-        read_again(get_robot(str(path)))
+def test_another_model_has_a_map_of_its_own(change: Callable[[str], str], maps: int, solved: list[str], tmp_path: Path):
+    for folder, text in ((tmp_path / "one", model_of()), (tmp_path / "other", change(model_of()))):
+        folder.mkdir()
+        read_again(get_robot(str(write(folder, model=text))))
     assert solved == ["own"] * maps
-    assert len(kept(tmp_path)) == maps
-
-
-def in_parts(folder: Path) -> Path:
-    """Write an arm whose model includes a file, which names a mesh, and whose gripper has a model of its own."""
-    for name in ("parts", "pictures"):
-        (folder / name).mkdir(parents=True)
-    corners = ["v 0 0 0", "v 1 0 0", "v 0 1 0", "v 0 0 1"]
-    triangles = ["f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"]
-    (folder / "parts" / "foot.obj").write_text("\n".join([*corners, *triangles]))
-    wrist, mesh = '<geom type="sphere" size="0.02" mass="0.2"/>', '<mesh name="foot" file="foot.obj" scale=".1 .1 .1"/>'
-    arm, fingers = ARM.replace("FINGERS", ""), JAWS["slides"][0]
-    arm = arm.replace("</asset>", f"</asset><asset>{mesh}</asset>").replace(wrist, '<include file="wrist.xml"/>')
-    arm = arm.replace('<body name="base">', '<body name="base"><geom type="mesh" mesh="foot" contype="0"/>')
-    (folder / "parts" / "wrist.xml").write_text(f"<mujoco>{wrist}</mujoco>")
-    (folder / "parts" / "pad.xml").write_text(f"<mujoco><worldbody>{fingers}</worldbody></mujoco>")
-    gripper = tree_of()["gripper"] | {"model": "parts/pad.xml"}
-    return write(folder, tree=tree_of() | {"gripper": gripper, "includes": "parts"}, model=arm)
+    assert len(list((tmp_path / "cache" / "manip_il").iterdir())) == maps
 
 
 def test_a_link_in_place_of_a_map_is_not_written_to(own: Robot, solved: list[str], tmp_path: Path):

@@ -15,7 +15,7 @@ from manip_il.store.transfer import open_remote, pull, push
 from .conftest import content, make_run
 from .servers import talk_to
 
-KILLS = int(os.environ.get("MANIP_IL_KILLS", "3"))  # in each direction, on each kind of remote
+KILLS = int(os.environ.get("MANIP_IL_KILLS", "3"))  # of each push and pull
 
 
 def work(do: str, url: str, folder: Path, environment: dict[str, str], begun: Path) -> None:
@@ -29,8 +29,13 @@ def work(do: str, url: str, folder: Path, environment: dict[str, str], begun: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("do", ["push", "pull"])
+@pytest.mark.parametrize(
+    ("do", "place"),
+    [("push", "file"), ("push", "s3"), ("push", "sftp"), ("push", "hub"), ("pull", "file")],
+    indirect=["place"],
+)
 def test_a_killed_transfer(do: str, place: str, request: pytest.FixtureRequest, tmp_path: Path):
+    """A pull ends with one rename on this machine, wherever it came from."""
     if place.startswith("hf://"):
         os.environ["HUB_OF_THE_TEST"] = request.getfixturevalue("hub").url
     context, rng, killed = multiprocessing.get_context("forkserver"), np.random.default_rng(7), 0
