@@ -1,9 +1,9 @@
-"""Find on a robot's model what its YAML may omit: joints, motors, the hand's frame, a posture to start from."""
+"""Find on a robot's model what its YAML may omit: motors, the hand's frame, a posture to start from."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,11 +12,10 @@ import numpy as np
 
 from manip_il.errors import UsageError
 from manip_il.mdp import F64
-from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import Body, at_tip, nearest, outline
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.robot import EndEffector, Robot, costs_of, yaw_of
+from manip_il.robots.robot import EndEffector, Robot
 from manip_il.robots.rotations import hand_down, rotation_vector
 from manip_il.robots.spec import arm_spec, bare_spec, require
 
@@ -40,59 +39,28 @@ _ENOUGH = (0.5, 0.15, 0.25)  # sufficient margin to a limit [rad], smallest sing
 _DIGITS = 4
 
 
-def complete(said: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a YAML's fields, missing ones found on the model. Raises `UsageError` if one cannot be found."""
-    said = dict(said)
-    spec = bare_spec(said["name"], said["files"], said["hand"], said["gripper"])
-    joints = said.setdefault("joints", arm_joints(said["name"], spec, said["hand"], said["gripper"].joints))
-    require(said["name"], "joint", joints, spec.joints)
-    said.setdefault("costs", costs_of(len(joints)))
-    said.setdefault("yaw", yaw_of(len(joints)))
-    forces, armature = motor_limits(said["name"], said["files"], spec, joints)
-    said.setdefault("forces", forces)
-    said.setdefault("armature", armature)
-    lacking = [name for name in ("ee", "home", "gains") if name not in said]
-    provisional: dict[str, Any] = {
+def complete(said: Mapping[str, Any]) -> Robot:
+    """Return the robot of a YAML's fields, missing ones found on the model. Raises `UsageError` if one is not found."""
+    files, names = said["files"], said["joints"]
+    spec = bare_spec(said["name"], files, said["hand"], said["gripper"])
+    require(said["name"], "joint", names, spec.joints)
+    joints = [spec.joint(name) for name in names]
+    whole = files.load(said["name"])  # keep a reference: MuJoCo's views of a spec do not keep it alive
+    motors = {one.target: one for one in whole.actuators}
+    found: dict[str, Any] = {
+        "forces": tuple(_greatest_torque(motors.get(joint.name), joint) for joint in joints),
+        "armature": tuple(float(joint.armature) or ARMATURE for joint in joints),
+        # For now:
         "ee": EndEffector(said["hand"], (0.0, 0.0, 0.0)),
         "home": (0.0,) * len(joints),
         "gains": (1.0,) * len(joints),
     }
-    robot = Robot(**(provisional | said))
-    if "ee" in lacking:
+    robot = Robot(**{**found, **said})
+    if "ee" not in said:
         robot = replace(robot, ee=find_ee(robot))
-    if "home" in lacking:
-        robot = find_home(robot, turns="ee" in lacking)
-    if "gains" in lacking:
-        robot = replace(robot, gains=find_gains(robot))
-    return said | {name: getattr(robot, name) for name in ("ee", "home", "gains")}
-
-
-def arm_joints(robot: str, spec: mujoco.MjSpec, hand: str, gripper: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the hinges between the base and the hand. Raises `UsageError` if there are none.
-
-    robot: its name, for messages. gripper: joints that are not the arm's.
-    """
-    require(robot, "body", (hand,), spec.bodies)
-    joints: list[str] = []
-    body = spec.body(hand)
-    while body.name != "world":
-        hinges = [one for one in body.joints if one.type == mujoco.mjtJoint.mjJNT_HINGE]
-        joints[:0] = [one.name for one in hinges if one.name not in gripper]
-        body = body.parent
-    if not joints:
-        raise UsageError(f"robot {robot}: there is no hinge between the base and hand {hand!r}; check hand")
-    return tuple(joints)
-
-
-def motor_limits(
-    robot: str, files: ModelFiles, spec: mujoco.MjSpec, joints: Sequence[str]
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the greatest torques [N m] and the armatures [kg m^2] of joints, from the model."""
-    whole = files.load(robot)  # keep a reference: MuJoCo's views of a spec do not keep it alive
-    motors = {one.target: one for one in whole.actuators}
-    forces = [_greatest_torque(motors.get(name), spec.joint(name)) for name in joints]
-    armature = [float(spec.joint(name).armature) or ARMATURE for name in joints]
-    return tuple(forces), tuple(armature)
+    if "home" not in said:
+        robot = find_home(robot, turns="ee" not in said)
+    return robot if "gains" in said else replace(robot, gains=find_gains(robot))
 
 
 def _greatest_torque(motor: mujoco._specs.MjsActuator | None, joint: mujoco._specs.MjsJoint) -> float:

@@ -18,8 +18,7 @@ RATE = 20  # default control steps per second
 _MOST_HZ = 500
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
-FOUND = ("joints", "home", "gains", "forces", "armature", "ee")  # found on the model if the YAML does not give them
-UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
+FOUND = ("home", "gains", "forces", "armature", "ee")  # found on the model if the YAML does not give them
 YAWS = ("world", "shoulder")
 WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, in the frame `ee` [m]
 
@@ -61,9 +60,6 @@ class GripperConfig:
         require_lengths(self, closed=len(self.joints), open=len(self.joints))
         if len(self.fingers) < 2:
             raise ManipError(f"fingers names {len(self.fingers)} bodies; expected two or more")
-        for joint, at, to in zip(self.joints, self.closed, self.open, strict=True):
-            if at == to:
-                raise ManipError(f"closed and open are both {at:g} for joint {joint!r}; expected two positions")
 
 
 @dataclass(frozen=True)
@@ -133,14 +129,12 @@ class LeRobotConfig:
 
     robot_type: str
     names: tuple[str, ...]
-    gripper: tuple[float, ...]
+    gripper: tuple[float, float]
     fps: int = RATE
 
     def __post_init__(self) -> None:
         checks.name("robot_type", self.robot_type)
         checks.whole("fps", self.fps, 1, _MOST_HZ)
-        if len(set(self.gripper)) != 2:
-            raise ManipError(f"gripper is {list(self.gripper)}; expected two positions, at 0 and at 100 [rad]")
 
     def percent(self, joint: F64) -> F64:
         """Return the gripper's numbers, 0 to 100, for positions `joint` of its driven joint [rad]."""
@@ -192,8 +186,6 @@ class Robot:
     def __post_init__(self) -> None:
         count = len(self.joints)
         require_lengths(self, home=count, gains=count, forces=count, armature=count)
-        if both := set(self.joints) & set(self.gripper.joints):
-            raise ManipError(f"joints and gripper.joints both name {min(both)!r}; expected each in only one")
         if (named := len(self.joint_names)) != count + 1:
             raise ManipError(f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the gripper's")
         if self.yaw not in YAWS:
@@ -218,13 +210,3 @@ class Robot:
     def leans(self) -> bool:
         """Whether the hand leans everywhere, as the arm has too few joints to hold it upright."""
         return self.costs.orientation == self.costs.leaning
-
-
-def costs_of(joints: int) -> Costs:
-    """Return the costs that suit an arm with that many joints."""
-    return UPRIGHT if joints >= UPRIGHT_JOINTS else SOFT
-
-
-def yaw_of(joints: int) -> str:
-    """Return the direction of zero yaw for an arm with that many joints."""
-    return YAWS[int(joints < UPRIGHT_JOINTS)]

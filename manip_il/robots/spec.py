@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
 
@@ -76,6 +76,22 @@ def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, 
     mount = spec.body(hand).add_frame(pos=gripper.position, quat=gripper.quaternion)
     spec.attach(hand_spec, prefix=GRIPPER, frame=mount)
     return spec
+
+
+def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig) -> tuple[str, ...]:
+    """Return the names of the hinges between the base and the hand, except the gripper's.
+
+    robot: its name. Raises `UsageError` if there are none, and what `bare_spec` raises.
+    """
+    spec = bare_spec(robot, files, hand, gripper)
+    joints, body = list[str](), spec.body(hand)
+    while body.name != "world":
+        hinges = [one for one in body.joints if one.type == mujoco.mjtJoint.mjJNT_HINGE]
+        joints[:0] = [one.name for one in hinges if one.name not in gripper.joints]
+        body = body.parent
+    if not joints:
+        raise UsageError(f"robot {robot}: there is no hinge between the base and hand {hand!r}; check hand")
+    return tuple(joints)
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
@@ -173,10 +189,7 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
     """Delete joints that are neither the arm's nor the gripper's, leaving their bodies where the YAML says."""
     kept = {*robot.joints, *robot.gripper.joints, *linked}
     loose = [joint for joint in spec.joints if joint.name not in kept]
-    known = {joint.name for joint in loose if joint.type in _SCALAR} | set(linked)
-    for name in robot.fixed:
-        if name not in known:
-            raise UnknownName(f"joint in 'fixed' of robot {robot.name}:", name, known)
+    require(robot.name, "joint", tuple(robot.fixed), [joint for joint in loose if joint.type in _SCALAR])
     if robot.fixed:
         _place_bodies(spec, robot.fixed)
     for joint in loose:

@@ -51,8 +51,6 @@ def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
         length, base = _length(spec, hand.name)
     except ValueError as error:
         raise UsageError(f"MuJoCo cannot compile {gripper or model}: {' '.join(str(error).split())}") from None
-    if not all((hand.name, palm.name, *fingers)):
-        raise UsageError(f"{gripper or model}: the body of its hand or of a finger has no name; name it in the model")
     return {
         "hand": hand.name,
         "gripper": {

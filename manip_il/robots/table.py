@@ -15,10 +15,12 @@ from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles, read
-from manip_il.robots.robot import FOUND, GRIPPER, UPRIGHT, CameraPose, Costs, GripperConfig, Robot, costs_of, yaw_of
+from manip_il.robots.robot import FOUND, GRIPPER, SOFT, UPRIGHT, YAWS, CameraPose, Costs, GripperConfig, Robot
+from manip_il.robots.spec import arm_joints
 
 SUFFIXES = (".yaml", ".yml")
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
+_UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
 GROUP = "manip_il.robots"  # entry points: a name, and the path of a YAML
 
 
@@ -45,24 +47,22 @@ def is_robot(name: str) -> bool:
 
 def read_robot(path: Path) -> Robot:
     """Read a robot's YAML. Raises `UsageError` naming the file and what is wrong in it."""
-    said: dict[str, Any] = {}
     try:
         said = _said(path, read_yaml(path, "a robot's YAML"))
-        lacking = [name for name in FOUND if name not in said]
-        if lacking:
-            from manip_il.robots.found import complete  # here: shipped YAMLs are complete, and mink is slow to import
+        if all(name in said for name in FOUND):
+            return Robot(**said)
+        from manip_il.robots.found import complete  # here: shipped YAMLs are complete, and mink is slow to import
 
-            said = complete(said)
-        return Robot(**said)
+        return complete(said)
     except ValueError as error:  # MuJoCo's, for a model that it reads but cannot compile
-        raise UsageError(f"{path}: MuJoCo cannot compile {said['files'].model}: {checks.one_line(error)}") from None
+        raise UsageError(f"{path}: MuJoCo cannot compile its model: {checks.one_line(error)}") from None
     except ManipError as error:
         named = str(path) in str(error) or f"robot {path.stem}" in str(error)
         raise UsageError(str(error) if named else f"{path}: {error}") from None
 
 
 def _said(path: Path, tree: Any) -> dict[str, Any]:
-    """The fields that a YAML gives, and the defaults of those that are not found on the model."""
+    """The fields that a YAML gives, the arm's joints, and the defaults that depend on their number."""
     tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
     known = (*KEYS, *(name for name in kinds if name not in ("name", "files")))
     for key in tree:
@@ -78,16 +78,16 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         "files": ModelFiles.read("", tree, path.parent),
         "gripper": _gripper(checks.mapping("gripper", tree["gripper"]), path.parent),
     }
-    costs, cameras = tree.pop("costs", {}), checks.mapping("cameras", tree.pop("cameras", {}))
+    costs, cameras = checks.mapping("costs", tree.pop("costs", {})), checks.mapping("cameras", tree.pop("cameras", {}))
     if unknown := [name for name in cameras if name not in SCENE_CAMERAS]:
         raise UnknownName("camera in a robot's YAML:", unknown[0], SCENE_CAMERAS)
     said["cameras"] = {name: read(f"cameras.{name}", CameraPose, one) for name, one in cameras.items()}
     said |= {key: read(key, kinds[key], value) for key, value in tree.items() if key not in (*KEYS, "gripper")}
-    if "joints" in said:
-        said.setdefault("yaw", yaw_of(len(said["joints"])))
-    if "joints" in said or costs:
-        found = costs_of(len(said["joints"])) if "joints" in said else UPRIGHT
-        said["costs"] = read("costs", Costs, vars(found) | checks.mapping("costs", costs))
+    if "joints" not in said:
+        said["joints"] = arm_joints(said["name"], said["files"], said["hand"], said["gripper"])
+    upright = len(said["joints"]) >= _UPRIGHT_JOINTS
+    said.setdefault("yaw", YAWS[not upright])
+    said["costs"] = read("costs", Costs, vars(UPRIGHT if upright else SOFT) | costs)
     return said
 
 

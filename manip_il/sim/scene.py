@@ -12,7 +12,7 @@ import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.action_space import ActionSpace, ServoUnits
-from manip_il.robots.geometry import outline, require_free_home
+from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import TABLE_BEYOND, CameraPose, Robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
@@ -97,7 +97,6 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         if model.geom_type[one.geom] == int(mujoco.mjtGeom.mjGEOM_MESH)
     }
     _check_objects(robot, task, model, objects, gripper, hulls)
-    require_free_home(robot, model, PREFIX)
     return Scene(
         robot=robot,
         task=task,

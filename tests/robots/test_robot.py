@@ -76,7 +76,6 @@ MISTAKES = {
         ["unknown joint", "own", "'elbwo'", "did you mean 'elbow'", "known: elbow, left"],
     ),
     "opened the wrong way round": (inside("gripper", closed=[0.045] * 2, open=[0.0] * 2), ["the fingers stand"]),
-    "a home in the table": (but(home=[0, 1.6, 1.0, 1.0, 0]), ["at home 'fore' and 'table' overlap by"]),
     "a package that is not installed": (
         but(model="no_such_arms:arm.xml"),
         ["model is in 'no_such_arms'", "not installed", "pip install --no-deps no-such-arms"],
