@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from manip_il.cli.common_options import Trusting, Varied
 from manip_il.cli.options import Given, given
-from manip_il.cli.progress import say, warn
+from manip_il.cli.progress import say
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 from manip_il.serve.config import LEADERS, ServoConfig, SessionConfig
@@ -54,4 +54,4 @@ class ServeOptions(Varied, Trusting):
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)
         session = SessionConfig(**self.session, servos=self.servos, varies=SERVO in self.vary)
         with exclusive(session.output_dir):
-            serve(env, session, self.command, cameras, conditions, policy, say, warn, trust=self.trust)
+            serve(env, session, self.command, cameras, conditions, policy, say, trust=self.trust)

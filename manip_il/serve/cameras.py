@@ -25,8 +25,8 @@ _QUALITY = 90  # JPEG quality
 class Cameras:
     """A thread that streams a station's cameras on one port, `RATE` times per second.
 
-    images: the last picture of each. rate: pictures of each that this machine renders per second. Raises `UsageError`
-    for a port that is taken, `RenderError` without off-screen OpenGL.
+    images: the last picture of each. Raises `UsageError` for a port that is taken, `RenderError` without off-screen
+    OpenGL.
     """
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
@@ -44,9 +44,6 @@ class Cameras:
         render.close()  # an OpenGL context belongs to the thread that made it, from here on the new one
         self._thread = ThreadPoolExecutor(1)
         self._thread.submit(self._send).result()
-        begun = time.perf_counter()
-        self._thread.submit(self._send).result()
-        self.rate = 1 / (time.perf_counter() - begun)
         self._thread.submit(self._run)
 
     def close(self) -> None:

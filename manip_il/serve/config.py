@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from manip_il.option import Seeded, check_bounds, option
+from manip_il.option import Seeded, option
 
 if TYPE_CHECKING:
     import numpy as np
 
 LEADERS = ("expert", "sliders", "none")  # or a policy
-_IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}
+IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}  # of `--servo=ideal`
 VARIED = {  # ranges of `--vary=servo`: factors, except for delay and offset, which are added
     "stiffness": (0.7, 1.3),
     "torque": (0.8, 1.1),
@@ -33,7 +33,7 @@ _ADDED = ("delay", "offset")
 
 @dataclass(frozen=True)
 class ServoConfig:
-    """Parameters of every servo of an arm. Raises `UsageError` for one out of bounds."""
+    """Parameters of every servo of an arm."""
 
     stiffness: float = option(27.0, "torque per position error at P_Coefficient 32 [N m/rad]", at_least=1, at_most=1000)
     torque: float = option(2.94, "stall torque [N m]", at_least=0.1, at_most=20)
@@ -42,13 +42,6 @@ class ServoConfig:
     delay: float = option(0.005, "delay between a command and its effect [s]", at_least=0, at_most=0.5)
     friction: float = option(0.052, "friction of the gears [N m]", at_least=0, at_most=2)
     offset: float = option(0.0, "error of each joint's calibration [deg]", at_least=-10, at_most=10)
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "--servos.")
-
-    def ideal(self) -> ServoConfig:
-        """Return stiff servos without play, friction or delay."""
-        return replace(self, **_IDEAL)
 
     def varied(self, rng: np.random.Generator) -> ServoConfig:
         """Draw servos that differ from these by amounts within `VARIED`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import gc
 import select
 import signal
@@ -10,20 +11,28 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from manip_il.collect.drivers import policy_actions
+from manip_il.collect.environments import env_spec
+from manip_il.collect.rollout import Turn
 from manip_il.errors import ManipError
-from manip_il.mdp import Actor
+from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.mdp import F64, Actor
 from manip_il.serve.cameras import RATE, Cameras
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.episodes import ServedEpisodes
-from manip_il.serve.leader import load_policy, mover_of
 from manip_il.serve.operator import INTERRUPT, Operator, weigh_session
-from manip_il.serve.station import Station
+from manip_il.serve.station import Mover, Station
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
+from manip_il.sim.window import Window
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import env_of
 
 Say = Callable[[str], None]
+_UNPACED = 1e6  # a window's frame rate, so high that it never waits: the station keeps real time [Hz]
 
 
 def serve(
@@ -34,15 +43,15 @@ def serve(
     conditions: Sequence[Condition],
     policy: Path | None,
     say: Say,
-    warn: Say,
     *,
     trust: bool,
 ) -> None:
     """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
 
     cameras: those to serve; None for none. conditions: how worlds vary. policy: folder of the one that moves the
-    leader, if any, and whether to `trust` it. say, warn: called with lines for the user. Raises `UsageError` for a
-    robot without Feetech servos or a port that is taken, `ManipError` if the program failed, what `mover_of` raises.
+    leader, if any, and whether to `trust` it; it must fit the environment and the cameras. say: called with lines for
+    the user. Raises `UsageError` for a robot without Feetech servos or a port that is taken, `MismatchError` for a
+    policy that does not fit, `RenderError` for a window without a display, `ManipError` if the program failed.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
@@ -53,11 +62,15 @@ def serve(
         shown = Cameras(station, cameras, config.camera_port) if cameras is not None else None
         if shown is not None:
             stack.callback(shown.close)
-            if shown.rate < RATE:
-                warn(f"pictures are drawn {shown.rate:.0f} times a second here; {RATE} need smaller or fewer ones")
-        task = station.env.task_description
-        leads = load_policy(policy, env, shown, task, trust=trust) if policy is not None else None
-        leader = mover_of(config.leader, leads, station, shown)
+        if policy is not None:
+            checkpoint = Checkpoint.open(policy)
+            checkpoint.check_fits(env_spec(env, cameras))
+            learned = LearnedPolicy.load(checkpoint, task=station.env.task_description, trust=trust)
+            leader = policy_mover(learned, station, shown)
+        elif config.leader == "sliders":
+            leader = slider_mover(station)
+        else:
+            leader = station.expert if config.leader == "expert" else lambda: None
         episodes = ServedEpisodes(station, env, config.log, config.seed, leader)
         gc.collect()
         gc.freeze()  # a full collection of what LeRobot and torch have imported takes longer than a client waits
@@ -89,6 +102,37 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
         f"--teleop.id=leader --teleop.calibration_dir={root} --dataset.repo_id=local/so101 "
         f'--dataset.single_task="{station.env.task_description}" --dataset.push_to_hub=false',
     ]
+
+
+def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | None) -> Mover:
+    """Return a policy that moves the leader, and sees what the cameras show."""
+    seed = None
+
+    def move() -> F64:
+        nonlocal seed
+        state, seen = station.env.get_state(), station.env.observe()
+        seen.images.update(cameras.images if cameras is not None else {})
+        turn = Turn(station.seed, state.step if seed == station.seed else 0, seen, state)
+        seed = station.seed
+        return station.to_joints(policy_actions(policy, [turn])[0])
+
+    return move
+
+
+def slider_mover(station: Station) -> Mover:
+    """Open a window whose control sliders move the leader. Raises `RenderError` without a display."""
+    env, window = station.env, Window(station.env.scene, _UNPACED, sliders=True)
+    order, seed = np.array([*env.scene.arm_ctrl, *env.scene.gripper.ctrl]), None
+
+    def move() -> F64:
+        nonlocal seed
+        joints = window.commands[order] if seed == station.seed else env.data.qpos[station.follower.q]
+        seed, shown = station.seed, copy.copy(env.data)
+        shown.ctrl[order] = joints
+        window.show(shown, env.world.variation)
+        return joints
+
+    return move
 
 
 def _operate(operator: Operator, station: Station, program: str, say: Say) -> None:

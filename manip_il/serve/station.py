@@ -18,14 +18,13 @@ from manip_il.errors import UsageError
 from manip_il.mdp import F64, State
 from manip_il.seeding import rng_for
 from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
-from manip_il.serve.config import SessionConfig
+from manip_il.serve.config import IDEAL, SessionConfig
 from manip_il.serve.servo import Follower
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import World
 
 FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
 HELD = 1.0  # how long the task must stay solved before it counts [s]
-_SLICES = 4  # most updates of motors and registers per control step
 _LATE = 0.25  # largest lag behind the wall clock; beyond it the clock is reset [s]
 _FULL_TURN = "wrist_roll"  # the joint to which LeRobot's calibration gives a full turn
 
@@ -50,8 +49,9 @@ class Station:
     """Two ports, `follower` and `leader`, in a folder, and the simulation behind them.
 
     `NAME.json` beside each is its calibration in LeRobot's form, and holds what the servos keep without power. on_read:
-    called, from another thread, whenever a client reads the follower's position. mover: returns target joints for the
-    leader, which has no weight, [rad], (n,), or None to leave it. hand: joints at which a hand holds both arms still.
+    called, from another thread, whenever a client reads the follower's position. mover: asked once a control step for
+    the joints to which the leader, which has no weight, moves [rad], (n,), or None to leave it. hand: joints at which
+    a hand holds both arms still.
     Raises `UsageError` for a robot without Feetech servos.
     """
 
@@ -64,16 +64,14 @@ class Station:
             )
         env.world = World(replace(env.scene, model=copy.copy(env.scene.model)))  # a copy, as its motors become servos
         self.env, self._config = env, config
-        self._servos = config.servos.ideal() if config.servo == "ideal" else config.servos
+        self._servos = replace(config.servos, **IDEAL) if config.servo == "ideal" else config.servos
         self._expert = Expert(env.scene)
         self.names = [name.removesuffix(".pos") for name in env.scene.robot.joint_names]
-        steps = env.config.physics_steps
-        self._slices = next(count for count in range(_SLICES, 0, -1) if steps % count == 0)
-        self.slice = 1 / (env.config.control_hz * self._slices)
+        self._step = 1 / env.config.control_hz  # [s]
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
         self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])  # the servos' joint limits [rad], (n, 2)
         self.buses = {name: self._open(name) for name in ("follower", "leader")}
-        self.follower = Follower(env.world, self.buses["follower"], self.slice)
+        self.follower = Follower(env.world, self.buses["follower"], self._step)
         self.mover: Mover = lambda: None
         self.hand: F64 | None = None
         self.on_read: Callable[[Read], None] = lambda read: None
@@ -127,25 +125,24 @@ class Station:
 
     def run(self, each_step: Callable[[], bool]) -> None:
         """Run the simulation until `each_step`, called every control step, returns False."""
-        begun, slices = time.perf_counter(), 0
+        begun, steps = time.perf_counter(), 0
         while True:
-            begun = self._wait(begun, slices)
-            if slices % self._slices == 0:
-                if self.hand is None:
-                    self.env.begin_step()
-                if not each_step():
-                    return
-            self._advance(slices % self._slices == self._slices - 1)
-            slices += 1
+            begun = self._wait(begun, steps)
+            if self.hand is None:
+                self.env.begin_step()
+            if not each_step():
+                return
+            self._advance()
+            steps += 1
 
-    def _wait(self, begun: float, slices: int) -> float:
-        """Wait until a slice is due; return the start time, moved later if the machine is too slow."""
-        behind = time.perf_counter() - begun - slices * self.slice / self._config.speed
+    def _wait(self, begun: float, steps: int) -> float:
+        """Wait until a step is due; return the start time, moved later if the machine is too slow."""
+        behind = time.perf_counter() - begun - steps * self._step / self._config.speed
         time.sleep(max(0.0, -behind))
         return begun + behind if behind > _LATE else begun
 
-    def _advance(self, ends_step: bool) -> None:
-        """Advance the simulation by one slice."""
+    def _advance(self) -> None:
+        """Advance the simulation by one control step."""
         env = self.env
         if self.hand is not None:
             env.data.qpos[self.follower.q] = self.hand
@@ -155,11 +152,10 @@ class Station:
         else:
             self._move_leader(self.mover())
             self.follower.command()
-            mujoco.mj_step(env.world.model, env.data, env.config.physics_steps // self._slices)
+            mujoco.mj_step(env.world.model, env.data, env.config.physics_steps)
             env.world.update()
-            if ends_step:
-                env.count_step()
-                self._solved = self._solved + 1 if env.solved else 0
+            env.count_step()
+            self._solved = self._solved + 1 if env.solved else 0
         self._show()
 
     def _place_leader(self, q: F64) -> None:
@@ -168,7 +164,7 @@ class Station:
 
     def _move_leader(self, q: F64 | None) -> None:
         """Move joints towards `q` at up to the servos' speed; those with torque on move to their goals instead."""
-        bus, most = self.buses["leader"], self._servos.speed * self.slice
+        bus, most = self.buses["leader"], self._servos.speed * self._step
         wanted = np.where(bus["Torque_Enable"] > 0, bus.goals(), self._leader if q is None else q)
         self._leader = self._leader + np.clip(wanted - self._leader, -most, most)
         bus.show(self._leader)

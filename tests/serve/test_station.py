@@ -17,7 +17,7 @@ from lerobot.teleoperators.so_leader import SO101Leader, SOLeaderTeleopConfig
 
 from manip_il.errors import UsageError
 from manip_il.mdp import F64
-from manip_il.serve import leader, operator
+from manip_il.serve import operator, session
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.serve.station import Station
 from manip_il.sim.env import joint_state
@@ -41,7 +41,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
 def run(station: Station, seconds: float) -> None:
     """Let time pass, as fast as the machine can."""
     steps = iter(range(round(seconds * station.env.config.control_hz)))
-    station._wait = lambda begun, slices: begun
+    station._wait = lambda begun, steps: begun
     station.run(lambda: next(steps, None) is not None)
 
 
@@ -110,9 +110,9 @@ def test_the_sliders_of_a_window_move_the_leader_and_follow_a_new_world(
         def show(self, data: mujoco.MjData, variation: F64) -> None:
             self.commands = data.ctrl + 0.1 * (len(self.commands) == 0)
 
-    monkeypatch.setattr(leader, "Window", FakeWindow)
+    monkeypatch.setattr(session, "Window", FakeWindow)
     start = station.env.data.qpos[station.follower.q]
-    move = leader.mover_of("sliders", None, station, None)
+    move = session.slider_mover(station)
     first = move()
     station.env.count_step()
     assert np.allclose([first, move()], [start, start + 0.1])
@@ -128,7 +128,7 @@ def test_the_expert_at_the_leader_solves_the_task_through_the_servos(station: St
         station.buses["follower"]["Goal_Position"] = station.buses["leader"]["Present_Position"]
         return not station.is_solved and station.env.get_state().step < 400
 
-    station._wait = lambda begun, slices: begun
+    station._wait = lambda begun, steps: begun
     station.run(follow)
     assert station.is_solved
 
