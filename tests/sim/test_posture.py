@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from manip_il.sim import events
 from manip_il.sim.conditions import Condition
@@ -43,9 +42,3 @@ def test_the_hand_is_within_reach_and_touches_nothing_at_every_start(robot: str)
         offsets.append(joints(env) - env.scene.robot.home)
     assert np.abs(offsets).max() <= 0.15 + NEAR
     assert (np.std(offsets, axis=0) > 0.06).all()
-
-
-def test_an_arm_that_could_only_begin_in_collision_stays_where_it_was(monkeypatch: pytest.MonkeyPatch):
-    plain, numbers = started(), iter(range(1000))
-    monkeypatch.setattr(events, "arm_contacts", lambda world: {(next(numbers), 0)})
-    np.testing.assert_array_equal(joints(started(conditions=[ELSEWHERE])), joints(plain))

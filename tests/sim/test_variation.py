@@ -83,14 +83,6 @@ def test_a_world_of_any_shape_has_the_one_that_is_drawn_as_mujoco_would_compile_
         np.testing.assert_allclose(ours, compiled, rtol=1e-9, atol=1e-15, err_msg=name)
 
 
-def test_a_variation_of_objects_alone_is_one_in_which_nothing_else_is_drawn():
-    base = np.array([*CUBE, *NOTHING_DRAWN])
-    np.testing.assert_array_equal(completed(np.array(CUBE), base), base)
-    assert completed(base, base) is base
-    with pytest.raises(MismatchError, match="size of the variation"):
-        completed(base[:-1], base)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 @given(x=lengths, y=lengths, z=lengths, mass=st.floats(0.01, 2))
 def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: float, z: float, mass: float):
