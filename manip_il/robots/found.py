@@ -50,7 +50,7 @@ def complete(said: Mapping[str, Any]) -> Robot:
     found: dict[str, Any] = {
         "forces": tuple(_greatest_torque(motors.get(joint.name), joint) for joint in joints),
         "armature": tuple(float(joint.armature) or ARMATURE for joint in joints),
-        # For now:
+        # provisional:
         "ee": EndEffector(said["hand"], (0.0, 0.0, 0.0)),
         "home": (0.0,) * len(joints),
         "gains": (1.0,) * len(joints),

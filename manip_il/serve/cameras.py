@@ -17,6 +17,7 @@ from manip_il.serve.station import Station
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import Picture
+from manip_il.sim.window import Clock
 
 RATE = 30  # pictures per second
 _QUALITY = 90  # JPEG quality
@@ -54,10 +55,10 @@ class Cameras:
         self._socket.close()
 
     def _run(self) -> None:
-        due = time.perf_counter()
-        while not self._stop.wait(max(0.0, due - time.perf_counter())):
+        clock = Clock(RATE)
+        while not self._stop.is_set():
+            clock.wait()
             self._send()
-            due = max(due + 1 / RATE, time.perf_counter())
 
     def _send(self) -> None:
         env = self._station.env

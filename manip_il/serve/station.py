@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -21,11 +20,11 @@ from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
 from manip_il.serve.config import IDEAL, SessionConfig
 from manip_il.serve.servo import Follower
 from manip_il.sim.env import ManipEnv
+from manip_il.sim.window import Clock
 from manip_il.sim.world import World
 
 FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
 HELD = 1.0  # how long the task must stay solved before it counts [s]
-_LATE = 0.25  # largest lag behind the wall clock; beyond it the clock is reset [s]
 _FULL_TURN = "wrist_roll"  # the joint to which LeRobot's calibration gives a full turn
 
 
@@ -51,8 +50,8 @@ class Station:
     `NAME.json` beside each is its calibration in LeRobot's form, and holds what the servos keep without power. on_read:
     called, from another thread, whenever a client reads the follower's position. mover: asked once a control step for
     the joints to which the leader, which has no weight, moves [rad], (n,), or None to leave it. hand: joints at which
-    a hand holds both arms still.
-    Raises `UsageError` for a robot without Feetech servos.
+    a hand holds both arms still. clock: paces the control steps. Raises `UsageError` for a robot without Feetech
+    servos.
     """
 
     def __init__(self, env: ManipEnv, config: SessionConfig):
@@ -68,6 +67,7 @@ class Station:
         self._expert = Expert(env.scene)
         self.names = [name.removesuffix(".pos") for name in env.scene.robot.joint_names]
         self._step = 1 / env.config.control_hz  # [s]
+        self.clock = Clock(env.config.control_hz * config.speed)
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
         self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])  # the servos' joint limits [rad], (n, 2)
         self.buses = {name: self._open(name) for name in ("follower", "leader")}
@@ -125,21 +125,13 @@ class Station:
 
     def run(self, each_step: Callable[[], bool]) -> None:
         """Run the simulation until `each_step`, called every control step, returns False."""
-        begun, steps = time.perf_counter(), 0
         while True:
-            begun = self._wait(begun, steps)
+            self.clock.wait()
             if self.hand is None:
                 self.env.begin_step()
             if not each_step():
                 return
             self._advance()
-            steps += 1
-
-    def _wait(self, begun: float, steps: int) -> float:
-        """Wait until a step is due; return the start time, moved later if the machine is too slow."""
-        behind = time.perf_counter() - begun - steps * self._step / self._config.speed
-        time.sleep(max(0.0, -behind))
-        return begun + behind if behind > _LATE else begun
 
     def _advance(self) -> None:
         """Advance the simulation by one control step."""

@@ -41,7 +41,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
 def run(station: Station, seconds: float) -> None:
     """Let time pass, as fast as the machine can."""
     steps = iter(range(round(seconds * station.env.config.control_hz)))
-    station._wait = lambda begun, steps: begun
+    station.clock.wait = lambda: None
     station.run(lambda: next(steps, None) is not None)
 
 
@@ -128,7 +128,7 @@ def test_the_expert_at_the_leader_solves_the_task_through_the_servos(station: St
         station.buses["follower"]["Goal_Position"] = station.buses["leader"]["Present_Position"]
         return not station.is_solved and station.env.get_state().step < 400
 
-    station._wait = lambda begun, steps: begun
+    station.clock.wait = lambda: None
     station.run(follow)
     assert station.is_solved
 
