@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import gc
 import logging
 import multiprocessing
 import os
+import resource
 import sys
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver
@@ -46,6 +48,8 @@ IMPORTED_ONCE = [
 forkserver.set_forkserver_preload(IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
 
+KEEP_SCENES = ("manip_il.sim.scene", "manip_il.sim.env", "manip_il.evaluation.runner")
+LARGE = 1_500_000_000  # of a process [bytes]
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
 
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
@@ -83,13 +87,31 @@ def _take_back() -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _memory_goes_back(request: pytest.FixtureRequest) -> Iterator[None]:
-    """What a file keeps for its own tests is let go after them, and what the allocator holds of it given back."""
+    """What a file keeps for its own tests is let go after them, and what the allocator holds of it given back.
+
+    Compiled scenes are kept for the next file unless this process has grown large: the finest take 64 MB each.
+    """
     yield
-    for kept in list(vars(request.module).values()):
+    modules = [request.module]
+    if _resident() > LARGE:
+        modules += [sys.modules[name] for name in KEEP_SCENES if name in sys.modules]
+    for kept in [one for module in modules for one in vars(module).values()]:
         if isinstance(kept, functools._lru_cache_wrapper):
             kept.cache_clear()
     if _TRIM is not None:
         _TRIM(0)
+
+
+def _resident() -> int:
+    """This process's memory [bytes]; 0 where no file says it."""
+    said = Path("/proc/self/statm")
+    return int(said.read_text().split()[1]) * resource.getpagesize() if said.is_file() else 0
+
+
+def pytest_collection_finish() -> None:
+    """What test files have imported is never garbage: do not search it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -123,7 +145,7 @@ def start() -> Callable[..., ForkServerProcess]:
     return begin
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # it takes half a gigabyte
 def warm_lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Warm]:
     """Runs LeRobot's commands, and scripts that use it, without network and with a home of its own."""
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "SVT_LOG": "1"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import shlex
 from collections.abc import Mapping
@@ -39,6 +40,7 @@ class Ours(AbstractContextManager["Ours"]):
 def _begin(log: str, environment: dict[str, str]) -> None:
     from manip_il.evaluation import film
 
+    gc.freeze()
     os.environ.clear()
     os.environ.update(environment)
     say_into(log)

@@ -39,7 +39,7 @@ def bucket() -> Iterator[dict[str, str]]:
         yield variables
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LeRobot]:
     """Runs a command of LeRobot's, or a script, in a folder; the Hub of the tests is the only one that it knows."""
     home = tmp_path_factory.mktemp("home")

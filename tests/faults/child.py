@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import sys
@@ -18,6 +19,7 @@ def run_command(words: Sequence[str], log: str, warm: bool, largest_file: int) -
     """
     from manip_il.cli.main import main
 
+    gc.freeze()  # else the first collection copies all that is shared with the parent
     os.setsid()
     say_into(log)
     if warm:

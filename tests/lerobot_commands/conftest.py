@@ -26,7 +26,7 @@ from ..warm import Warm
 PLUGIN = "manip_il.lerobot_plugin"
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def command(warm_lerobot: Warm) -> Callable[..., str]:
     """Runs a command as a user would; returns what it said."""
 
