@@ -148,6 +148,7 @@ class RedrawOptions(Edit, Varied, Seeded):
 
     example: ClassVar[str] = "manip-il data redraw runs/dagger datasets/redrawn --frames=20000"
     frames: int = option(20_000, "scenes to draw", at_least=1)
+    pictures: bool = option(True, "render the scenes; false: states alone, for --policy.states")
     scenes: bool = option(True, "draw new goals and objects; false: keep the visited states")
     branch_steps: int = option(
         1, "control steps that the expert drives from every scene, for act and diffusion", at_least=1
@@ -163,7 +164,7 @@ class RedrawOptions(Edit, Varied, Seeded):
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
         with self.open("redrawn", root, -(-self.frames // CHUNK)) as (source, target):
             conditions = varied(self.vary, source.env, sees=True)
-            cameras = self.camera_config(source.env)
+            cameras = self.camera_config(source.env) if self.pictures else None
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)
             left = self.frames - info.episodes

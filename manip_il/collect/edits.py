@@ -158,7 +158,11 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     `NothingToLearnError` if no scene has a valid label.
     """
     columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
-    drawn = {"scenes": scenes.anew, "branch_steps": scenes.branch_steps, "cameras": asdict(scenes.cameras)}
+    drawn = {
+        "scenes": scenes.anew,
+        "branch_steps": scenes.branch_steps,
+        "cameras": scenes.cameras and asdict(scenes.cameras),
+    }
     vary = {"vary": [condition.to_json() for condition in scenes.conditions]} if scenes.conditions else {}
     seeds = scenes.numbers[::CHUNK]
     tried = {"seeds": [seeds[0], seeds[-1]], "tried": len(seeds)}

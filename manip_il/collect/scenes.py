@@ -38,14 +38,14 @@ _TRIES = 5  # scenes drawn for a state, before it is kept as visited
 
 @dataclass(frozen=True)
 class Scenes:
-    """How scenes are drawn from a dataset's states, and their cameras.
+    """How scenes are drawn from a dataset's states, and their cameras, None for scenes without pictures.
 
     anew: also draw goals and objects, not only looks. conditions: those that the looks are drawn from.
     branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
     of the first scene in the random stream, so that several datasets of one seed have different scenes.
     """
 
-    cameras: CameraConfig
+    cameras: CameraConfig | None
     frames: int
     seed: int = 0
     anew: bool = True

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast, override
 
 import numpy as np
@@ -15,13 +16,15 @@ from lerobot.configs import PreTrainedConfig
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, interpolate
 
+from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_layout import INDEX
-from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, KEYPOINTS, STATE
-from manip_il.errors import UsageError
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, KEYPOINTS, LABEL_VALID, STATE
+from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.mlp import MLPConfig, MLPPolicy, offsets_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
+from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
-from manip_il.learn.samples import Table
+from manip_il.learn.samples import Table, valid_frames
 from manip_il.option import option
 
 __all__ = ["CNNConfig", "CNNPolicy", "make_cnn_pre_post_processors"]
@@ -32,6 +35,9 @@ STRIDE = 4  # distance between cells of the heat maps [pixels]
 _LIGHT, _COLOUR = 4.0, 16.0  # pictures vary far more in brightness than in colour; these scales equalise them
 _SHARPNESS = 3.0  # gain before the softmax
 _SPREAD, _STRENGTH = 4.0, 0.3  # scale both to about -2 to 2
+DRAWS = 16  # noisy true states per picture, with `states`
+MOST_NOISE = 2.0  # their largest noise, as a multiple of the prediction's mean error in training
+_MEMORY = 0.99  # share of that mean error kept from step to step
 
 
 @PreTrainedConfig.register_subclass("cnn")
@@ -46,7 +52,10 @@ class CNNConfig(MLPConfig):
     never used to act. scales: as in the mlp, for the offsets in the predicted state, or in the true one if it is an
     input; scaled: their columns there. heatmap_weight: weight, in training, of the cross-entropy [nats] between heat
     maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a keypoint
-    of its own in addition to the others; 0: off. All other options are the mlp's.
+    of its own in addition to the others; 0: off. states: a dataset without pictures. The action is then predicted from
+    joints and predicted state alone, by the mlp's network, which learns from the true state, there and in the frames
+    with pictures, with noise of the size of the prediction's error (the "independent" concept bottleneck of Koh et al.,
+    ICML 2020). All other options are the mlp's.
 
     `use_amp` runs the convolutions in half precision while training, if the processor has bfloat16: twice as fast.
     Acting is always in single precision.
@@ -58,6 +67,7 @@ class CNNConfig(MLPConfig):
     keypoints: int = option(32, "keypoints per camera", at_least=1)
     aux_weight: float = option(0.5, "weight of the loss of the predicted state", at_least=0)
     heatmap_weight: float = option(0.0, "weight of the loss of the heat maps", at_least=0)
+    states: str = option("", "dataset of states from which to learn to act on joints and predicted state alone")
     privileged_size: int = 0  # size of the predicted state; taken from the dataset
     named_points: int = 0  # number of points with a heat map; taken from the dataset
 
@@ -69,6 +79,8 @@ class CNNConfig(MLPConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.channels = tuple(self.channels)
+        if self.states and self.action_space == EE_DELTA:
+            raise UsageError(f"policy.states cannot be combined with {EE_DELTA}; expected {JOINT_DELTA}")
         if len(self.channels) < 2 or min(self.channels) < 1:
             raise UsageError(
                 f"policy.channels is {list(self.channels)}; expected at least two layers, of at least one channel each"
@@ -106,6 +118,7 @@ class CNNPolicy(MLPPolicy):
     name = "cnn"  # type: ignore[assignment]
     truth_mean: Tensor
     truth_scale: Tensor
+    error: Tensor
 
     @override
     @torch.no_grad()
@@ -127,6 +140,7 @@ class CNNPolicy(MLPPolicy):
         self.cameras = sorted(config.image_features)
         config.input_features = {key: features[key] for key in (*self.inputs, *self.cameras)}
         self._by_index: dict[str, Tensor] = {}  # values of every frame of the data, by its `index`
+        self._table: tuple[Tensor, ...] = ()  # joints, true state and action of every labelled frame
         self.privileged: nn.Module | None = None
         self.aux_weight, self.heatmap_weight = config.aux_weight, config.heatmap_weight
         self._make(config)
@@ -145,8 +159,13 @@ class CNNPolicy(MLPPolicy):
             self.register_buffer("truth_mean", torch.zeros(size))
             self.register_buffer("truth_scale", torch.ones(size))
         self.offsets = list(config.scaled) if size or ENVIRONMENT_STATE in self.inputs else []
-        shape = Shape.of(vars(config) | {"scales": (), "scaled": ()})  # this class scales the offsets itself
-        self.model = MLPNetwork(self.seen_size + size + len(config.scales) * len(self.offsets), n, shape)
+        if config.states:
+            self.register_buffer("error", torch.zeros(size))  # mean absolute error of the predicted state in training
+            shape = Shape.of(vars(config) | {"scaled": tuple(n + i for i in self.offsets)})
+            self.model = MLPNetwork(n + size, n, shape)
+        else:
+            shape = Shape.of(vars(config) | {"scales": (), "scaled": ()})  # this class scales the offsets itself
+            self.model = MLPNetwork(self.seen_size + size + len(config.scales) * len(self.offsets), n, shape)
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
@@ -158,14 +177,15 @@ class CNNPolicy(MLPPolicy):
         parts, around, config = [seen], batch.get(ENVIRONMENT_STATE), cast(CNNConfig, self.config)
         with torch.autocast(seen.device.type, enabled=False):
             if self.privileged is not None:
-                width = self.seen_size
-                encoded = ((seen - self.model.input_mean[:width]) * self.model.input_scale[:width]).clamp(
-                    -config.clamp, config.clamp
-                )
+                n = batch[STATE].shape[1]
+                joints = (batch[STATE] - self.model.input_mean[:n]) * self.model.input_scale[:n]
+                encoded = torch.cat([joints, seen[:, n:]], dim=-1).clamp(-config.clamp, config.clamp)
                 parts.append(self.privileged(encoded))
                 varies = self.truth_scale > 0
                 deviation = torch.where(varies, 1.0 / self.truth_scale, torch.zeros_like(self.truth_scale))
                 around = self.truth_mean + deviation * parts[1]
+                if config.states:
+                    return torch.cat([batch[STATE], around], dim=-1)
             if around is not None and self.offsets:
                 parts += [torch.tanh(around[:, self.offsets] / scale) for scale in config.scales]
             return torch.cat(parts, dim=-1)
@@ -178,16 +198,33 @@ class CNNPolicy(MLPPolicy):
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
         with torch.autocast(inputs.device.type, enabled=False):
-            losses = super()._row_losses(inputs, batch)
-            if not self.training:
-                return losses
-            if (truth := self._of_frames(ENVIRONMENT_STATE, batch)) is not None:
-                wanted = (truth - self.truth_mean) * self.truth_scale
-                read_off = inputs[:, self.seen_size : self.seen_size + wanted.shape[1]]
-                losses = losses + self.aux_weight * (read_off - wanted).abs().mean(-1)
-            if (places := self._of_frames(KEYPOINTS, batch)) is not None:
+            truth = self._of_frames(ENVIRONMENT_STATE, batch) if self.training else None
+            if truth is not None and cast(CNNConfig, self.config).states:
+                errors = (inputs[:, -truth.shape[1] :] - truth).abs()
+                losses = self._losses_of_states(errors.detach())
+                losses = losses + self.aux_weight * (errors * self.truth_scale).mean(-1)
+            else:
+                losses = super()._row_losses(inputs, batch)
+                if truth is not None:
+                    wanted = (truth - self.truth_mean) * self.truth_scale
+                    read_off = inputs[:, self.seen_size : self.seen_size + wanted.shape[1]]
+                    losses = losses + self.aux_weight * (read_off - wanted).abs().mean(-1)
+            if self.training and (places := self._of_frames(KEYPOINTS, batch)) is not None:
                 losses = losses + self.heatmap_weight * self._heat_map_losses(places)
             return losses
+
+    def _losses_of_states(self, errors: Tensor) -> Tensor:
+        """Return the action network's mean losses on `DRAWS` noisy true states a row, (B,).
+
+        errors: of the predicted state in this batch, (B, k), in its units.
+        """
+        self.error.lerp_(errors.mean(0), 1.0 - _MEMORY if self.error.any() else 1.0)
+        rows = torch.randint(len(self._table[0]), (DRAWS * len(errors),))
+        joints, truth, actions = (one[rows].to(errors.device) for one in self._table)
+        noise = MOST_NOISE * torch.rand(len(rows), 1, device=errors.device) * self.error * torch.randn_like(truth)
+        inputs = torch.cat([joints, truth + noise], dim=-1)
+        targets = self.model.encode_targets(self.model.relative(actions, inputs))
+        return self.model.row_losses(self.model.encode(inputs), targets).view(len(errors), DRAWS).mean(1)
 
     def _of_frames(self, name: str, batch: dict[str, Tensor]) -> Tensor | None:
         """Return what is stored of a batch's frames, (B, ...), by `index`, which LeRobot's preprocessor keeps."""
@@ -229,7 +266,10 @@ class CNNPolicy(MLPPolicy):
         if not config.privileged_size and not config.named_points and any(sizes):
             config.privileged_size, config.named_points = sizes
             self._make(config)
-        super()._learn_columns(columns)
+        if config.states:
+            self._learn_states(columns, truth, Path(config.states))
+        else:
+            super()._learn_columns(columns)
         if truth is not None and config.privileged_size == sizes[0]:  # else it comes from another task
             statistics = fit_statistics(truth.numpy(), truth.numpy(), "mse")
             self.truth_mean.copy_(statistics["input_mean"])
@@ -237,6 +277,29 @@ class CNNPolicy(MLPPolicy):
             self._remember(ENVIRONMENT_STATE, columns, truth)
         if places is not None and config.named_points == sizes[1]:
             self._remember(KEYPOINTS, columns, places)
+
+    def _learn_states(self, columns: Table, truth: Tensor | None, more: Path) -> None:
+        """Compute the action network's statistics from joints and true state, and keep all labelled states.
+
+        more: the dataset of states. Raises `MismatchError` if it is of another task.
+        """
+        if truth is None:
+            raise UsageError("policy.states needs a dataset with observation.environment_state, and aux_weight > 0")
+        table = joined_columns([more], [STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID])
+        if (size := table[ENVIRONMENT_STATE].shape[1]) != truth.shape[1]:
+            raise MismatchError(
+                "size of the environment state", str(more), size, "the pictures' dataset", len(truth[0])
+            )
+        self._table = tuple(
+            torch.cat(
+                [torch.from_numpy(one[key])[torch.from_numpy(valid_frames(one))].float() for one in (columns, table)]
+            )
+            for key in (STATE, ENVIRONMENT_STATE, ACTION)
+        )
+        joints, states, actions = self._table
+        inputs = torch.cat([joints, states], dim=1)
+        targets = self.model.relative(actions, inputs).numpy()
+        self.model.set_statistics(fit_statistics(self.model.expanded(inputs).numpy(), targets, self.model.loss))
 
     def _truth(self, columns: Table) -> Tensor | None:
         """Return the environment state, (N, k), if it is to be predicted."""

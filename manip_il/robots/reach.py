@@ -63,6 +63,14 @@ class Reach:
             there = np.delete(there, -1, axis) & np.delete(there, 0, axis)
         return there
 
+    @cached_property
+    def _arrives(self) -> list[list[list[bool]]]:
+        return self.arrives.tolist()
+
+    @cached_property
+    def _corner(self) -> list[float]:
+        return self.origin.tolist()
+
     def error(self, position: Sequence[float] | F64) -> float:
         """Return how far from `position` [m], (3,), the hand ends; plus its distance from the map if beyond it [m]."""
         place = (np.asarray(position) - self.origin) / _CELL
@@ -77,7 +85,11 @@ class Reach:
 
     def has(self, position: Sequence[float] | F64) -> bool:
         """Return whether the hand reaches `position` [m], (3,), and the rest of its cell of the map."""
-        return bool(self.has_each(np.asarray(position)[None])[0])
+        cells, (x, y, z), (first_x, first_y, first_z) = self._arrives, position, self._corner
+        x, y, z = (math.floor(at / _CELL) for at in (x - first_x, y - first_y, z - first_z))
+        if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
+            return False
+        return cells[x][y][z]
 
     def has_each(self, points: F64) -> NDArray[np.bool_]:
         """Return `has` of points (N, 3) [m], (N,)."""

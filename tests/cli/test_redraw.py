@@ -55,6 +55,20 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
 
 @pytest.mark.gl
 @pytest.mark.slow
+def test_without_pictures_it_gives_the_same_scenes_and_a_cnn_learns_to_act_from_them(redrawn, demos, tmp_path):
+    states, policy = tmp_path / "states", tmp_path / "policy"
+    assert main(["data", "redraw", str(demos), str(states), "--pictures=false", *SMALL]) == 0
+    assert Dataset.open(states).spec.cameras == ()
+    seen, unseen = (Dataset.open(one).columns(["sim_state", "action"]) for one in (redrawn, states))
+    assert all((seen[name] == unseen[name]).all() for name in seen)
+    words = ["train", f"--dataset.root={redrawn}", "--policy.type=cnn", f"--policy.states={states}"]
+    assert main([*words, "--policy.width=16", "--steps=2", "--batch_size=4", f"--output_dir={policy}"]) == 0
+    words = ["eval", f"--policy.path={policy}", "--eval.n_episodes=1", "--env.horizon=10", "--workers=1"]
+    assert main([*words, f"--output_dir={tmp_path / 'eval'}"]) == 0
+
+
+@pytest.mark.gl
+@pytest.mark.slow
 def test_dagger_by_pictures_redraws_every_rounds_states_the_same_after_a_kill(demos, tmp_path, capsys):
     run = tmp_path / "run"
     words = ["dagger", f"--dataset.root={demos}", "--policy.type=cnn", "--policy.width=16", "--redraw=60"]

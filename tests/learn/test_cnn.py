@@ -65,6 +65,10 @@ def make_batch(table, rows: int = 20, seed: int = 0) -> dict[str, torch.Tensor]:
     return batch | {"index": torch.arange(rows)}
 
 
+def rows_of(batch: dict[str, torch.Tensor]) -> list[dict[str, torch.Tensor]]:
+    return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(len(batch["index"]))]
+
+
 def test_larger_pictures_are_averaged(meta, table):
     policy, batch = new_policy(meta).eval(), make_batch(table, rows=3)
     larger = batch | {key: batch[key].repeat_interleave(3, 2).repeat_interleave(3, 3) for key in PICTURES}
@@ -198,6 +202,28 @@ def test_offsets_that_are_read_off_or_given_enter_at_several_scales_too(meta, ta
             new_policy(named, **options)
     with pytest.raises(UsageError, match="scales needs offsets"):
         new_policy(meta, scales=scales)
+
+
+def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the_predicted_one(meta, table, tmp_path):
+    policy, batch = new_policy(meta, states=str(meta.root), width=64), make_batch(table)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
+    blank = batch | {key: torch.zeros_like(batch[key]) for key in PICTURES}  # the label does not show in these
+    for _ in range(100):
+        optimizer.zero_grad()
+        policy.forward(blank)[0].backward()
+        optimizer.step()
+    valid = torch.from_numpy(table["label_valid"][:20, 0] != 0)
+    truth = torch.cat([batch["observation.state"], batch["observation.environment_state"]], dim=1)
+    assert policy.network_inputs(batch).shape == truth.shape
+    error = (policy.model.act(truth) - batch["action"])[valid, :-1].abs().mean()
+    assert error < 0.5 * (batch["action"] - batch["observation.state"])[valid, :-1].std(0).mean()
+    assert (policy.error > 0).any()
+    expected = policy.eval().select_action(batch)
+    assert torch.equal(expected, policy.model.act(torch.cat([policy.network_inputs(row) for row in rows_of(batch)])))
+    policy.save_pretrained(tmp_path)
+    assert torch.equal(CNNPolicy.from_pretrained(tmp_path, strict=True).eval().select_action(batch), expected)
+    with pytest.raises(UsageError, match=r"policy\.states needs"):
+        new_policy(meta, states=str(meta.root), aux_weight=0.0)
 
 
 @pytest.fixture
