@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import MismatchError, OlderSchemaError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import KEYPOINTS, Episode
 from manip_il.tasks.stock.table import TWO_ARMS
 
@@ -80,9 +80,12 @@ class RobotTaskSpec:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
-        """Return the spec that `to_json` wrote. Raises `OlderSchemaError`, and `TypeError` for other keys."""
+        """Return the spec that `to_json` wrote. Raises `ManipError` for an older schema, `TypeError` for other keys."""
         if (found := data.get("schema", 1)) != VERSION:
-            raise OlderSchemaError(checks.shorten(found), VERSION)
+            raise ManipError(
+                f"written with schema {checks.shorten(found)} of manip_il's columns, but this version reads {VERSION}; "
+                "make it again in another folder, with the same options"
+            )
         values: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in data.items()}
         return cls(**values)
 
