@@ -41,6 +41,10 @@ _FORMER = {  # options of older files, ignored with these values
     "dataset.rgb_encoder.g": 2,
     "dataset.rgb_encoder.crf": None,
     "dataset.rgb_encoder.preset": None,
+    "ppo.gae_lambda": 0.95,
+    "ppo.clip_range": 0.2,
+    "ppo.entropy": 0.0,
+    "ppo.target_kl": 0.05,
 }
 type Known = Mapping[str, Option]
 

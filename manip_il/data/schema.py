@@ -34,6 +34,7 @@ OWN_OBJECT = "the task's own"  # meaning of an empty object name
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
 SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as in LeRobot's recorder
 JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
+GRIPPERS = {TWO_ARMS: (6, 13)}  # meaning -> indices of the grippers in state and action; otherwise the last
 LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, if it differs
 VERSION = 2  # version of the columns and their meaning: 2 has progress, complete states and named phases
 MOST_FPS = 10_000  # highest control rate [Hz]
