@@ -35,7 +35,7 @@ from manip_il.algorithms.vector_env import ActionRange, Lockstep
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics, threads
-from manip_il.learn.ppo import Learner, lent_generators
+from manip_il.learn.ppo import Learner, seed_generators
 from manip_il.learn.transitions import Demonstrations, Transitions
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
@@ -152,19 +152,19 @@ class Run:
         self.simulated, self.metrics = 0, dict[str, float]()
         self._settings, self._seed, self._number = settings, seed, 0
         shown = demonstrations(name, settings, seed)
-        with lent_generators(self._stream("weights")):
-            self._network = MLPNetwork(shown.inputs[0].shape[1], 1, SHAPE)
-            self._network.set_statistics(fit_statistics(*shown.stacked, SHAPE.loss))
-            names = ("target_mean", "target_scale", "target_low", "target_high")
-            actions = ActionRange(*(getattr(self._network, one).numpy().copy() for one in names))
-            episodes = [ENVIRONMENTS[name]() for _ in range(settings.episodes)]
-            self._envs = Lockstep(episodes, actions, settings.episode_steps)
-            self._learner = Learner(self._network, settings.ppo, self._envs, settings.episode_steps, settings.log_std)
+        seed_generators(self._stream("weights"))
+        self._network = MLPNetwork(shown.inputs[0].shape[1], 1, SHAPE)
+        self._network.set_statistics(fit_statistics(*shown.stacked, SHAPE.loss))
+        names = ("target_mean", "target_scale", "target_low", "target_high")
+        actions = ActionRange(*(getattr(self._network, one).numpy().copy() for one in names))
+        episodes = [ENVIRONMENTS[name]() for _ in range(settings.episodes)]
+        self._envs = Lockstep(episodes, actions, settings.episode_steps)
+        self._learner = Learner(self._network, settings.ppo, self._envs, settings.episode_steps, settings.log_std)
         self._expert = shown.padded(settings.episode_steps, actions.normalised)
 
     def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
-        with lent_generators(self._stream("discriminator")):
-            return make(self._network)
+        seed_generators(self._stream("discriminator"))
+        return make(self._network)
 
     def agent(self) -> Run:
         return self
@@ -176,8 +176,8 @@ class Run:
         count = self._settings.episodes
         self._number += 1
         self._envs.seed(stream_seeds("reinforcement", (self._number + 1) * count, self._seed)[-count])
-        with lent_generators(self._stream("rollouts")):
-            rows = self._learner.collect()
+        seed_generators(self._stream("rollouts"))
+        rows = self._learner.collect()
         self.simulated += self._envs.simulated
         return rows
 
@@ -192,8 +192,8 @@ class Run:
 
     def improve(self, rewards: F32) -> None:
         remaining = max(0.0, 1.0 - self.simulated / self._settings.steps)
-        with lent_generators(self._stream("updates")):
-            self.metrics |= self._learner.improve(rewards, remaining=remaining)
+        seed_generators(self._stream("updates"))
+        self.metrics |= self._learner.improve(rewards, remaining=remaining)
 
     def finish(self, agent: Run) -> dict[str, float]:
         return self.metrics

@@ -25,7 +25,7 @@ from manip_il.algorithms.run import Run
 from manip_il.algorithms.vector_env import RobotEpisode
 from manip_il.cli.main import main as command
 from manip_il.collect.workers import Engine
-from manip_il.learn.discriminators import GailDiscriminator
+from manip_il.learn.discriminators import Discriminator
 from manip_il.sim.env import ManipEnv
 from manip_il.tasks.config import make_config
 
@@ -80,7 +80,7 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
     recorded = [Recorded(env, None) for _ in range(config.episodes)]
     for one, episode in zip(agent.envs.envs, recorded, strict=True):
         one.episode = episode
-    d = agent.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
+    d = agent.keep(lambda actor: Discriminator(config.discriminator, actor))
     found = []
     for _ in range(iterations):
         times = [time.process_time()]

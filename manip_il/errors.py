@@ -50,16 +50,6 @@ class MismatchError(ManipError):
         super().__init__(f"{what} differs: {left} has {left_value}, {right} has {right_value}")
 
 
-class OlderSchemaError(ManipError):
-    """The data have an older version of our columns, which cannot be read; the message says how to make them again."""
-
-    def __init__(self, found: str, reads: int):
-        super().__init__(
-            f"written with schema {found} of manip_il's columns, but this version reads {reads}; make it again in "
-            "another folder: manip-il record, train or dagger with the same options"
-        )
-
-
 class NotFiniteError(ManipError):
     """A value is NaN or infinite."""
 

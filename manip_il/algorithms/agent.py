@@ -23,7 +23,7 @@ from manip_il.errors import UsageError
 from manip_il.learn.checkpoint import Origin, in_one_line
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.network import MLPNetwork, threads
-from manip_il.learn.ppo import Learner, lent_generators, save_policy, start_conversion, start_policy
+from manip_il.learn.ppo import Learner, save_policy, seed_generators, start_conversion, start_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL, TRAINING_STATE, new_checkpoint, read_step, write_own_files
 from manip_il.learn.transitions import Transitions, read_demonstrations
 from manip_il.mdp import F32
@@ -52,9 +52,10 @@ class Agent:
         if demonstrations and not config.episode_steps:
             horizon = min(horizon, math.ceil(LONGER * demonstrations.longest))
         hold = demonstrations.hold if demonstrations else None
-        with threads(1), lent_generators(self._stream("weights")):
+        with threads(1):
+            seed_generators(self._stream("weights"))
             rows = demonstrations.stacked if demonstrations else None
-            self._policy = start_policy(config.start, self._conversion.space, spec, rows)
+            self._policy = start_policy(config.start, self._conversion, spec, rows)
             actions = ActionRange.of(self._policy.model)
             episodes = [RobotEpisode(config.env, hold) for _ in range(config.episodes)]
             self.envs = Lockstep(episodes, actions, horizon, self._conversion)
@@ -64,8 +65,8 @@ class Agent:
 
     def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
         """Return `make(network)`, a discriminator that is saved with the agent. network: the actor's."""
-        with lent_generators(self._stream("discriminator")):
-            self._modules["discriminator"] = made = make(self._policy.model)
+        seed_generators(self._stream("discriminator"))
+        self._modules["discriminator"] = made = make(self._policy.model)
         return made
 
     def rollouts(self) -> Transitions:
@@ -73,7 +74,8 @@ class Agent:
         config = self.config
         self.number += 1
         self.envs.seed(stream_seeds("reinforcement", self.number * config.episodes, config.seed)[-config.episodes])
-        with self._clock.timed("collect"), threads(1), lent_generators(self._stream("rollouts")):
+        with self._clock.timed("collect"), threads(1):
+            seed_generators(self._stream("rollouts"))
             self._rows = self._learner.collect()
         self.simulated += self.envs.simulated
         solved, absorbing = self.envs.solved.mean(), self._rows.absorbing.mean()
@@ -112,7 +114,8 @@ class Agent:
         self.metrics["return"] = float(rewards.sum() / self.config.episodes)
         remaining = max(0.0, 1.0 - self.simulated / self.config.steps)
         warm = self.number > self.config.warmup_iterations
-        with self._clock.timed("fit"), threads(1), lent_generators(self._stream("updates")):
+        with self._clock.timed("fit"), threads(1):
+            seed_generators(self._stream("updates"))
             self.metrics |= self._learner.improve(rewards, actor=warm, remaining=remaining)
 
     def save(self, folder: Path) -> None:

@@ -5,13 +5,13 @@ from collections.abc import Iterator
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.results import Result
 from manip_il.algorithms.run import Run
-from manip_il.learn.discriminators import AirlDiscriminator
+from manip_il.learn.discriminators import Discriminator
 
 
 def airl(run: Run, c: LearningConfig) -> Iterator[Result]:
     """Yield each iteration: roll out the agent, fit f by D = exp f / (exp f + pi), improve the agent by f - log pi."""
     agent = run.agent()
-    d = agent.keep(lambda actor: AirlDiscriminator(c.discriminator, actor, c.discount))
+    d = agent.keep(lambda actor: Discriminator(c.discriminator, actor, c.discount))
     yield from run.begin(agent)
     while agent.simulated < c.steps:
         steps = agent.rollouts()

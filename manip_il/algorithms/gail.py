@@ -5,13 +5,13 @@ from collections.abc import Iterator
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.results import Result
 from manip_il.algorithms.run import Run
-from manip_il.learn.discriminators import GailDiscriminator
+from manip_il.learn.discriminators import Discriminator
 
 
 def gail(run: Run, c: LearningConfig) -> Iterator[Result]:
     """Yield each iteration: roll out the agent, fit the discriminator, improve the agent by its reward."""
     agent = run.agent()
-    d = agent.keep(lambda actor: GailDiscriminator(c.discriminator, actor))
+    d = agent.keep(lambda actor: Discriminator(c.discriminator, actor))
     yield from run.begin(agent)
     while agent.simulated < c.steps:
         steps = agent.rollouts()

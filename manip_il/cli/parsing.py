@@ -34,6 +34,18 @@ from manip_il.option import check_bound
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
 _MOST_OFFERED = 3  # names that an error suggests
+_FORMER = {  # options of older files, ignored with these values
+    "task.reward": "",
+    "eval.stream": "test",
+    "dataset.rgb_encoder.pix_fmt": "yuv420p",
+    "dataset.rgb_encoder.g": 2,
+    "dataset.rgb_encoder.crf": None,
+    "dataset.rgb_encoder.preset": None,
+    "ppo.gae_lambda": 0.95,
+    "ppo.clip_range": 0.2,
+    "ppo.entropy": 0.0,
+    "ppo.target_kl": 0.05,
+}
 type Known = Mapping[str, Option]
 
 
@@ -168,7 +180,7 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
                 raise UsageError(f"{origin}: {name} can only be set on the command line; give --{name}=...")
         elif any(option == name or option.startswith(f"{name}.") for option in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
-        else:
+        elif name not in _FORMER or value != _FORMER[name]:
             raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
     return raw
 

@@ -29,13 +29,10 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
-from manip_il.robots.table import get_robot, is_robot
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.mesh import is_stored, nameable
 from manip_il.sim.variation import OLDER
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.stock.table import ROBOTS as STOCK
-from manip_il.tasks.table import get_task, is_task
 
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
@@ -59,7 +56,8 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
     """Open a dataset whose states are to be restored.
 
     robot, task: files of the user's own robot and task. shape: the object's, if it is a mesh. Raises `ManipError` if
-    the folder is not a dataset of ours, or its robot or task is unknown, `MismatchError` if its states do not fit them.
+    the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or object, and what
+    `make_config` raises for one that is not built in.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -67,26 +65,14 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
         raise ManipError(
             f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
-    lacking = [] if robot or is_robot(spec.robot) or spec.robot in STOCK else [f"--robot.type=PATH/{spec.robot}.yaml"]
-    lacking += [] if task or is_task(spec.task) or spec.robot in STOCK else [f"--task.type=PATH/{spec.task}.py"]
-    lacking += [] if shape or not is_stored(spec.object) else [f"--task.object={nameable(spec.object)}"]
-    if lacking:
-        what = f"the robot {spec.robot!r} and the task {spec.task!r}" + (f" with {spec.object}" if spec.object else "")
-        raise ManipError(
-            f"{root} is for {what}, not all of it built in, so its states cannot be restored; "
-            f"give {' and '.join(lacking)}"
-        )
-    given = get_robot(robot).name if robot else spec.robot, get_task(task).name if task else spec.task
-    for what, ours, theirs in zip(("robot", "task"), given, (spec.robot, spec.task), strict=True):
-        if ours != theirs:
-            raise MismatchError(what, str(root), theirs, f"--{what}.type", ours)
     env = make_config(robot or spec.robot, task or spec.task, object=shape or spec.object)
-    if shape and (ours := env_spec(env).object) != spec.object:
-        raise MismatchError("object", str(root), spec.object, "--task.object", ours)
-    size = env_spec(env).sim_state_size
-    lacks = size - spec.sim_state_size  # older states do not hold all draws
+    given = env_spec(env)
+    for what in ("robot", "task", "object"):
+        if getattr(given, what) != getattr(spec, what):
+            raise MismatchError(what, str(root), getattr(spec, what), "the given one", getattr(given, what))
+    lacks = given.sim_state_size - spec.sim_state_size  # older states do not hold all draws
     if lacks not in (0, *OLDER):
-        raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
+        raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", given.sim_state_size)
     here, there = env_fingerprint(env), dataset.fingerprint
     left, right = ({key: one.get(key, "nothing") for key in _COMPARED} for one in (there, here))
     warnings = compare_fingerprints(str(root), left, "this machine", right)

@@ -13,7 +13,7 @@ from manip_il.collect.environments import env_actions, env_spec, make_env, make_
 from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, gate_of, labelled
 from manip_il.collect.rollout import Act, Environment, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
@@ -51,10 +51,6 @@ class RolloutJob:
     batch: int = LOCKSTEP
     round: int = 0
     cameras: CameraConfig | None = None
-
-    def __post_init__(self) -> None:
-        if self.label == "takeover" and self.driver.name != "policy":
-            raise UsageError(f"takeover needs a policy that drives; this rollout is driven by {self.driver.name!r}")
 
     @property
     def policy(self) -> Path | None:
@@ -122,10 +118,8 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     wanted = policy_cameras(job.policy) if job.policy is not None else None
     if wanted is None or job.cameras is None:
         return job.cameras or wanted
-    if not set(wanted.names) <= set(job.cameras.names):
-        raise MismatchError("cameras", str(job.policy), wanted.names, "the recording", job.cameras.names)
-    if wanted.size != job.cameras.size:
-        raise MismatchError("size of pictures", str(job.policy), wanted.size, "the recording", job.cameras.size)
+    if not set(wanted.names) <= set(job.cameras.names) or wanted.size != job.cameras.size:
+        raise MismatchError("cameras or their size", str(job.policy), wanted, "the recording", job.cameras)
     return job.cameras
 
 

@@ -101,7 +101,7 @@ def rollout(
     seeds: Iterable[int],
     act: Act,
     rules: Rules,
-    labeller: Labeller | None = None,
+    labeller: Labeller,
     gate: Gate | None = None,
     *,
     first: State | None = None,
@@ -138,7 +138,7 @@ def _next_episode(env: Environment, seeds: Iterator[int], first: State | None) -
     return _Slot(env, seed)
 
 
-def _begin_step(slot: _Slot, labeller: Labeller | None) -> None:
+def _begin_step(slot: _Slot, labeller: Labeller) -> None:
     env = slot.env
     env.begin_step()
     seen, state = env.observe(), env.get_state()

@@ -28,7 +28,7 @@ from manip_il.mdp import Episode
 if TYPE_CHECKING:
     from manip_il.collect.ray_pool import RayPool
 
-MAX_DEATHS = 3  # workers that a seed may kill before it is left out; consecutive left-out seeds that end the work
+MOST_DEATHS = 3  # consecutive left-out seeds that end the work
 Backend = Literal["local", "ray"]
 Seeds = tuple[int, ...]
 Pool = Union["LocalPool", "RayPool"]
@@ -39,7 +39,7 @@ class Engine:
     """Runs rollout jobs; use as a context manager. Workers live as long as the engine.
 
     workers: processes, 1 for this process alone; on Ray the number of concurrent tasks; None for one per core.
-    given_up: seeds that were left out because they killed their worker three times.
+    given_up: seeds that were left out because they killed a worker that ran them alone.
     """
 
     def __init__(self, workers: int | None = 1, backend: Backend = "local"):
@@ -111,16 +111,17 @@ class Engine:
                     failed = 0
                     yield future.result()
             for seed in lost:
-                episodes = _run_alone(pool, job, seed, journal)
-                if episodes is None:
+                try:
+                    yield pool.submit(job, (seed,), journal).result()
+                    failed = 0
+                except BrokenExecutor:
                     self.given_up.append(seed)
-                failed = 0 if episodes else failed + 1
-                if failed == MAX_DEATHS:
+                    failed += 1
+                if failed == MOST_DEATHS:
                     raise ManipError(
                         f"rollout workers keep dying, on seeds {self.given_up[-failed:]}; out of memory? "
                         "Finished episodes are kept"
                     )
-                yield episodes or []
 
 
 class LocalPool:
@@ -183,22 +184,16 @@ def kill_pool(pool: ProcessPoolExecutor) -> None:
 def start_server(learned: bool) -> None:
     """Start, once per process, the background server that workers are forked from.
 
-    learned: also import policies. The server keeps the current environment variables, except for a single OpenMP
-    thread.
+    learned: also import policies. The server keeps the current environment variables.
     """
     _CONTEXT.set_forkserver_preload(["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])])
-    threads = os.environ.get("OMP_NUM_THREADS")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported; one core each
     resource_tracker.ensure_running()  # first, because starting it would undo the mask
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # only this process handles Ctrl-C
-    os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
     try:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        if threads is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = threads
 
 
 def _end_with_parent() -> None:
@@ -239,13 +234,3 @@ def split(job: RolloutJob, seeds: Sequence[int], workers: int) -> deque[Seeds]:
 def default_workers() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
-
-
-def _run_alone(pool: Pool, job: RolloutJob, seed: int, journal: Journal | None) -> list[Episode] | None:
-    """Run a single seed in a worker and return its episodes; None if it killed `MAX_DEATHS` workers."""
-    for _ in range(MAX_DEATHS):
-        try:
-            return pool.submit(job, (seed,), journal).result()
-        except BrokenExecutor:
-            continue
-    return None

@@ -41,8 +41,7 @@ class Recording:
     A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes. only_labelled:
     leave out episodes without a valid label. episodes: number of episodes to keep, in seed order; None: all. labels:
     number of valid labels to keep; later ones have `label_valid` 0, and later episodes are left out. provenance: who
-    drove, stored in the dataset. video: fields of `VideoConfig`. stills: store pictures as PNGs in the data files, for
-    frames that are independent scenes.
+    drove, stored in the dataset. video: the fields of `VideoConfig`; others, of older versions, are not read.
     """
 
     repo_id: str
@@ -52,7 +51,6 @@ class Recording:
     video: dict[str, Any] = field(default_factory=dict)
     only_labelled: bool = False
     labels: int | None = None
-    stills: bool = False
 
     def write(self, journals: Path) -> None:
         """Write `recording.json` next to the journals."""
@@ -113,9 +111,9 @@ class Recording:
                 )
             provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
 
-        spec, video = dataclasses.replace(about.spec, video=not self.stills), VideoConfig(**self.video)
+        video = VideoConfig(self.video.get("vcodec", VideoConfig.vcodec))
         options: dict[str, Any] = {"repo_id": self.repo_id, "fingerprint": about.fingerprint, "video": video}
-        return write_dataset(selected(), root, spec, provenance, replace=replace, **options), failed
+        return write_dataset(selected(), root, about.spec, provenance, replace=replace, **options), failed
 
     def _is_full(self, episodes: int, labels: int) -> bool:
         """Whether a limit on episodes or labels is reached."""
@@ -155,17 +153,14 @@ def merge_datasets(
     root: Path,
     *,
     repo_id: str,
-    fingerprint: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> Info:
     """Merge several datasets, in order, into one; equal to `write_dataset` of all their episodes.
 
-    fingerprint: by default the first dataset's; if they differ, a warning is logged. The new provenance is the given
-    one with the sources and their provenance. Films are copied. Raises `MismatchError` naming both sides if the specs
+    The fingerprint is the first dataset's; if they differ, a warning is logged. The new provenance is the given one
+    with the sources and their provenance. Films are copied. Raises `MismatchError` naming both sides if the specs
     differ.
     """
-    if not roots:
-        raise ManipError("no datasets to merge")
     opened = [Dataset.open(source) for source in roots]
     about = next((one for one in opened if one.spec.task != UNKNOWN_TASK), opened[0])
     own = opened[0].fingerprint
@@ -175,7 +170,7 @@ def merge_datasets(
         for warning in compare_fingerprints(str(roots[0]), own, str(one.root), one.fingerprint):
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
-    options: dict[str, Any] = {"repo_id": repo_id, "fingerprint": own if fingerprint is None else fingerprint}
+    options: dict[str, Any] = {"repo_id": repo_id, "fingerprint": own}
     episodes = itertools.chain.from_iterable(map(_with_films, opened))
     return write_dataset(episodes, root, about.spec, {**(provenance or {}), "merged": sources}, **options)
 

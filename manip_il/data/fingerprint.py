@@ -17,13 +17,6 @@ from threadpoolctl import threadpool_info
 _HASH = 12  # printed characters of a hash
 _LONGEST = 80  # printed characters of any other value
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
-_MEANING = {
-    "model_sha256": "compiled MuJoCo model",
-    "task_sha256": "the task's file",
-    "object_sha256": "the object's mesh",
-    "config_sha256": "config",
-    "cameras_sha256": "pictures' size and look",
-}
 
 
 def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> dict[str, str]:
@@ -65,7 +58,7 @@ def compare_fingerprints(
         if ours != theirs:
             most = _HASH if key.endswith("_sha256") else _LONGEST
             sides = f"{left_name} has {str(ours)[:most]}, {right_name} has {str(theirs)[:most]}"
-            warnings.append(f"{_MEANING.get(key, key)} differs: {sides}")
+            warnings.append(f"{key} differs: {sides}")
     return warnings
 
 

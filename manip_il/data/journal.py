@@ -21,11 +21,11 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data import foxglove, schema
+from manip_il.data import foxglove
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
-from manip_il.errors import ManipError, OlderSchemaError
+from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 _FORMAT = "2"
@@ -107,15 +107,11 @@ def list_episodes(folder: Path) -> list[Path]:
 def read_journal(path: Path) -> tuple[Journal, Episode]:
     """Read an episode, bit for bit, and the description of its environment.
 
-    Raises `ManipError` naming the file if it is truncated, changed or not ours, `OlderSchemaError` if its version is
-    older.
+    Raises `ManipError` naming the file if it is truncated, changed, not ours or of an older version.
     """
     try:
         with path.open("rb") as stream:
             return _read(path.parent, stream)
-    except OlderSchemaError as error:
-        error.args = (f"{path}: {error}",)
-        raise
     except Exception as error:  # a foreign file with valid checksums can make a parser raise anything
         why = checks.one_line(error) or type(error).__name__
         again = "delete it; --resume=true records it again"
@@ -136,9 +132,7 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
             chunks.append(record)
         elif isinstance(record, DataEnd):  # all checksums were verified
             break
-    if (found := texts.get("format")) == "1":
-        raise OlderSchemaError("1", schema.VERSION)
-    if found != _FORMAT:
+    if (found := texts.get("format")) != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
     values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
     spec, fingerprint = RobotTaskSpec.from_json(values.pop("spec")), values.pop("fingerprint")

@@ -25,7 +25,7 @@ from manip_il.data.info import PICTURES, Info, read_info
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
-from manip_il.data.video import CameraFiles, try_encoder
+from manip_il.data.video import CameraFiles
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
@@ -45,20 +45,16 @@ def write_dataset(
     *,
     repo_id: str,
     fingerprint: Mapping[str, Any],
-    video: VideoConfig | None = None,
+    video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
     replace: bool = False,
 ) -> Info:
     """Write the episodes, in order, as a dataset with our columns; return its `info.json`.
 
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
     give the same bytes, videos included. Films of an episode are copied. provenance: the episodes' origin, read after
-    the last one. video: by default LeRobot's settings. replace: as in `new_folder`. Before taking an episode, raises
-    `FolderExistsError` if `root` is not empty, and `UsageError` for pictures or settings that the encoder refuses; then
-    what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
+    the last one. replace: as in `new_folder`. Before taking an episode, raises `FolderExistsError` if `root` is not
+    empty; then what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
     """
-    video = video or VideoConfig()
-    if spec.cameras and spec.video:
-        try_encoder(video, spec.image_size, spec.fps)
     about = features(spec), spec.fps, spec.lerobot_type, video
     with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about)) as writer:
         for item in episodes:
@@ -84,7 +80,7 @@ class TableWriter:
         features: layout.Features,
         fps: float,
         robot_type: str | None,
-        video: VideoConfig | None = None,
+        video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
     ):
         index: layout.Features = {
             key: {"dtype": kind, "shape": (1,), "names": None} for key, kind in layout.INDEX_DTYPES.items()
@@ -97,7 +93,7 @@ class TableWriter:
         self._rows: list[dict[str, Any]] = []
         self._row_schema: pa.Schema | None = None  # that of the first rows
         films = [key for key, feature in features.items() if feature["dtype"] == "video"]
-        self.films = {key: CameraFiles(folder, key, video or VideoConfig(), int(fps)) for key in films}
+        self.films = {key: CameraFiles(folder, key, video, int(fps)) for key in films}
         self._pooled: Statistics = {}
         self._tasks: dict[str, int] = {}  # text -> index, in order of first appearance
         self.episodes = self.frames = 0

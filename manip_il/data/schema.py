@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import MismatchError, OlderSchemaError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import KEYPOINTS, Episode
 from manip_il.tasks.stock.table import TWO_ARMS
 
@@ -34,6 +34,7 @@ OWN_OBJECT = "the task's own"  # meaning of an empty object name
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
 SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as in LeRobot's recorder
 JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
+GRIPPERS = {TWO_ARMS: (6, 13)}  # meaning -> indices of the grippers in state and action; otherwise the last
 LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, if it differs
 VERSION = 2  # version of the columns and their meaning: 2 has progress, complete states and named phases
 MOST_FPS = 10_000  # highest control rate [Hz]
@@ -80,9 +81,12 @@ class RobotTaskSpec:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
-        """Return the spec that `to_json` wrote. Raises `OlderSchemaError`, and `TypeError` for other keys."""
+        """Return the spec that `to_json` wrote. Raises `ManipError` for an older schema, `TypeError` for other keys."""
         if (found := data.get("schema", 1)) != VERSION:
-            raise OlderSchemaError(checks.shorten(found), VERSION)
+            raise ManipError(
+                f"written with schema {checks.shorten(found)} of manip_il's columns, but this version reads {VERSION}; "
+                "make it again in another folder, with the same options"
+            )
         values: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in data.items()}
         return cls(**values)
 

@@ -13,7 +13,7 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.arm import Arm
 from manip_il.evaluation.intervals import (
     CONFIDENCE,
-    Pairs,
+    PairCounts,
     Proportion,
     format_p,
     format_percent,
@@ -70,9 +70,9 @@ class Comparison:
         return found
 
     @cached_property
-    def pairs(self) -> tuple[Pairs, ...]:
+    def pairs(self) -> tuple[PairCounts, ...]:
         """The paired outcomes of each training seed."""
-        return tuple(Pairs.of(outcomes.values()) for outcomes in self._outcomes)
+        return tuple(PairCounts.of(outcomes.values()) for outcomes in self._outcomes)
 
     @property
     def difference(self) -> float:

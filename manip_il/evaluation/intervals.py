@@ -102,7 +102,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class PairCounts:
     """Two policies, left and right, on the same `n` episodes, counted by which succeeded."""
 
     both: int
@@ -111,7 +111,7 @@ class Pairs:
     neither: int
 
     @classmethod
-    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> Pairs:
+    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> PairCounts:
         """Count the outcomes (left, right) of episodes, at least one."""
         pairs = Counter(outcomes)
         return cls(pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])

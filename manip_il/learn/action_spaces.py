@@ -7,7 +7,8 @@ commanded opening, as in datasets and environments), and (p, R) = FK(q) the posi
     joint_delta    y = (q* - q, w*)
     ee_delta       y = (p* - p, log(R* R^T), 0 ..., w*)      with (p*, R*) = FK(q*)
 
-`joint_target` and `joint_delta` are lossless. The opening is absolute in all three: it is a command, not a motion.
+`joint_target` and `joint_delta` are lossless. The opening is absolute in all three: it is a command, not a motion. Two
+arms have two openings, each the last number of its arm.
 
 `ee_delta` is a translation [m] and a rotation vector [rad] in the world frame, not the hand's: objects and goals are
 observed in the world frame, so that "towards it" is the same numbers for any orientation of the hand, and stock
@@ -38,30 +39,35 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.schema import JOINT_TARGETS, RobotTaskSpec
+from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.robots import ROBOTS
 from manip_il.robots.rotations import rotation_vector
 
 if TYPE_CHECKING:  # importing inverse kinematics takes a second
+    from manip_il.learn.checkpoint import Checkpoint
     from manip_il.robots.ik import ArmIK
     from manip_il.robots.robot import Robot
 
-ARM, GRIPPER = slice(None, -1), -1  # slices of joint state and action, in the order of every robot's `ActionSpace`
+LAST = (-1,)  # the gripper of a single arm
+_ARM = slice(None, -1)  # its joints, in state and action
 _POSITION, _ROTATION, _POSE = slice(0, 3), slice(3, 6), 6
 Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
 
 @dataclass(frozen=True)
 class Conversion:
-    """Converts actions to the targets of a space and back, row by row. robot: the arm, for `ee_delta` only.
+    """Converts actions to the targets of a space and back, row by row.
+
+    robot: the arm, for `ee_delta` only. grippers: indices of the numbers that are absolute in `joint_delta`, too.
 
     Raises `UnknownName` for an unknown robot, `UsageError` for an arm with fewer joints than a pose has numbers.
     """
 
     space: str = JOINT_TARGET
     robot: str = ""
+    grippers: tuple[int, ...] = LAST
 
     def __post_init__(self) -> None:
         if self.space != EE_DELTA:
@@ -80,12 +86,13 @@ class Conversion:
             return actions
         targets = actions.copy()
         if self.space == JOINT_DELTA:
-            targets[:, ARM] -= states[:, ARM]
+            joints = self._joints(actions.shape[1])
+            targets[:, joints] -= states[:, joints]
             return targets
-        targets[:, ARM], ik = 0, _arm_ik(self.robot)
+        targets[:, _ARM], ik = 0, _arm_ik(self.robot)
         for target, action, state in zip(targets, actions, states, strict=True):
-            position, rotation = ik.ee_pose(self._to_radians(state[ARM]))
-            wanted, turned = ik.ee_pose(self._to_radians(action[ARM]))
+            position, rotation = ik.ee_pose(self._to_radians(state[_ARM]))
+            wanted, turned = ik.ee_pose(self._to_radians(action[_ARM]))
             target[_POSITION], target[_ROTATION] = wanted - position, rotation_vector(turned @ rotation.T)
         return targets
 
@@ -95,12 +102,17 @@ class Conversion:
             return targets
         actions = targets.copy()
         if self.space == JOINT_DELTA:
-            actions[:, ARM] += states[:, ARM]
+            joints = self._joints(targets.shape[1])
+            actions[:, joints] += states[:, joints]
             return actions
         motions = targets[:, :_POSE].astype(np.float64)
-        joints = _arm_ik(self.robot).moved(self._to_radians(states[:, ARM]), motions)
-        actions[:, ARM] = np.degrees(joints) if self._robot.lerobot is not None else joints
+        joints = _arm_ik(self.robot).moved(self._to_radians(states[:, _ARM]), motions)
+        actions[:, _ARM] = np.degrees(joints) if self._robot.lerobot is not None else joints
         return actions
+
+    def _joints(self, n: int) -> NDArray[np.intp]:
+        """Return the indices of the joints in an action of n numbers."""
+        return np.delete(np.arange(n), self.grippers)
 
     def _to_radians(self, joints: NDArray[Any]) -> NDArray[np.float64]:
         """Return the joints (..., n - 1) [rad] of actions or states, in double precision."""
@@ -114,13 +126,14 @@ class Conversion:
         return get_robot(self.robot)
 
 
-def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
-    """Return the conversion of a space for data of `spec`.
+def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = None) -> Conversion:
+    """Return the conversion of a space for data of `spec`. start: the checkpoint that a fit continues from, if any.
 
     Raises `MismatchError` naming both sides if the data's actions are not joint targets of a known robot with these
     joints, in so far as the space needs that, and what `Conversion` raises.
     """
-    found = Conversion(space, spec.robot if space == EE_DELTA else "")
+    grippers = start.grippers if start is not None else GRIPPERS.get(spec.action_meaning, LAST)
+    found = Conversion(space, spec.robot if space == EE_DELTA else "", grippers)
     if space != JOINT_TARGET and spec.action_meaning not in JOINT_TARGETS:
         needed = " or ".join(JOINT_TARGETS)
         raise MismatchError("meaning of the action", "the dataset", spec.action_meaning, space, needed)

@@ -22,7 +22,7 @@ from lerobot.processor import (
 
 from manip_il.data.schema import STATE
 from manip_il.errors import ManipError
-from manip_il.learn.action_spaces import Conversion
+from manip_il.learn.action_spaces import LAST, Conversion
 from manip_il.learn.checkpoint import DECODER, MEASURED
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET, OWN_SPACE
 
@@ -62,6 +62,7 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
 
     action_space: str = JOINT_TARGET
     robot: str = ""
+    grippers: tuple[int, ...] = LAST
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with joint targets. Raises `ManipError` unless the output is that of one step."""
@@ -74,12 +75,13 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
                 f"output of one step and its observation, both (B, n), not {given}"
             )
         rows = targets.detach().to("cpu", torch.float32).numpy()
-        actions = Conversion(self.action_space, self.robot).decode(rows, states.to("cpu", torch.float32).numpy())
+        conversion = Conversion(self.action_space, self.robot, tuple(self.grippers))
+        actions = conversion.decode(rows, states.to("cpu", torch.float32).numpy())
         return cast(EnvTransition, {**transition, TransitionKey.ACTION: torch.from_numpy(actions).to(targets)})
 
     def get_config(self) -> dict[str, Any]:
         """Return the options that are saved in a checkpoint."""
-        return {"action_space": self.action_space, "robot": self.robot}
+        return {"action_space": self.action_space, "robot": self.robot, "grippers": list(self.grippers)}
 
 
 def is_in_processors(kind: str, found: Conversion) -> bool:
@@ -93,5 +95,7 @@ def add_steps(before: Pipeline, after: Pipeline, found: Conversion) -> None:
     names = [getattr(step, "_registry_name", "") for step in before.steps]
     place = names.index(_NORMALISER) if _NORMALISER in names else len(names)
     before.steps = [*before.steps[:place], measured, *before.steps[place:]]
-    decoder = JointTargetsStep(relative_step=measured, action_space=found.space, robot=found.robot)
-    after.steps = [*after.steps, decoder]
+    after.steps = [
+        *after.steps,
+        JointTargetsStep(relative_step=measured, action_space=found.space, robot=found.robot, grippers=found.grippers),
+    ]

@@ -23,12 +23,6 @@ class PPOConfig:
     gamma: float | None = option(
         None, "discount per control step; by default 0.9, or 0.97 for a clone", at_least=0, at_most=1
     )
-    gae_lambda: float = option(0.95, "lambda of generalised advantage estimation", at_least=0, at_most=1)
-    clip_range: float = option(0.2, "clipping range of the probability ratio", at_least=1e-6, at_most=1)
-    entropy: float = option(0.0, "weight of the entropy bonus", at_least=0)
-    target_kl: float = option(
-        0.05, "stop an iteration's passes if the KL divergence exceeds 1.5 times this [nats]", at_least=1e-6
-    )
 
     def __post_init__(self) -> None:
         check_bounds(self, "ppo.")

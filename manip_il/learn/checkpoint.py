@@ -30,7 +30,9 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
-_MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled")
+_MLP_SHAPE = (  # what is the same in another mlp of this architecture
+    *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled", "grippers"),
+)
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ class Checkpoint:
     """A policy on disk. path: its `pretrained_model` folder. config: its `config.json`.
 
     numbers: column -> size; pictures: camera -> (height, width) [pixels]; action: size of the action. space: the action
-    space that it learnt in; robot: the arm, for `ee_delta` only. origin: None if another program wrote it. processors:
-    file -> steps, each with `registry_name` and `config`.
+    space that it learnt in; robot: the arm, for `ee_delta` only; grippers: see `Conversion`. origin: None if another
+    program wrote it. processors: file -> steps, each with `registry_name` and `config`.
     """
 
     path: Path
@@ -127,6 +129,7 @@ class Checkpoint:
     action: int
     space: str
     robot: str
+    grippers: tuple[int, ...]
     origin: Origin | None
     processors: Mapping[str, Sequence[Mapping[str, Any]]]
 
@@ -144,7 +147,7 @@ class Checkpoint:
             action = math.prod(outputs[ACTION][1])
             pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
             sizes = {name: (height, width) for name, (_, height, width) in pictures.items()}
-            space, robot = _space(config, processors.get(PROCESSORS[1], []))
+            space, robot, grippers = _space(config, processors.get(PROCESSORS[1], []))
         return cls(
             path,
             config,
@@ -153,6 +156,7 @@ class Checkpoint:
             action=action,
             space=space,
             robot=robot,
+            grippers=grippers,
             origin=origin,
             processors=processors,
         )
@@ -226,14 +230,17 @@ def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ..
     return {key: (str(value["type"]), tuple(map(int, value["shape"]))) for key, value in features.items()}
 
 
-def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
-    """Return action space and robot: from the configuration of mlp and cnn, else from the postprocessor's step."""
+def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str, tuple[int, ...]]:
+    """Return action space, robot and grippers: from the configuration of mlp and cnn, or the postprocessor's step.
+
+    Older checkpoints, which do not name the grippers, took the last number alone to be one.
+    """
     options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
     own = config["type"] in OWN_SPACE
     space = config.get("action_space", JOINT_DELTA) if own else options.get("action_space", JOINT_TARGET)
     if space not in ACTION_SPACES:
         raise UnknownName("action space", checks.shorten(space), ACTION_SPACES)
-    return space, str(options.get("robot", ""))
+    return space, str(options.get("robot", "")), tuple((config if own else options).get("grippers", (-1,)))
 
 
 @contextmanager

@@ -1,19 +1,20 @@
 """Discriminators of adversarial imitation, which tell expert from learner; their output is the reward.
 
-Both learn D = P(expert | transition) by logistic loss. `GailDiscriminator` is any function of state and action (Ho &
-Ermon, Generative adversarial imitation learning, NeurIPS 2016). `AirlDiscriminator` has the form
+Both learn D = P(expert | transition) by logistic loss. GAIL's is any function of state and action (Ho & Ermon,
+Generative adversarial imitation learning, NeurIPS 2016). AIRL's has the form
 
     D = exp f / (exp f + pi(a | s)),    f(s, a, s') = g(s, a) + gamma h(s') - h(s)
 
 so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with adversarial inverse
-reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log D - log(1 - D).
+reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log D - log(1 - D); AIRL's is f - log pi.
+
+In AIRL pi is divided by exp(-H) with its entropy H. Otherwise -log pi, whose mean is H, would reward every step before
+the absorbing state but none in it, where no action is sampled, and f would have to track H as the spread changes.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import override
 
 import numpy as np
 import torch
@@ -29,32 +30,38 @@ LARGEST_REWARD = 10.0
 Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), next states (B, e), log pi (B,)
 
 
-class Discriminator(nn.Module, ABC):
-    """A discriminator, its optimiser and its input scales. network: the actor, whose statistics scale the inputs."""
+class Discriminator(nn.Module):
+    """A discriminator, its optimiser and its input scales.
+
+    network: the actor, whose statistics scale the inputs. gamma: discount of AIRL's form; None for GAIL's.
+    asks_density: whether the logit depends on the learner's log-density of the action, as in AIRL.
+    """
 
     mean: Tensor
     scale: Tensor
     clamp: Tensor
     free: Tensor
-    asks_density = False  # whether the logit depends on the learner's log-density of the action
 
-    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork) -> None:
+    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float | None = None) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.asks_density = config, gamma is not None
         for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
             self.register_buffer(name, value[: network.inputs].clone())
         self.register_buffer("clamp", torch.tensor(network.clamp))
         self.register_buffer("free", (network.target_scale > 0).float())
-        self.build(len(self.mean) + 1, len(self.free))
+        encoded = len(self.mean) + 1
+        self.g = _perceptron(encoded + len(self.free), config.width)
+        self.h = None if gamma is None else _perceptron(encoded, config.width)
+        self._gamma = gamma or 0.0
         self.optimizer = torch.optim.Adam(self.parameters(), lr=config.lr, fused=True)
 
-    @abstractmethod
-    def build(self, e: int, n: int) -> None:
-        """Build the layers, for encoded states of e numbers and actions of n numbers."""
-
-    @abstractmethod
     def logits(self, batch: Batch) -> Tensor:
         """Return log D - log(1 - D), (B,)."""
+        states, actions, next_states, log_prob = batch
+        g = self.g(torch.cat([states, actions], dim=1))
+        if self.h is None:
+            return g.squeeze(1)
+        return (g + self._gamma * self.h(next_states) - self.h(states)).squeeze(1) - log_prob
 
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
         """Return the reward of every transition, (N,), clipped to +-10.
@@ -102,13 +109,6 @@ class Discriminator(nn.Module, ABC):
         gradients = torch.cat([one for one in found if one is not None], dim=1)
         return (gradients.norm(dim=1) - 1.0).square().mean()
 
-    def perceptron(self, inputs: int) -> nn.Sequential:
-        """Return a network of two hidden layers with one output, (B, inputs) to (B, 1)."""
-        width = self.config.width
-        return nn.Sequential(
-            nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1)
-        )
-
     def _encode(self, rows: Transitions, log_probs: F32 | None) -> Batch:
         log_prob = torch.zeros(len(rows)) if log_probs is None else torch.from_numpy(log_probs)
         actions = torch.from_numpy(rows.actions) * self.free * (1.0 - torch.from_numpy(rows.states[:, -1:]))
@@ -120,41 +120,9 @@ class Discriminator(nn.Module, ABC):
         return torch.cat([x.clamp(-self.clamp, self.clamp) * (1.0 - absorbing), absorbing], dim=1)
 
 
-class GailDiscriminator(Discriminator):
-    """D(s, a)."""
-
-    @override
-    def build(self, e: int, n: int) -> None:
-        self.d = self.perceptron(e + n)
-
-    @override
-    def logits(self, batch: Batch) -> Tensor:
-        states, actions, _, _ = batch
-        return self.d(torch.cat([states, actions], dim=1)).squeeze(1)
-
-
-class AirlDiscriminator(Discriminator):
-    """f(s, a, s') against the learner's log-density, as above; the reward is log D - log(1 - D) = f - log pi.
-
-    pi is divided by exp(-H) with its entropy H. Otherwise -log pi, whose mean is H, would reward every step before the
-    absorbing state but none in it, where no action is sampled, and f would have to track H as the spread changes.
-    """
-
-    asks_density = True
-
-    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float) -> None:
-        self._gamma = gamma
-        super().__init__(config, network)
-
-    @override
-    def build(self, e: int, n: int) -> None:
-        self.g, self.h = self.perceptron(e + n), self.perceptron(e)
-
-    @override
-    def logits(self, batch: Batch) -> Tensor:
-        states, actions, next_states, log_prob = batch
-        g = self.g(torch.cat([states, actions], dim=1))
-        return (g + self._gamma * self.h(next_states) - self.h(states)).squeeze(1) - log_prob
+def _perceptron(inputs: int, width: int) -> nn.Sequential:
+    """Return a network of two hidden layers with one output, (B, inputs) to (B, 1)."""
+    return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
 
 
 def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:

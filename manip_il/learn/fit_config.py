@@ -107,6 +107,15 @@ class FitConfig:
         return Checkpoint.open(Path(self.policy["path"]))
 
     @property
+    def initial(self) -> Checkpoint | None:
+        """The checkpoint with the initial weights, in `policy.path` or `init_from`. Raises what `start` raises."""
+        if self.init_from is None:
+            return self.start
+        from manip_il.learn.checkpoint import Checkpoint
+
+        return Checkpoint.open(self.init_from)
+
+    @property
     def kind(self) -> str:
         """The type of the policy."""
         return self.start.kind if self.start else str(self.policy.get("type", MLP))

@@ -22,9 +22,9 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from manip_il.data.schema import ACTION, JOINT_TARGETS, OPENINGS
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.checkpoint import Checkpoint, require_trust
+from manip_il.learn.checkpoint import require_trust
 from manip_il.learn.fit_config import FitConfig, check_convertible
-from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
+from manip_il.learn.names import JOINT_TARGET
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
 # Options of LeRobot's policies that are meant for one machine or one command.
@@ -174,15 +174,13 @@ def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[Tra
 
 
 def _action_space(policy: PreTrainedConfig, fit: FitConfig, meaning: str) -> str:
-    """Return the action space of a fit; also set it in a policy configuration that has the option."""
+    """Return the action space of a fit."""
     wanted = fit.action_space
     if wanted is None and "action_space" not in fit.policy and meaning not in JOINT_TARGETS:
         wanted = JOINT_TARGET
-    start = fit.start or (Checkpoint.open(fit.init_from) if fit.init_from else None)
+    start = fit.initial
     space = wanted or getattr(policy, "action_space", start.space if start else JOINT_TARGET)
     if start is not None and start.space != space:
         raise MismatchError("action space", f"the checkpoint {start.path}", start.space, "this fit", space)
     check_convertible(policy.type, space)
-    if policy.type in OWN_SPACE:
-        vars(policy)["action_space"] = space
     return space

@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from manip_il.errors import MismatchError, UnknownName, UsageError
-from manip_il.learn.action_spaces import ARM, GRIPPER
+from manip_il.learn.action_spaces import LAST
 from manip_il.learn.checkpoint import WEIGHTS, in_one_line
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
@@ -44,7 +44,8 @@ class Shape:
     of the data. sigma: how far `categorical` smears a target, in bins; 0: over the two nearest. clamp: bound on the
     normalised inputs, in standard deviations, so that states far from the data cannot blow up the outputs.
     action_space: one of `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among the inputs
-    (`object_from_ee.x`, ...), tanh(x / s) is an input, too. scaled: their columns, from the dataset.
+    (`object_from_ee.x`, ...), tanh(x / s) is an input, too. scaled: their columns, from the dataset. grippers: indices
+    of the numbers that are absolute in `joint_delta`, too, from the robot.
 
     Raises `UnknownName` for an unknown loss or activation, `UsageError` for a size out of range.
     """
@@ -60,10 +61,11 @@ class Shape:
     action_space: str = JOINT_DELTA
     scales: tuple[float, ...] = ()
     scaled: tuple[int, ...] = ()
+    grippers: tuple[int, ...] = LAST
 
     def __post_init__(self) -> None:
         self.sigma = SIGMA if self.sigma is None else self.sigma
-        self.scales, self.scaled = tuple(self.scales), tuple(self.scaled)
+        self.scales, self.scaled, self.grippers = tuple(self.scales), tuple(self.scaled), tuple(self.grippers)
         check_bounds(self, "policy.")
         for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS), ("action_space", ACTION_SPACES)):
             if (value := getattr(self, name)) not in known:
@@ -113,11 +115,12 @@ def _mean_and_deviation(values: NDArray[np.float32]) -> tuple[NDArray[np.float64
 class MLPNetwork(nn.Module):
     """Perceptron, head and normalisation. Inputs (B, n + k) are raw; the first n are the measured joints.
 
-    In the space `joint_delta` its targets are relative to the measured joints, except for the gripper's, the last,
-    which is absolute: the network adds the joints itself. In all others its actions are its targets, to be converted by
+    In the space `joint_delta` its targets are relative to the measured joints, except for the grippers', which are
+    absolute: the network adds the joints itself. In all others its actions are its targets, to be converted by
     `action_spaces`. A row's action does not depend on the other rows, bit for bit.
     """
 
+    added: Tensor  # 1 for the measured joints that are added to the targets, else 0, (n,)
     input_mean: Tensor
     input_scale: Tensor
     target_mean: Tensor
@@ -128,7 +131,9 @@ class MLPNetwork(nn.Module):
     def __init__(self, inputs: int, n: int, shape: Shape) -> None:
         super().__init__()
         self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
-        self.adds_joints = shape.action_space == JOINT_DELTA
+        added = torch.full((n,), float(shape.action_space == JOINT_DELTA))
+        added[list(shape.grippers)] = 0.0
+        self.register_buffer("added", added, persistent=False)
         self.scales, self.scaled, self.inputs = shape.scales, list(shape.scaled), inputs
         inputs += len(shape.scales) * len(shape.scaled)
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma or 0.0)
@@ -168,9 +173,7 @@ class MLPNetwork(nn.Module):
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
         """Return targets (B, n) for actions (B, n): relative to the measured joints if the network adds these."""
-        if not self.adds_joints:
-            return actions
-        return torch.cat([actions[:, ARM] - inputs[:, : self.n - 1], actions[:, GRIPPER:]], dim=1)
+        return actions - self.added * inputs[:, : self.n]
 
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
@@ -185,9 +188,7 @@ class MLPNetwork(nn.Module):
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so the learner's must not either.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
-        if not self.adds_joints:
-            return target
-        return torch.cat([inputs[:, : self.n - 1] + target[:, ARM], target[:, GRIPPER:]], dim=1)
+        return target + self.added * inputs[:, : self.n]
 
 
 @contextmanager

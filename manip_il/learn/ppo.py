@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, override
 
@@ -46,6 +45,7 @@ EXTRA = 2  # numbers appended to the policy's inputs: flag of the absorbing stat
 _GAUSSIAN = "gaussian"
 _CENTRED = ("mse", "l1", _GAUSSIAN)  # losses whose outputs are the mean action
 LAST_LR = 0.05  # final learning rate as a share of the first
+TARGET_KL = 0.05  # an iteration's passes stop if the KL divergence exceeds 1.5 times this [nats]
 _METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/explained_variance": "explained_variance"}
 
 
@@ -151,10 +151,7 @@ class Learner:
             batch_size=env.num_envs * horizon // config.minibatches,
             n_epochs=config.epochs,
             gamma=config.discount(clone=clone),
-            gae_lambda=config.gae_lambda,
-            clip_range=config.clip_range,
-            ent_coef=config.entropy,
-            target_kl=config.target_kl,
+            target_kl=TARGET_KL,
             policy_kwargs={"network": network},
             device="cpu",
         )
@@ -240,17 +237,10 @@ class Learner:
         return {"actor_critic": self.policy, **modules}
 
 
-@contextmanager
-def lent_generators(seed: int) -> Generator[None]:
-    """Seed torch's and numpy's global generators, which stable-baselines3 uses, inside; restore them afterwards."""
-    before = np.random.get_state()  # noqa: NPY002
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        np.random.seed(seed % 2**32)  # noqa: NPY002
-        try:
-            yield
-        finally:
-            np.random.set_state(before)  # noqa: NPY002
+def seed_generators(seed: int) -> None:
+    """Seed torch's and numpy's global generators, which stable-baselines3 uses."""
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002
 
 
 def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec) -> Conversion:
@@ -271,16 +261,18 @@ def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec)
     checkpoint.check_fits(spec)
     if space not in (None, checkpoint.space):
         raise MismatchError("action space", str(start), checkpoint.space, "--action_space", space)
-    return conversion_for(checkpoint.space, spec)
+    return conversion_for(checkpoint.space, spec, checkpoint)
 
 
-def start_policy(start: Path | None, space: str, spec: RobotTaskSpec, rows: tuple[F32, F32] | None) -> MLPPolicy:
+def start_policy(
+    start: Path | None, conversion: Conversion, spec: RobotTaskSpec, rows: tuple[F32, F32] | None
+) -> MLPPolicy:
     """Return an mlp with a Gaussian loss. rows: raw inputs (N, d) and targets (N, n) for the statistics of a new one.
 
     A clone keeps its own statistics and acts as before. Weights are drawn from torch's global generator.
     """
     options = (None if start is None else Checkpoint.open(start).mlp_options) or {}
-    options |= {"loss": _GAUSSIAN, "action_space": space}
+    options |= {"loss": _GAUSSIAN, "action_space": conversion.space, "grippers": conversion.grippers}
     config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
     inputs = [STATE, *([ENVIRONMENT_STATE] if spec.environment_state_names else [])]
     config.input_features, config.output_features = policy_features(features(spec), inputs)

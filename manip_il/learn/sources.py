@@ -54,24 +54,17 @@ def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
 
     Raises `ManipError`, with a remedy, for a column that the dataset lacks.
     """
-    cameras = [key for key, feature in info.features.items() if feature.is_rgb]
-    about, observes = f"{root}: the dataset has no", config.observes
-    if ACTION not in info.features:
-        raise ManipError(f"{about} {ACTION}: there is nothing to learn")
-    if STATE not in info.features:
-        raise ManipError(f"{about} {STATE}: every policy needs the measured joints")
-    if observes != "images" and ENVIRONMENT_STATE not in info.features:
-        hint = f"choose --policy.type={CNN} or act with --observation=images, or " if cameras else ""
-        raise ManipError(
-            f"{about} {ENVIRONMENT_STATE}, which --observation={observes} needs; {hint}record with manip-il record"
-        )
+    cameras = [key for key, feature in info.features.items() if feature.is_rgb] if config.takes_images else []
+    numbers = [STATE] if config.observes == "images" else [STATE, ENVIRONMENT_STATE]
+    lacking = [name for name in (ACTION, *numbers) if name not in info.features]
     if config.takes_images and not cameras:
+        lacking.append("pictures")
+    if lacking:
         raise ManipError(
-            f"{about} pictures, which --observation={observes} needs; record with --cameras=front,wrist, add pictures "
-            "with manip-il data render, or choose --observation=state"
+            f"{root}: the dataset has no {' and no '.join(lacking)}, which --observation={config.observes} needs; "
+            f"choose another --observation (--policy.type={CNN} takes images), or record with manip-il record"
         )
-    numbers = [STATE] if observes == "images" else [STATE, ENVIRONMENT_STATE]
-    return [*numbers, *(cameras if config.takes_images else [])]
+    return [*numbers, *cameras]
 
 
 def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -85,11 +85,14 @@ class Trainer:
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
         assert self.pipeline.policy is not None
         policy = self.pipeline.policy
-        conversion = conversion_for(space, spec)
-        self._conversion = conversion if is_in_processors(policy.type, conversion) else None
         self.accelerator = _accelerator(policy)
         self.accelerator.wait_for_everyone()  # the first process may be emptying the folder
         checkpoint = last_checkpoint(output_dir, resume=resume)
+        begun = Checkpoint.open(checkpoint / PRETRAINED_MODEL) if checkpoint else config.initial
+        conversion = conversion_for(space, spec, begun)
+        self._conversion = conversion if is_in_processors(policy.type, conversion) else None
+        if policy.type in OWN_SPACE:
+            vars(policy).update(action_space=conversion.space, grippers=conversion.grippers)
         self.meta: Any = JoinedDatasets(datasets)
         set_features(policy, self.meta.features, input_columns(config, first.root, first.info), config.observes)
         self.data = load_data(
@@ -104,19 +107,7 @@ class Trainer:
         drawn = row_weights(datasets, shares, self.data.train) if shares else None
         drawn = drawn if weights is None else weights[self.data.train]
         self._augment = Augment() if config.augments else None
-        options = {"eval_split": config.eval_split, "augment": asdict(self._augment) if self._augment else None}
-        self.origin = Origin.of(
-            spec,
-            first.fingerprint,
-            options,
-            config.observes,
-            recorded_look(first.provenance, first.fingerprint),
-            datasets=[
-                {"name": one.root.resolve().name, "frames": len(one), "weight": share}
-                for one, share in zip(datasets, shares or [None] * len(datasets), strict=True)
-            ],
-            action_space=space,
-        )
+        self.origin = self._origin(datasets, shares, space)
         self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(datasets[-1].root)))
         self.pipeline.output_dir = output_dir
         self.steps, self.batch_size, self.step = self.pipeline.steps, self.pipeline.batch_size, 0
@@ -124,6 +115,21 @@ class Trainer:
             self._build(policy, checkpoint)
         world = self.accelerator.num_processes
         self._order = Order(len(self.data.train), drawn, self.batch_size * world, config.seed)
+
+    def _origin(self, datasets: Sequence[Dataset], shares: Sequence[float], space: str) -> Origin:
+        first, augment = datasets[0], self._augment
+        return Origin.of(
+            first.spec,
+            first.fingerprint,
+            {"eval_split": self.config.eval_split, "augment": asdict(augment) if augment else None},
+            self.config.observes,
+            recorded_look(first.provenance, first.fingerprint),
+            datasets=[
+                {"name": one.root.resolve().name, "frames": len(one), "weight": share}
+                for one, share in zip(datasets, shares or [None] * len(datasets), strict=True)
+            ],
+            action_space=space,
+        )
 
     def _build(self, config: PreTrainedConfig, checkpoint: Path | None) -> None:
         set_seed(self.config.seed)
@@ -205,7 +211,7 @@ class Trainer:
     def validate(self) -> dict[str, float]:
         """Return the mean loss on samples of held-out episodes, without changing the random state of training.
 
-        Also returns the other numbers that the policy outputs. Every process evaluates all samples.
+        Also returns the other numbers that the policy outputs, such as the parts of its loss.
         """
         held_out, size = self.data.held_out, self.batch_size
         policy = self.unwrapped

@@ -92,16 +92,16 @@ def test_a_policy_acts_the_same_everywhere(engine: Engine, checkpoint):
 
 @pytest.mark.slow
 @both_backends
-def test_a_seed_runs_again_where_its_worker_died_and_after_three_times_is_left_out(engine: Engine, tmp_path, expected):
-    (tmp_path / "twice").mkdir()
-    twice = DeadlyJournal.of(tmp_path / "twice", JOB, SEEDS[1], SEEDS[4], times=2)
-    assert sorted(episode.seed for episode in engine.run(JOB, SEEDS, twice)) == list(SEEDS)
-    assert contents(tmp_path / "twice" / "journals") == expected
-    assert (twice.deaths(), engine.given_up) == (4, [])
+def test_a_seed_runs_again_where_its_worker_died_and_after_that_alone_is_left_out(engine: Engine, tmp_path, expected):
+    (tmp_path / "once").mkdir()
+    once = DeadlyJournal.of(tmp_path / "once", JOB, SEEDS[1], SEEDS[4], times=1)
+    assert sorted(episode.seed for episode in engine.run(JOB, SEEDS, once)) == list(SEEDS)
+    assert contents(tmp_path / "once" / "journals") == expected
+    assert (once.deaths(), engine.given_up) == (2, [])
     journal = DeadlyJournal.of(tmp_path, JOB, SEEDS[2])
     episodes = list(engine.run(JOB, SEEDS, journal))
     assert sorted(episode.seed for episode in episodes) == [seed for seed in SEEDS if seed != SEEDS[2]]
-    assert 3 <= journal.deaths() <= 4  # the first time it may not have been alone
+    assert journal.deaths() == 2
     assert engine.given_up == [SEEDS[2]]
 
 

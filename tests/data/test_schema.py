@@ -57,7 +57,7 @@ def test_a_fingerprint_names_versions_and_hashes_what_it_is_given():
     other = environment_fingerprint(b"other", {"b": 1, "a": [1, 2]})
     assert compare_fingerprints("dataset", print_, "policy", print_) == []
     (warning,) = compare_fingerprints("dataset", print_, "policy", other)
-    assert warning.startswith("compiled MuJoCo model differs: dataset has ")
+    assert warning.startswith("model_sha256 differs: dataset has ")
     assert "policy has " in warning
 
 

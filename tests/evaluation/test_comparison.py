@@ -10,7 +10,7 @@ import pytest
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.arm import Arm, Member, require_pair
 from manip_il.evaluation.comparison import Comparison, Study
-from manip_il.evaluation.intervals import Pairs
+from manip_il.evaluation.intervals import PairCounts
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.rounds import Rule, history
 
@@ -36,7 +36,7 @@ def one(name: str, outcomes: list[bool]) -> Arm:
 
 
 def test_one_policy_against_another_is_the_paired_comparison():
-    comparison, paired = Comparison.of(one("A", HARD), one("B", EASY)), Pairs.of(zip(HARD, EASY, strict=True))
+    comparison, paired = Comparison.of(one("A", HARD), one("B", EASY)), PairCounts.of(zip(HARD, EASY, strict=True))
     assert comparison.difference == pytest.approx(0.3)
     assert comparison.interval == paired.interval
     assert comparison.verdict.startswith("B is better than A by 30.0 points [20.")

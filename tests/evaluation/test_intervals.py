@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.evaluation.intervals import (
-    Pairs,
+    PairCounts,
     Proportion,
     confidence_sequence,
     sign_flip_exact,
@@ -77,7 +77,7 @@ def test_newcombes_paired_interval_agrees_with_worked_examples(
 ):
     digits = 5e-5 if round(low, 3) != low else 5e-4
     both, only_first, only_second, neither = table
-    assert Pairs(both, only_second, only_first, neither).interval == pytest.approx((low, high), abs=digits)
+    assert PairCounts(both, only_second, only_first, neither).interval == pytest.approx((low, high), abs=digits)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_with_one_training_seed_the_test_is_mcnemars_with_the_exact_binomial(onl
 @given(outcomes)
 def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(pairs: list[tuple[bool, bool]]):
     a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    forward, backward = Pairs.of(zip(a, b, strict=True)), Pairs.of(zip(b, a, strict=True))
+    forward, backward = PairCounts.of(zip(a, b, strict=True)), PairCounts.of(zip(b, a, strict=True))
     low, high = forward.interval
     assert -1 <= low <= forward.difference <= high <= 1
     assert backward.interval == pytest.approx((-high, -low), abs=1e-12)

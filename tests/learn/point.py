@@ -8,7 +8,7 @@ import torch
 from manip_il.algorithms.vector_env import ActionRange, Lockstep
 from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.learn.network import MLPNetwork, Shape
-from manip_il.learn.ppo import Learner, lent_generators
+from manip_il.learn.ppo import Learner, seed_generators
 
 STEPS, EPISODES = 10, 8
 ACTIONS = ActionRange(*(np.array(values, np.float32) for values in ([0, 0], [0.5, 0], [-1, 0], [1, 0])))
@@ -47,7 +47,7 @@ def network() -> MLPNetwork:
 
 def learner(seed: int = 0, ends: bool = True, **options: float) -> tuple[Learner, Lockstep]:
     """A learner on points, drawn from a seed."""
-    with lent_generators(seed):
-        env = Lockstep([Point(ends) for _ in range(EPISODES)], ACTIONS, STEPS)
-        config = PPOConfig(**{"minibatches": 4, **options})
-        return Learner(network(), config, env, STEPS, log_std=-0.5), env
+    seed_generators(seed)
+    env = Lockstep([Point(ends) for _ in range(EPISODES)], ACTIONS, STEPS)
+    config = PPOConfig(**{"minibatches": 4, **options})
+    return Learner(network(), config, env, STEPS, log_std=-0.5), env

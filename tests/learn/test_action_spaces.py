@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.checkpoint import META_FILE
+from manip_il.learn.checkpoint import META_FILE, Checkpoint
 from manip_il.learn.export import export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
@@ -28,6 +29,7 @@ from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
+from manip_il.tasks.stock.table import TWO_ARMS
 
 from ..tables import every_large_robot, every_robot
 from .conftest import write_table
@@ -91,6 +93,31 @@ def test_joint_spaces_lose_nothing(robot, space):
     measured = states[:, :-1] if space == JOINT_DELTA else 0.0
     np.testing.assert_array_equal(there[:, :-1], actions[:, :-1] - measured)
     np.testing.assert_array_equal(there[:, -1], actions[:, -1])
+
+
+@pytest.mark.parametrize("settings", [{"width": 8}, ACT], ids=["mlp", "act"])
+def test_both_grippers_of_two_arms_are_absolute_but_an_older_checkpoint_goes_on_as_it_was_trained(settings, tmp_path):
+    names = tuple(f"{side}_{number}" for side in ("left", "right") for number in range(7))
+    spec = RobotTaskSpec("aloha", "lift", 50, names, ("e0",), 5, "lift", action_meaning=TWO_ARMS)
+    rng = np.random.default_rng(0)
+    states, actions = rng.normal(size=(2, EPISODES * LENGTH, 14)).astype(np.float32)
+    episodes = np.repeat(np.arange(EPISODES), LENGTH)
+    sources = write_table({STATE: states, ACTION: actions, "episode_index": episodes,
+                           "label_valid": np.ones((len(states), 1), np.int64)}, tmp_path / "data", spec)  # fmt: skip
+    path = trainer_of(sources, tmp_path / "run", settings, JOINT_DELTA).fit()
+    found = Checkpoint.open(path)
+    targets = Conversion(JOINT_DELTA, grippers=found.grippers).encode(actions, states)
+    absolute = (targets == actions).all(axis=0)
+    assert (found.grippers, np.flatnonzero(absolute).tolist()) == ((6, 13), [6, 13])
+    before = LearnedPolicy.load(path).act(states, np.zeros((len(states), 1)))
+    for file in (path / "config.json", path / "policy_postprocessor.json"):  # as older versions wrote them
+        file.write_text(re.sub(r',\s*"grippers": \[[^]]*\]', "", file.read_text()))
+    assert Checkpoint.open(path).grippers == (-1,)
+    after = LearnedPolicy.load(path).act(states, np.zeros((len(states), 1)))
+    np.testing.assert_allclose(after - before, states * (np.arange(14) == 6), atol=1e-6)
+    more = trainer_of(sources, tmp_path / "more", {"path": str(path)}, None)
+    more.fit()
+    assert Checkpoint.open(tmp_path / "more/checkpoints/last/pretrained_model").grippers == (-1,)
 
 
 @every_large_robot

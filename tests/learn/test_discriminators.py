@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from manip_il.learn.adversarial_config import DiscriminatorConfig
-from manip_il.learn.discriminators import LARGEST_REWARD, AirlDiscriminator, GailDiscriminator
-from manip_il.learn.ppo import lent_generators
+from manip_il.learn.discriminators import LARGEST_REWARD, Discriminator
+from manip_il.learn.ppo import seed_generators
 from manip_il.learn.transitions import Transitions
 
 from .point import network
@@ -31,9 +31,9 @@ def log_density(steps: Transitions, mean: float) -> np.ndarray:
 
 
 def make(kind: str, **options):
-    with lent_generators(0):
-        config = DiscriminatorConfig(**{"width": 32, "steps": 200, **options})
-        return GailDiscriminator(config, network()) if kind == "gail" else AirlDiscriminator(config, network(), 0.9)
+    seed_generators(0)
+    config = DiscriminatorConfig(**{"width": 32, "steps": 200, **options})
+    return Discriminator(config, network(), None if kind == "gail" else 0.9)
 
 
 def trained(kind: str, **options):

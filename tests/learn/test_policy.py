@@ -94,7 +94,7 @@ def test_pictures_go_in_as_lerobot_feeds_them():
 
     inner = Seen()
     numbers, pictures = {"observation.state": 4}, {"front": (5, 6)}
-    policy = LearnedPolicy(inner, Checkpoint(Path("x"), {"type": "act"}, numbers, pictures, 4, "", "", None, {}))
+    policy = LearnedPolicy(inner, Checkpoint(Path("x"), {"type": "act"}, numbers, pictures, 4, "", "", (), None, {}))
     picture = np.arange(2 * 5 * 6 * 3, dtype=np.uint8).reshape(2, 5, 6, 3)
     states, environments = observations(2)
     policy.act(states, environments, {"front": picture, "wrist": picture}, [40, 30])

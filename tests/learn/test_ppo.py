@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from manip_il.learn.ppo import lent_generators
+from manip_il.learn.ppo import seed_generators
 from manip_il.learn.transitions import Transitions
 
 from .point import EPISODES, STEPS, learner
@@ -16,10 +16,10 @@ def weights(one) -> dict[str, torch.Tensor]:
 
 
 def iterate(one, env, number: int, actor: bool = True) -> Transitions:
-    with lent_generators(number):
-        env.seed(number * EPISODES)
-        rows = one.collect()
-        one.improve(-np.abs(rows.next_states[:, 0]), actor=actor)
+    seed_generators(number)
+    env.seed(number * EPISODES)
+    rows = one.collect()
+    one.improve(-np.abs(rows.next_states[:, 0]), actor=actor)
     return rows
 
 
@@ -43,8 +43,8 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
 def test_of_the_actors_own_actions_the_density_is_at_its_mean():
     one, env = learner()
     env.seed(0)
-    with lent_generators(0):
-        rows = one.collect()
+    seed_generators(0)
+    rows = one.collect()
     live = one.log_prob(rows)[~rows.absorbing]
     assert abs(live.mean()) < 4 * live.std() / np.sqrt(len(live)) + 0.05
 
@@ -59,8 +59,8 @@ def test_in_the_absorbing_state_every_action_is_as_likely():
 def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_step():
     one, env = learner()
     env.seed(0)
-    with lent_generators(0):
-        rows = one.collect()
+    seed_generators(0)
+    rows = one.collect()
     flags = rows.absorbing.reshape(STEPS, EPISODES)
     assert len(rows) == STEPS * EPISODES
     assert (np.diff(flags.astype(int), axis=0) >= 0).all(), "an absorbing state is never left"

@@ -73,7 +73,7 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     assert main(["record", f"--task.type={touch}", *words]) == 0
     assert main(["data", "check", "data"]) == 0
     assert not is_known("panda", "touch")
-    with pytest.raises(ManipError, match=r"--task\.type=PATH/touch\.py"):
+    with pytest.raises(ManipError, match="unknown task 'touch'"):
         open_source(tmp_path / "data")
     assert open_source(tmp_path / "data", task=str(touch)).warnings == ()
     assert main(["eval", "--policy.type=expert", f"--task.type={touch}", "--eval.n_episodes=2", "--eval.films=0",

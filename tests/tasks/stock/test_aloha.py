@@ -158,7 +158,7 @@ def test_names_and_numbers_are_those_of_lerobots_datasets(task: str):
     left = episode.columns["observation.state"][:, 6]
     assert 0 <= left.min() < left.max() < 1.1
     assert episode.success
-    assert conversion_for("joint_delta", spec).space == "joint_delta"
+    assert conversion_for("joint_delta", spec).grippers == (6, 13)
 
 
 @every_task
