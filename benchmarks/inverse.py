@@ -29,8 +29,8 @@ from manip_il.rewards.methods import METHODS, learn
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.tasks.carry.grid import Grid
+from manip_il.tasks.carry.layout import TASTES
 from manip_il.tasks.carry.obstacles import layout_of
-from manip_il.tasks.carry.reward import TASTES
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
 from manip_il.tasks.pick_place import OBJECT

@@ -36,9 +36,8 @@ from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.mdp import Episode
 from manip_il.rewards.methods import METHODS, learn
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-from manip_il.tasks.carry.layout import OBSTACLES, path_features
+from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Reward, path_features
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
-from manip_il.tasks.carry.reward import TASTES, Reward
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.pick_place import OBJECT

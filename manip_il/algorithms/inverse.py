@@ -26,9 +26,8 @@ from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
 from manip_il.rewards.paths import Demonstration, cheapest_path, plan
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid
-from manip_il.tasks.carry.layout import OBSTACLES
+from manip_il.tasks.carry.layout import FEATURES, OBSTACLES
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
-from manip_il.tasks.carry.reward import FEATURES
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT

@@ -143,6 +143,6 @@ class CompareOptions(Tested, Seeded, Trusting):
 
         write_json(folder / FILE_NAME, study.to_json())
         compare_report(study, title, command_line(), config).write(folder / REPORT_FILE)
-        for table in (*study.result_tables(), *study.cost_tables()):
+        for table in study.tables:
             print_table(table)
         say(study.verdict, *study.facts, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")

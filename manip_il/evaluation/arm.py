@@ -11,9 +11,9 @@ from typing import Any
 
 from manip_il.collect.workers import Engine
 from manip_il.data.json_lines import read_lines
-from manip_il.errors import MismatchError, UsageError
-from manip_il.evaluation.policy_folder import EXPECTED, find_policy, require_source
-from manip_il.evaluation.results import FILE_NAME, EvalResult
+from manip_il.errors import UsageError
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.runner import FOLDER, Progress, Trial
 from manip_il.learn.checkpoint import policy_sha256
@@ -106,7 +106,6 @@ def select_rounds(rule: Rule, arms: Sequence[Arm]) -> tuple[Rule, tuple[Arm, ...
 
 def read_arm(path: Path) -> Arm:
     """Return the arm at `path`. Raises a one-line `UsageError` if it cannot be compared."""
-    require_source(path)
     folders = [folder for folder in path.iterdir() if folder.is_dir()] if path.is_dir() else []
     seeds = {int(match[1]): folder for folder in folders if (match := _SEED_FOLDER.fullmatch(folder.name))}
     if not seeds:
@@ -133,10 +132,7 @@ def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
     """Return the environment that all share, given by name. Raises `MismatchError` naming the first difference."""
     (first, env), *others = envs.items()
     for name, other in others:
-        for field in fields(env):
-            ours, theirs = getattr(env, field.name), getattr(other, field.name)
-            if ours != theirs:
-                raise MismatchError(field.name, first, ours, name, theirs)
+        require_equal(first, env, name, other, *(field.name for field in fields(env)))
     return env
 
 
@@ -152,7 +148,8 @@ def read_member(path: Path) -> Member:
     try:
         return Member(path, policy=find_policy(path))
     except UsageError:
-        raise UsageError(f"{path} holds nothing to compare; {EXPECTED}") from None
+        expected = "an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
+        raise UsageError(f"{path} holds nothing to compare; expected {expected}") from None
 
 
 def _round_folder(run: Path, one: Round) -> Path:

@@ -71,12 +71,6 @@ class Row:
         return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
 
     @property
-    def mean_steps(self) -> float | None:
-        """The mean over solved cases of the control steps until solved."""
-        steps = [case.steps for case in self.cases if case.steps is not None]
-        return float(np.mean(steps)) if steps else None
-
-    @property
     def gaps(self) -> list[int]:
         """Q*(s, a) - V*(s) of each wrong action [control steps]; the whole horizon if the expert did not recover."""
         known = [(case.steps, case.undisturbed) for case in self.cases if case.undisturbed is not None]
@@ -84,8 +78,8 @@ class Row:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; a case is [seed, moment, steps, undisturbed]."""
-        found = {"group": self.group, "kind": self.kind, "words": self.words, "n": len(self.cases)}
-        found |= {"left_out": self.left_out, "mean_steps": self.mean_steps}
+        found = {"group": self.group, "kind": self.kind, "words": self.words}
+        found |= {"n": len(self.cases), "left_out": self.left_out}
         found |= self.success.to_json() if self.success else {"success_rate": None, "interval": None}
         return found | {"cases": [list(case) for case in self.cases]}
 
@@ -107,37 +101,25 @@ class Certificate:
         """Return the rows of a group."""
         return tuple(row for row in self.rows if row.group == group)
 
-    def pooled(self, group: Group, words: str = "") -> Row:
-        """Return all cases of a group as one row."""
-        rows = self.of(group)
-        cases = tuple(case for row in rows for case in row.cases)
-        return Row(group, "all", words, cases, self.settings["horizon"], sum(row.left_out for row in rows))
-
     @property
     def mu(self) -> int | None:
         """The largest gap of all wrong actions [control steps]: the empirical u of Ross et al. (2011)."""
-        return max(self.pooled("action").gaps, default=None)
+        return max((gap for row in self.of("action") for gap in row.gaps), default=None)
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `certificate.json`."""
         content = {"robot": self.robot, "task": self.task, "fingerprint": dict(self.fingerprint)}
         content |= {"settings": dict(self.settings), "confidence": CONFIDENCE, "mu": self.mu}
-        return content | {"rows": [row.to_json() for row in self._with_pooled]}
-
-    @property
-    def _with_pooled(self) -> tuple[Row, ...]:
-        states, actions = self.pooled("state", "all changed states"), self.pooled("action", "all wrong actions")
-        return (*self.of("start"), *self.of("state"), states, *self.of("action"), actions)
+        return content | {"rows": [row.to_json() for row in self.rows]}
 
     def table(self) -> Table:
-        """Return one row per kind: how often and how fast the expert recovers, and what a wrong action costs."""
+        """Return one row per kind: how often the expert recovers, and what a wrong action costs."""
         rows: list[tuple[str, ...]] = []
-        for row in self._with_pooled:
-            steps = "" if row.mean_steps is None else f"{row.mean_steps:.1f}"
+        for row in self.rows:
             gaps = row.gaps if row.group == "action" else []
             costs = (f"{np.mean(gaps):.1f}", str(max(gaps))) if gaps else ("", "")
-            rows.append((row.words, str(row.success or ""), steps, *costs, str(len(row.cases)), str(row.left_out)))
-        head = ("the expert continues from", f"solved {INTERVAL}", "mean steps", "mean cost", "largest cost")
+            rows.append((row.words, str(row.success or ""), *costs, str(len(row.cases)), str(row.left_out)))
+        head = ("the expert continues from", f"solved {INTERVAL}", "mean cost", "largest cost")
         return Table((*head, "cases", "left out"), tuple(rows))
 
 

@@ -21,9 +21,9 @@ from manip_il.evaluation.intervals import (
     mean_interval,
     sign_flip_exact,
 )
-from manip_il.evaluation.results import EvalResult, require_equal
+from manip_il.evaluation.results import EvalResult, require_comparable
 from manip_il.evaluation.rounds import COSTS, Cost, Round, Rule, format_amount, has_unlabelled_steps
-from manip_il.evaluation.tables import NO_CONDITION, Table
+from manip_il.evaluation.tables import Table
 
 FILE_NAME = "compare.json"
 TARGET = 0.95
@@ -43,7 +43,7 @@ class Comparison:
 
     def __post_init__(self) -> None:
         for left, right in self.results:
-            require_equal(self.left, left, self.right, right)
+            require_comparable(self.left, left, self.right, right)
         if not all(self._outcomes):
             raise ManipError(f"{self.left} and {self.right} share no seed; evaluate both with the same --seed=")
 
@@ -186,14 +186,11 @@ class Study:
             facts.append(self.rule.fact)
         return facts
 
-    def result_tables(self) -> tuple[Table, ...]:
-        """Return the table of results, and success by condition if there are several."""
-        several = self.baseline is not None and len(self.arms[0].members[0].test.by_condition) > 1
-        return (self.results_table(), *([self.condition_table()] if several else []))
-
-    def cost_tables(self) -> tuple[Table, ...]:
-        """Return the costs to reach the target; empty unless all arms are runs."""
-        return (self.target_table(),) if all(arm.has_histories for arm in self.arms) else ()
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """The results, and the costs to reach the target if all arms are runs."""
+        runs = all(arm.has_histories for arm in self.arms)
+        return (self.results_table(), self.target_table()) if runs else (self.results_table(),)
 
     def results_table(self) -> Table:
         """Return one row per arm: mean costs, validation, test success, difference.
@@ -210,20 +207,6 @@ class Study:
             rows.append((arm.name, *cells, points or ""))
         head = ("arm", *map(_head, self._costs), "validation", "test", f"test, against {self.baseline}")
         return Table(head, tuple(rows))
-
-    def condition_table(self) -> Table:
-        """Return one row per condition: success of every arm, averaged over training seeds."""
-        rows = [
-            (
-                name or NO_CONDITION,
-                *(
-                    format_percent(fmean(member.test.by_condition[name].success.rate for member in arm.members))
-                    for arm in self.arms
-                ),
-            )
-            for name in self.arms[0].members[0].test.by_condition
-        ]
-        return Table(("condition", *(arm.name for arm in self.arms)), tuple(rows))
 
     def target_table(self) -> Table:
         """Return one row per arm: its mean costs when validation first reached the target in each training seed."""

@@ -11,22 +11,19 @@ from typing import Any
 from manip_il.evaluation.comparison import Study
 from manip_il.evaluation.figures import (
     ARMS,
-    MAP_NOTE,
     Bar,
     Curve,
     Figure,
     curve_figures,
     curve_note,
-    failure_map,
     rates_figure,
+    start_map,
 )
 from manip_il.evaluation.report import Film, Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.tables import BASELINE, PolicyRow, Table, evaluation_table, policy_table
-from manip_il.sim.task import NO_PHASE, phases
+from manip_il.sim.task import phases
 from manip_il.tasks.table import TASKS
-
-_NO_PHASE = "not even the expert can continue: an object is off the table, or something is out of reach"
 
 
 def eval_report(
@@ -38,7 +35,7 @@ def eval_report(
 ) -> Report:
     """Return the report of an evaluation. no_films: the reason if there are none."""
     fails = failures_sections(
-        [("failed episodes", result.episodes)], result.task, "Where it fails", failure_map(result.episodes)
+        [("failed episodes", result.episodes)], result.task, "Where it fails", start_map(result.episodes)
     )
     if result.success.successes == result.success.n:
         fails = [Section("Where it fails", (f"No failure in {result.success.n:,} episodes.",))]
@@ -60,11 +57,9 @@ def run_report(
     **parts: Any,
 ) -> Report:
     """Return the report of a run's policies, one per row. parts: title, verdict and the like, see `Report`."""
-    sizes = sorted({row.success.n for row in rows})
-    episodes = " to ".join(f"{size:,}" for size in dict.fromkeys((sizes[0], sizes[-1])))
-    note = f"Each policy ran {episodes} episodes. Intervals are Wilson's score intervals."
+    note = f"Each policy ran {rows[0].result.success.n:,} episodes. Intervals are Wilson's score intervals."
     note += next((disturbed_note(row.disturbed) for row in rows if row.disturbed), "")
-    bars = [Bar(row.name, (row.success,), row.colour) for row in rows]
+    bars = [Bar(row.name, (row.result.success,), row.colour) for row in rows]
     results = Section("Results", figures=(rates_figure(bars),), tables=(policy_table(rows),), notes=(note,))
     return Report(sections=(results, *curve_sections(curves), *_looks(films, no_films)), **parts)
 
@@ -74,15 +69,14 @@ def compare_report(study: Study, title: str, command: str, config: Mapping[str, 
     colours = arm_colours(study)
     first = study.arms[0].members[0].test
     of_arms = tuple(colours.values())
-    results, *conditions = study.result_tables()
-    results, costs = replace(results, colours=of_arms), [replace(one, colours=of_arms) for one in study.cost_tables()]
+    results, *costs = (replace(table, colours=of_arms) for table in study.tables)
     bars = [Bar(arm.name, tuple(one.test.success for one in arm.members), colours[arm.name]) for arm in study.arms]
     same = "the same " if study.baseline is not None else ""
     note = f"Every policy ran {same}{first.success.n:,} test episodes, which were used for no choice."
     note += disturbed_note(first)
     if len(bars[0].successes) > 1:
         note += " In brackets and as dots: each training seed; the bar is their mean."
-    sections = [Section("Results", figures=(rates_figure(bars),), tables=(results, *conditions), notes=(note,))]
+    sections = [Section("Results", figures=(rates_figure(bars),), tables=(results,), notes=(note,))]
     if study.baseline is not None:
         failed = [(arm.name, [*chain(*(one.test.episodes for one in arm.members))]) for arm in study.arms]
         sections += failures_sections(failed, first.task, "Where they fail")
@@ -117,7 +111,7 @@ def failures_sections(
     table = phase_table(policies, task)
     if not figures and table is None:
         return []
-    return [Section(heading, figures=figures, tables=(table,) if table else (), notes=(MAP_NOTE,) if figures else ())]
+    return [Section(heading, figures=figures, tables=(table,) if table else ())]
 
 
 def curve_sections(
@@ -147,29 +141,18 @@ def phase_table(policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: s
         return None
     known = phases(TASKS[task]) if task in TASKS else ()
     names = [*known, *sorted(found.difference(known))]
-    rows = ((_phase_words(name), *(f"{counts[name]:,}" for counts in counted)) for name in names)
+    rows = ((_spaced(name), *(f"{counts[name]:,}" for counts in counted)) for name in names)
     return Table(("phase that it ended in", *(name for name, _ in policies)), tuple(rows))
-
-
-def _phase_words(name: str) -> str:
-    return _spaced(name) if name != NO_PHASE else f"{name}\n{_NO_PHASE}"
 
 
 def evaluation_verdict(result: EvalResult) -> str:
     """Return the first sentence: success with its interval, and the phase in which most failures end."""
-    success, episodes = result.success, f"unseen episodes of {result.robot} {result.task}"
-    failed = success.n - success.successes
-    if not failed:
-        return f"{result.policy} succeeds in all {success.n:,} {episodes}: {success}."
-    if success.successes == 0:
-        verdict = f"{result.policy} fails in all {success.n:,} {episodes}: {success}"
-    else:
-        verdict = f"{result.policy} succeeds in {success} of {success.n:,} {episodes}"
-    phase = next(filter(None, result.failures), "")  # missing in old files
-    if not phase:
+    success = result.success
+    verdict = f"{result.policy} succeeds in {success} of {success.n:,} unseen episodes of {result.robot} {result.task}"
+    phase, count = next(iter(result.failures.items()), ("", 0))
+    if not phase:  # nothing failed, or the file is from before phases were kept
         return f"{verdict}."
-    share = f"{result.failures[phase]:,} of its {failed:,} failures end" if failed > 1 else "its one failure ends"
-    return f"{verdict}; {share} in the phase {_spaced(phase)}."
+    return f"{verdict}; {count:,} of its {success.n - success.successes:,} failures end in the phase {_spaced(phase)}."
 
 
 def _conditions(result: EvalResult) -> Section:

@@ -1,4 +1,4 @@
-"""Figures of reports, drawn by matplotlib as SVG: success rates, learning curves, and where episodes fail.
+"""Figures of reports, drawn by matplotlib as SVG: success rates, learning curves, and the starts of failed episodes.
 
 A panel is as wide as a phone's screen, so that its text stays readable there; wide windows show panels side by side.
 """
@@ -6,7 +6,6 @@ A panel is as wide as a phone's screen, so that its text stays readable there; w
 from __future__ import annotations
 
 import io
-import math
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,14 +25,8 @@ ARMS = (DAGGER, CLONING, EXPERT, "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
 _MARKERS = "osD^"  # distinguishable without colour
 _PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]
 _NAME = 20  # characters per line of a bar's name
-_LOG_SPAN = 20  # a cost axis is logarithmic if its amounts differ by at least this factor
 _COST_WORDS = {"labels": "expert labels", "steps": "simulated steps", "seconds": "wall-clock [s]"}
 _DPI = 96
-MAX_MARKS = 200  # number shown on a map per outcome; more would hide each other
-MAP_NOTE = (
-    "Circles: starts, squares: goals, crosses: where failed episodes ended. "
-    f"At most the first {MAX_MARKS} episodes of each outcome are drawn."
-)
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same whatever fonts a machine has
     "svg.hashsalt": "manip_il",  # makes equal figures equal bytes
@@ -108,9 +101,7 @@ class Bar:
 
 def rates_figure(bars: Sequence[Bar]) -> Figure:
     """Draw success rates as bars from 0 to 100 %, with intervals, or with one dot per training seed."""
-    # at most three short lines, broken at spaces and slashes
-    lines = [textwrap.wrap(bar.name.replace("/", "/ "), _NAME)[-3:] for bar in bars]
-    names = ["\n".join(plain(part.replace("/ ", "/")) for part in parts) for parts in lines]
+    names = [textwrap.fill(plain(bar.name), _NAME) for bar in bars]
     height = 0.55 + sum(0.24 + 0.14 * (1 + name.count("\n")) for name in names)
     with drawing(1, size=(4.4, height)) as (drawn, axes):
         axis = axes[0, 0]
@@ -150,9 +141,6 @@ def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple
 
     Steps are omitted if every step was labelled, as they then equal the labels.
     """
-    rounds = [one for curve in curves for run in curve.runs for one in run]
-    lowest = min([one.validation.interval[0] for one in rounds] + ([] if target is None else [target]))
-    floor = math.floor(10 * lowest) * 10 if lowest > 0.5 else 0  # unlike bars, the axis of points may start above 0
     queried = not any(has_unlabelled_steps(run) for curve in curves for run in curve.runs)
     figures: list[Figure] = []
     for cost in COSTS:
@@ -160,16 +148,14 @@ def curve_figures(curves: Sequence[Curve], target: float | None = None) -> tuple
             continue
         shown = [curve for curve in curves if cost in curve.costs]
         with drawing(1, size=_PANEL) as (drawn, axes):
-            _draw_curves(axes[0, 0], shown, cost, floor, target)
+            _draw_curves(axes[0, 0], shown, cost, target)
             if len(curves) > 1 or target is not None:
                 drawn.legend(loc="outside upper left", ncols=2)
             figures.append(to_figure(drawn, f"Validation success over {cost}: {', '.join(one.name for one in shown)}"))
     return tuple(figures)
 
 
-def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, target: float | None) -> None:
-    amounts = [one.amount(cost) for curve in curves for run in curve.runs for one in run]
-    name = _COST_WORDS.get(cost, cost)
+def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, target: float | None) -> None:
     for place, curve in enumerate(curves):
         style: dict[str, Any] = {"color": curve.colour, "marker": _MARKERS[place % len(_MARKERS)]}
         style["label"] = plain(textwrap.shorten(curve.name, 40))
@@ -186,10 +172,7 @@ def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, floor: float, t
         axis.plot(xs, ys, lw=1.8, ms=5, **style)
     if target is not None:
         axis.axhline(100 * target, color=INK, ls="--", lw=1, label=f"target, {format_percent(target)}")
-    if min(amounts) > 0 and max(amounts) / min(amounts) >= _LOG_SPAN:
-        axis.set_xscale("log")
-        name += ", logarithmic"
-    axis.set(xlabel=name, ylim=(floor - 2, 102), ylabel="validation success [%]")
+    axis.set(xlabel=_COST_WORDS.get(cost, cost), ylim=(-2, 102), ylabel="validation success [%]")
 
 
 def curve_note(curves: Sequence[Curve]) -> str:
@@ -200,31 +183,16 @@ def curve_note(curves: Sequence[Curve]) -> str:
     return f"Validation success by round; {marks}. Wall-clock is collecting and fitting, without validating."
 
 
-def failure_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
-    """Draw a top view of starts, goals and where episodes failed; no figure if no episode has its positions.
-
-    Shows at most the first `MAX_MARKS` failed and solved episodes each.
-    """
-    places = [(one.success, [one.place("start"), one.place("goal"), one.place("end")]) for one in episodes]
-    known = [(success, own) for success, own in places if None not in own]
+def start_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
+    """Draw a top view of where the object starts in solved and failed episodes; no figure if that is unknown."""
+    known = [(one.success, one.start) for one in episodes if one.start]
     if not known:
         return ()
-    points = np.array([own[:2] for _, own in known])[:, :, :2].reshape(-1, 2)  # starts and goals
-    middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, 0.55 * float(np.ptp(points, axis=0).max()) + 0.01
     with drawing(1, size=(_PANEL[0], 4.6)) as (drawn, axes):
         axis = axes[0, 0]
-        for name, success, colour in (("solved", True, BASELINE), ("failed, from start to goal", False, CLONING)):
-            marks = np.array([own for outcome, own in known if outcome == success][:MAX_MARKS]).reshape(-1, 3, 3)
-            starts, goals, ends = marks[:, :, :2].transpose(1, 2, 0)
-            style: dict[str, Any] = {"color": colour, "ls": "", "ms": 4, "alpha": 0.5 if success else 0.9}
-            style["fillstyle"] = "none" if success else "full"
-            axis.plot(*starts, marker="o", label=name, **style)
-            axis.plot(*goals, marker="s", **style)
-            if not success:
-                axis.plot(*np.stack([starts, goals], axis=1), color=colour, lw=0.7, alpha=0.3)
-                axis.plot(*ends, "x", color=INK, ms=4, mew=0.9, alpha=0.6)
-        # The view covers starts and goals, however far an object rolled away.
-        axis.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
-        axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]")
+        for success, name, marker, colour in ((True, "solved", ".", BASELINE), (False, "failed", "x", CLONING)):
+            starts = [start[:2] for outcome, start in known if outcome == success]
+            axis.plot(*np.reshape(starts, (-1, 2)).T, marker, color=colour, ms=5, label=name)
+        axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]", aspect="equal")
         drawn.legend(loc="outside lower left")
-        return (to_figure(drawn, "Starts, goals and ends of failed episodes, seen from above"),)
+        return (to_figure(drawn, "Starts of solved and failed episodes, seen from above"),)

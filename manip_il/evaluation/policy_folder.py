@@ -9,7 +9,6 @@ from manip_il.errors import UsageError
 
 _PLACES = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
 _NEWEST = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")
-EXPECTED = "expected an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
 _REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
 
 
@@ -26,12 +25,6 @@ def find_policy(path: Path) -> Path:
             return found[-1].parent
     wanted = f"LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
     raise UsageError(f"no policy in {path}; expected {wanted}")
-
-
-def require_source(path: Path) -> None:
-    """Raise `UsageError` if nothing that can be compared is at `path`."""
-    if not path.exists():
-        raise UsageError(f"{path} does not exist; {EXPECTED}{hub_hint(path)}")
 
 
 def hub_hint(path: Path, kind: str = "") -> str:

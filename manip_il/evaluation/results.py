@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
 from manip_il.data.atomic import write_file
@@ -49,13 +49,14 @@ class EpisodeResult:
         name = self.detail.get("condition")
         return name if isinstance(name, str) else ""
 
-    def place(self, when: Literal["start", "end", "goal"]) -> list[float] | None:
-        """Return the start, end or goal position of the object, or of the hand if the task has none; None if unknown.
+    @property
+    def start(self) -> list[float] | None:
+        """Where the object, or the hand if the task has none, starts; None if unknown.
 
         x away from the robot, y to its left, z above the table's top [m].
         """
-        found = self.detail.get(when)
-        return found.get("object", found.get("hand")) if isinstance(found, Mapping) else found
+        found = self.detail.get("start", {})
+        return found.get("object", found.get("hand"))
 
     def to_json(self) -> dict[str, Any]:
         """Return the episode as stored in `eval.json`."""
@@ -248,7 +249,7 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     (first, one), *others = parts.items()
     for name, other in others:
         known = one.policy_sha256 or other.policy_sha256  # otherwise only the names show whether the policy is the same
-        require_equal(first, one, name, other, "policy_sha256" if known else "policy")
+        require_comparable(first, one, name, other, "policy_sha256" if known else "policy")
     if stopped := next((name for name, part in parts.items() if part.until_width is not None), None):
         raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes merge")
     episodes = [episode for part in parts.values() for episode in part.episodes]
@@ -261,12 +262,15 @@ def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -
     write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
-def require_equal(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
-    """Raise `MismatchError` naming the first field that differs: one of `more`, robot, task, or a setting."""
-    sides = [(name, getattr(one, name), getattr(other, name)) for name in (*more, "robot", "task")]
-    own = [field.name for field in fields(EvalSettings)]
-    sides += [(name, getattr(one.settings, name), getattr(other.settings, name)) for name in own]
-    for name, ours, theirs in sides:
+def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:
+    """Raise `MismatchError` for the first attribute in which two objects differ. left, right: what they are called."""
+    for name in names:
+        ours, theirs = getattr(one, name), getattr(other, name)
         if ours != theirs:
-            words = ("; ".join(map(str, side)) if isinstance(side, tuple) else side for side in (ours, theirs))
-            raise MismatchError(name, left, next(words), right, next(words))
+            raise MismatchError(name, left, ours, right, theirs)
+
+
+def require_comparable(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
+    """Raise `MismatchError` if two evaluations differ in one of `more`, robot, task, or a setting."""
+    require_equal(left, one, right, other, *more, "robot", "task")
+    require_equal(left, one.settings, right, other.settings, *(field.name for field in fields(EvalSettings)))

@@ -15,7 +15,7 @@ from manip_il.collect.workers import Engine
 from manip_il.errors import UsageError
 from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
 from manip_il.evaluation.film import encode_jpeg
-from manip_il.evaluation.report import Report, Section, Still
+from manip_il.evaluation.report import Film, Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
@@ -139,7 +139,7 @@ def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
 
 
 def check_report(
-    check: RobotCheck, pictures: Sequence[Still], no_pictures: str, command: str, config: Mapping[str, Any]
+    check: RobotCheck, pictures: Sequence[Film], no_pictures: str, command: str, config: Mapping[str, Any]
 ) -> Report:
     """Return the HTML report of a check. no_pictures: the reason if there are none."""
     lead = () if pictures else (f"No pictures: {no_pictures}",)
@@ -163,7 +163,7 @@ def check_report(
         config=config,
         sections=(
             Section("Tasks", tables=(task_table(check),), notes=(tasks,)),
-            Section("At home in its scene", lead, stills=tuple(pictures), notes=(home,)),
+            Section("At home in its scene", lead, films=tuple(pictures), notes=(home,)),
             Section("Where it reaches", figures=(_reach_figure(check.robot),), notes=(reach,)),
         ),
     )
@@ -223,7 +223,7 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def looks(name: str) -> tuple[Still, ...]:
+def looks(name: str) -> tuple[Film, ...]:
     """Return pictures of a robot at home, with the axes of its frame `ee`.
 
     Raises `RenderError` without off-screen OpenGL.
@@ -247,5 +247,5 @@ def looks(name: str) -> tuple[Still, ...]:
     )
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
     return tuple(
-        Still(words, encode_jpeg(framed_picture(scene, data, view, (480, 640), FILM))) for view, words in views
+        Film(words, poster=encode_jpeg(framed_picture(scene, data, view, (480, 640), FILM))) for view, words in views
     )

@@ -129,17 +129,16 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
             "steps_to_success": first,
             "condition": turn_of(job.conditions, episode.seed).name,
             "drawn": drawn,
-            "goal": start.pop("goal", None),
             "start": start,
-            "end": {name: at for name, at in end.items() if name != "goal"},
+            "end": end,
         },
     )
 
 
 def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
-    """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects, and `goal`.
+    """Return the true positions [m] in one row of `sim_state` (m,), of `hand` and objects.
 
-    The first object that the episode is about is named `object`; `goal` is the target of the object or of the hand.
+    The first object that the episode is about is named `object`.
     """
     state = State.from_vector(sim_state)
     if env.robot in STOCK:
@@ -150,7 +149,7 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
         world = _world(config_scene(env))
         task = world.scene.task
         world.restore(state.physics, state.variation)
-        found = {"hand": world.ee.position, "goal": task.destination(world)}
+        found = {"hand": world.ee.position}
         for name in world.scene.objects:
             found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
@@ -209,9 +208,6 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
         return {}
     for key, now in common.items():
         if (before := records[0].get(key)) != now:
-            if isinstance(before, dict) and isinstance(now, dict):  # name only what differs
-                differ = [name for name in before | now if before.get(name) != now.get(name)]
-                before, now = ({name: one.get(name) for name in differ} for one in (before, now))
             what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
             raise MismatchError(what, "then", before, "now", now)
     return {result.seed: result for result in results}

@@ -11,7 +11,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from manip_il.errors import printable
-from manip_il.evaluation.intervals import CONFIDENCE, Proportion
+from manip_il.evaluation.intervals import CONFIDENCE
 from manip_il.evaluation.results import EvalResult
 
 INTERVAL = f"[{CONFIDENCE:.0%} interval]".replace("%", " %")  # part of a column's header
@@ -68,11 +68,6 @@ class PolicyRow:
     labels: int | None = None
     disturbed: EvalResult | None = None
     colour: str = DAGGER
-
-    @property
-    def success(self) -> Proportion:
-        """Episodes that succeeded at some time."""
-        return self.result.success
 
 
 def policy_table(rows: Sequence[PolicyRow]) -> Table:

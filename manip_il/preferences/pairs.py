@@ -122,11 +122,6 @@ class Clips:
         found = [one.progress for one in self.frames]
         return None if any(one is None for one in found) else np.concatenate([one for one in found if one is not None])
 
-    @property
-    def too_short(self) -> int:
-        """Number of episodes that are shorter than a clip."""
-        return sum(int((one.lengths < self.pairs.clip).sum()) for one in self.frames)
-
     @cached_property
     def rows(self) -> I64:
         """Rows in `inputs` of the frames of left and right clips, (P, 2, L)."""

@@ -40,7 +40,7 @@ class PathProblem:
     goal: int
 
     @cached_property
-    def _numbers(self) -> Any:
+    def numbers(self) -> Any:
         """Edge numbers, counted from 1, as a sparse matrix from -> to, (S, S)."""
         return csr_array((np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes))
 
@@ -50,12 +50,12 @@ class PathProblem:
 
     def matrix(self, values: F64) -> Any:
         """Return values of the edges (E,) as a sparse matrix from -> to, (S, S). Zeros are stored too."""
-        numbers = self._numbers
+        numbers = self.numbers
         return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
     def edges_of(self, path: I64) -> I64:
         """Return the edges (n - 1,) along a path of nodes (n,). Raises `ManipError` if an edge is missing."""
-        numbers = self._numbers
+        numbers = self.numbers
         found = np.array([numbers[pair] for pair in pairwise(path.tolist())], np.int64) - 1
         if (found < 0).any():
             raise ManipError("no edge joins two consecutive nodes of a path")

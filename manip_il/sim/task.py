@@ -115,10 +115,6 @@ class Task(Protocol):
         """Return the entries of `environment_state` by name, in its order: numbers, and vectors of x, y and z."""
         ...
 
-    def destination(self, world: World) -> F64:
-        """Return the target of the object, or of the hand if there is none, (3,) [m]; for reports only."""
-        ...
-
     def error(self, world: World) -> float:
         """Return how far the task is from being solved [m]; within the tolerance it is solved."""
         ...

@@ -106,10 +106,6 @@ class ClearTable:
             **{f"{one}.in_box": float(_inside(world, one)) for one in COLOURS},
         }
 
-    def destination(self, world: World) -> F64:
-        """Return the middle of the box, (3,) [m]."""
-        return world.pose(BOX).position
-
     def error(self, world: World) -> float:
         """Return the summed distances of the cubes outside the box from its middle [m]."""
         at = world.pose(BOX).position

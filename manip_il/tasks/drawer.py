@@ -264,10 +264,6 @@ class Drawer:
             "drawer_from_object": middle_of_drawer(world) - cube,
         }
 
-    def destination(self, world: World) -> F64:
-        """Return the middle of the drawer, (3,) [m]."""
-        return middle_of_drawer(world)
-
     def error(self, world: World) -> float:
         """Return how far the drawer is open [m], plus the object's distance if it is not inside."""
         missing = 0.0 if is_in_drawer(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))

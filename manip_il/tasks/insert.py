@@ -173,10 +173,6 @@ class Insert:
             "turn": way.turn,
         }
 
-    def destination(self, world: World) -> F64:
-        """Return the middle of the hole's floor, (3,) [m]."""
-        return world.pose(HOLE).position
-
     def error(self, world: World) -> float:
         """Return the distance of the peg's lower end from the middle of the hole's floor [m]."""
         return math.dist(lower_end(world), world.pose(HOLE).position)

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.rests import LEAST_HEIGHT
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
 from manip_il.sim.world import GOAL, World
@@ -65,22 +64,15 @@ class PickPlace:
         """Return hand, goal, cube and the vectors between them; the yaw times four, as the cube's faces are alike."""
         return observe_cube(world, OBJECT)
 
-    def destination(self, world: World) -> F64:
-        """Return the goal, (3,) [m]."""
-        return world.goal
-
     def error(self, world: World) -> float:
         """Return the distance of the cube's centre from the goal [m]."""
         return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label (a mesh lies too wide or too low for the gripper), or ""."""
-        if world.hull(OBJECT) is None or (lie := lie_of(world, OBJECT)).fits or held(world, OBJECT):
+        if lie_of(world, OBJECT).fits or held(world, OBJECT):
             return ""
-        if lie.tall < LEAST_HEIGHT:
-            return f"{OBJECT} lies on a side on which it is {lie.tall:.3f} m high, too low for the fingers"
-        width = min(width for _, width, _, _ in lie.grasps)
-        return f"{OBJECT} lies on a side on which it is {width:.3f} m wide, too wide for the gripper"
+        return f"{OBJECT} lies on a side on which it is too low or too wide for the gripper"
 
     def progress(self, world: World) -> float:
         """Return progress by the distance left along the ladder's path."""

@@ -7,7 +7,6 @@ import math
 import mujoco
 import numpy as np
 
-from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import World
@@ -93,10 +92,6 @@ class Press:
         """Return the hand, the middle of the cap's top, and the vector to it."""
         cap = world.pose(CAP).position
         return {**observe_hand(world), CAP: cap, "cap_from_ee": cap - world.ee.position}
-
-    def destination(self, world: World) -> F64:
-        """Return the middle of the cap's top, (3,) [m]."""
-        return world.pose(CAP).position
 
     def error(self, world: World) -> float:
         """Return how far the cap is from its stop [m]."""

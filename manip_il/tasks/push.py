@@ -173,10 +173,6 @@ class Push:
         seen = {"goal": goal, PUCK: puck, "puck_from_ee": puck - world.ee.position, "goal_from_puck": goal - puck}
         return {**observe_hand(world), **seen}
 
-    def destination(self, world: World) -> F64:
-        """Return the goal, (3,) [m]."""
-        return world.goal
-
     def error(self, world: World) -> float:
         """Return the distance of the puck from the goal on the table [m]."""
         return _way(world)[1]

@@ -7,7 +7,6 @@ import math
 import mujoco
 import numpy as np
 
-from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, World
@@ -45,10 +44,6 @@ class ReachGoal:
     def observe(self, world: World) -> Observed:
         """Return hand, goal, and the vector between them."""
         return {**observe_hand(world), "goal": world.goal, "goal_from_ee": world.goal - world.ee.position}
-
-    def destination(self, world: World) -> F64:
-        """Return the goal, (3,) [m]."""
-        return world.goal
 
     def error(self, world: World) -> float:
         """Return the distance of `ee` from the goal [m]."""

@@ -216,10 +216,6 @@ class Sort:
             **{one: world.pose(one).position for one in BINS.values()},
         }
 
-    def destination(self, world: World) -> F64:
-        """Return the middle of the named bin, (3,) [m]."""
-        return world.pose(BINS[asked(world)]).position
-
     def error(self, world: World) -> float:
         """Return how far the named cube is from its bin's middle [m], 0 if inside; more if another is in a bin."""
         name = asked(world)

@@ -103,10 +103,6 @@ class Stack:
             "place_from_top": place_on_base(world) - world.pose(TOP).position,
         }
 
-    def destination(self, world: World) -> F64:
-        """Return the place on the other cube, (3,) [m]."""
-        return place_on_base(world)
-
     def error(self, world: World) -> float:
         """Return how far the cube is from its place on the other [m]; more while the hand is at it."""
         off = math.dist(world.pose(TOP).position, place_on_base(world))

@@ -43,8 +43,6 @@ def made_eval(
         detail = _detail(rng, conditions[number % len(conditions)])
         failed = fails(number, detail)
         detail["steps_to_success"] = None if failed else 40 + number % 7
-        thing = detail["start"]["object"] if failed else detail["goal"]
-        detail["end"] = {"hand": [0.4, 0.0, 0.3], "object": list(thing)}
         phase = phases[number % len(phases)] if failed else "at_goal"
         episodes.append(EpisodeResult(FIRST_SEED + number, not failed, not failed, 100, -20.0, phase, detail))
     fingerprint = {"mujoco": "3.11.0", "model_sha256": "ab" * 32}
@@ -79,7 +77,7 @@ def _member(name: str, seed: int, result: EvalResult, run: History) -> Member:
 
 
 def _detail(rng: np.random.Generator, condition: str) -> dict[str, Any]:
-    x, y, a, b, height = (float(value) for value in rng.uniform(-1, 1, 5))
+    x, y, a = (float(value) for value in rng.uniform(-1, 1, 3))
     drawn: dict[str, Any] = {}
     if condition == "knocked":
         drawn = {"action_noise": 0.1, "knock": 0.05 + 0.03 * abs(a), "knock_step": int(rng.integers(5, 25))}
@@ -89,5 +87,4 @@ def _detail(rng: np.random.Generator, condition: str) -> dict[str, Any]:
         "condition": condition,
         "drawn": drawn,
         "start": {"hand": [0.4, 0.0, 0.3], "object": [0.45 + 0.15 * x, 0.15 * y, 0.025]},
-        "goal": [0.45 + 0.15 * a, 0.15 * b, 0.025 + 0.4 * max(0.0, height)],
     }

@@ -46,13 +46,11 @@ def test_the_file_holds_every_case_and_what_follows_from_them():
     data = json.loads(json.dumps(made.to_json(), allow_nan=False))
     assert set(data) == {"robot", "task", "fingerprint", "settings", "confidence", "mu", "rows"}
     assert data["mu"] == HORIZON
-    assert [(one["group"], one["kind"]) for one in data["rows"]] == [
-        *(("start", "start"), ("state", "state"), ("state", "b"), ("state", "all")),
-        *(("action", "a"), ("action", "all")),
-    ]
-    action, empty = data["rows"][4], data["rows"][2]
+    kinds = [("start", "start"), ("state", "state"), ("action", "a"), ("state", "b")]
+    assert [(one["group"], one["kind"]) for one in data["rows"]] == kinds
+    action, empty = data["rows"][2:]
     assert action["cases"] == [[1, 3, 10, 9], [2, 0, 30, 10], [3, 9, None, 7], [4, 2, 8, 9]]
-    assert (action["n"], action["left_out"], action["success_rate"], action["mean_steps"]) == (4, 2, 0.75, 16)
+    assert (action["n"], action["left_out"], action["success_rate"]) == (4, 2, 0.75)
     assert action["interval"] == list(wilson_interval(3, 4))
     assert (empty["n"], empty["left_out"], empty["success_rate"], empty["interval"]) == (0, 4, None, None)
 
@@ -60,8 +58,8 @@ def test_the_file_holds_every_case_and_what_follows_from_them():
 def test_the_table_shows_the_numbers():
     many = row("action", tuple(Case(i, 0, i + 2, 1) for i in range(40)))  # gaps of 1 to 40
     made = certificate(row("action", ACTIONS))
-    assert certificate(many).table().rows[3][3:5] == ("20.5", "40")
-    assert made.table().rows[3][1:] == ("75.0 % [30.1, 95.4]", "16.0", "17.5", "50", "4", "0")
+    assert certificate(many).table().rows[2][2:4] == ("20.5", "40")
+    assert made.table().rows[2][1:] == ("75.0 % [30.1, 95.4]", "17.5", "50", "4", "0")
 
 
 @pytest.mark.parametrize("kind", ["random", "opposite"])
@@ -108,10 +106,10 @@ MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: the mean was 
 @pytest.mark.slow
 def test_the_certificate_of_pick_and_place_does_not_fall():
     certified = certify(Engine(), make_config("panda"), CASES)
-    actions = certified.pooled("action")
-    rows = {one.group: one for one in (certified.of("start")[0], certified.pooled("state"), actions)}
-    rates = {group: row.success.rate for group, row in rows.items()}
-    assert {group: rate for group, rate in rates.items() if rate < FLOORS[group]} == {}
-    assert min(len(row.cases) for row in rows.values()) >= CASES // 2
-    assert np.mean(actions.gaps) <= MEAN_COST
-    assert np.percentile(actions.gaps, 95, method="higher") <= COST_95
+    for group, floor in FLOORS.items():
+        cases = [case for row in certified.of(group) if row.kind != "noise" for case in row.cases]
+        assert len(cases) >= CASES // 2
+        assert np.mean([case.steps is not None for case in cases]) >= floor
+    gaps = [gap for row in certified.of("action") for gap in row.gaps]
+    assert np.mean(gaps) <= MEAN_COST
+    assert np.percentile(gaps, 95, method="higher") <= COST_95

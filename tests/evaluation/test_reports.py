@@ -47,12 +47,12 @@ def test_every_condition_is_in_the_table_and_the_figure(page: Page):
 
 def test_if_nothing_or_everything_failed_the_page_says_so():
     good = eval_report(made_eval(fails=lambda *_: False), COMMAND)
-    assert good.verdict.startswith("runs/a/best succeeds in all 120 unseen episodes")
+    assert good.verdict.startswith("runs/a/best succeeds in 100.0 % [")
     text = page_of(good).text
     assert "No failure in 120 episodes." in text
-    assert "Phase that it ended in" not in text
+    assert "phase that it ended in" not in text
     bad = eval_report(made_eval(fails=lambda *_: True), COMMAND)
-    assert bad.verdict.startswith("runs/a/best fails in all 120 unseen episodes of panda pick_place: 0.0 % [")
+    assert bad.verdict.startswith("runs/a/best succeeds in 0.0 % [")
 
 
 def test_a_run_has_its_policies_their_curves_and_how_it_was_made():
@@ -64,23 +64,19 @@ def test_a_run_has_its_policies_their_curves_and_how_it_was_made():
             config={"policy": {"hidden": 256, "name": None}},
         )
     )  # fmt: skip
-    for words in ("1,234", "policy.hidden 256 policy.name none"):
+    for words in ("1,234", "policy: hidden: 256 name: null"):
         assert words in page.text
     curves = [words for words in page.figures if "Validation" in words]
     assert curves[0] == "Validation success over labels: DAgger, cloning"
     assert [words.partition(": ")[2] for words in curves[1:]] == ["DAgger"] * (len(curves) - 1)
 
 
-def test_a_comparison_tells_which_is_better_where_they_fail_and_each_condition():
+def test_a_comparison_tells_which_is_better_and_where_they_fail():
     page = page_of(compare_report(SELDOM, "t", COMMAND))
     assert SELDOM.verdict.startswith("runs/dagger is better than runs/cloning by ")
     assert "Every policy ran the same 120 test episodes" in page.text
-    assert "Phase that it ended in" in page.text
+    assert "phase that it ended in" in page.text
     assert sum("Validation success over" in words for words in page.figures) == 3
-    knocked = made_pair(lambda _, detail: detail["condition"] == "knocked", lambda *_: False)
-    rows = {row[0]: row[1:] for row in knocked.condition_table().rows}
-    assert rows["knocked"] == ("0.0 %", "100.0 %")
-    assert rows["nominal"] == ("100.0 %", "100.0 %")
 
 
 def test_whatever_comes_from_outside_is_escaped():
@@ -95,7 +91,7 @@ def test_whatever_comes_from_outside_is_escaped():
     assert page_of(compare_report(study, EVIL, EVIL)).text.count("alert") > 10
 
 
-def test_a_figure_is_the_same_bytes_and_starts_above_0_only_if_nothing_is_left_out():
+def test_a_figure_is_the_same_bytes_and_fits_a_phone():
     bars = [Bar("a $name_of$ many words that is rather long", (Proportion(3, 4),)), Bar("b", (Proportion(1, 4),) * 2)]
     assert rates_figure(bars).svg == rates_figure(bars).svg
     assert rates_figure(bars).width <= 480  # or it would not be readable on a phone

@@ -108,9 +108,8 @@ def test_a_node_gets_the_file(touch):
 
 
 MISTAKES = {
-    "is not Python": ("def (", "line 1 cannot be run: SyntaxError"),
+    "is not Python": ("def (", "cannot be run: SyntaxError"),
     "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
-    "has one object": (TOUCH.replace('("cube",)', '("cube")'), "objects is 'cube'; expected a tuple of names"),
     "observes two": (
         TOUCH.replace('"cube": cube,', '"cube": cube[:2],'),
         "cube has shape (2,); expected a number or (3,)",

@@ -1,6 +1,5 @@
 """Carry: move an object past obstacles on the table as cheaply as possible; `carry:REWARD` sets another reward.
 
-`task.py` is the task and its starts; `layout.py` has the obstacles' places and the cost of a metre of path, `grid.py`
-plans on it, `reward.py` reads rewards; `obstacles.py` has the obstacles' bodies, and the parts of the hand that may hit
-them.
+`task.py` is the task and its starts; `layout.py` has the obstacles' places, the cost of a metre of path and rewards,
+`grid.py` plans on it; `obstacles.py` has the obstacles' bodies, and the parts of the hand that may hit them.
 """

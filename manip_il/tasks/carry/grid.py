@@ -18,8 +18,7 @@ from manip_il.mdp import F64
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
-from manip_il.tasks.carry.layout import Layout
-from manip_il.tasks.carry.reward import Reward
+from manip_il.tasks.carry.layout import Layout, Reward
 
 I64 = NDArray[np.int64]
 CELL = 0.02  # grid spacing, at full scale [m]
@@ -160,12 +159,7 @@ class Grid:
 
     def joined(self, start: int, end: int) -> bool:
         """Return whether an edge leads from one node to another."""
-        at = np.searchsorted(self._keys, start * len(self.points) + end)
-        return bool(at < len(self._keys) and self._keys[at] == start * len(self.points) + end)
-
-    @cached_property
-    def _keys(self) -> I64:
-        return self._links.edges @ np.array([len(self.points), 1])
+        return bool(self.problem.numbers[start, end])
 
     def _between(self, start: int, end: int) -> list[int]:
         lengths = PathProblem(self._links.edges, self._links.cells[:, None], len(self.points), end)

@@ -13,12 +13,9 @@ import numpy as np
 from manip_il.mdp import F64
 from manip_il.robots.geometry import outline
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.carry.layout import FULL, OBSTACLES, Edge, Layout, Part
-from manip_il.tasks.carry.reward import DEFAULT, FEATURES, TASTES, Reward
+from manip_il.tasks.carry.layout import DEFAULT, FEATURES, FULL, OBSTACLES, TASTES, Edge, Layout, Part, Reward
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.objects import add_furniture, add_part
-
-Pose = tuple[F64, F64]  # position (3,) [m], quaternion wxyz (4,)
 
 EDGE = "edge"  # the mocap body of the table's edge; its x points away from the table
 TASTE_BODIES = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights

@@ -22,7 +22,7 @@ from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.carry.grid import Descent, descent
-from manip_il.tasks.carry.layout import ABOVE, ASIDE, FULL, OBSTACLES, Layout
+from manip_il.tasks.carry.layout import ABOVE, ASIDE, DEFAULT, FULL, OBSTACLES, TASTES, Layout, Reward
 from manip_il.tasks.carry.obstacles import (
     EDGE,
     PARKED,
@@ -36,7 +36,6 @@ from manip_il.tasks.carry.obstacles import (
     reward_in,
     scale_of,
 )
-from manip_il.tasks.carry.reward import DEFAULT, TASTES, Reward
 from manip_il.tasks.grasp import grasp_of, once_per_state
 from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
 from manip_il.tasks.pick_place import OBJECT, PickPlace, observe_cube

@@ -123,8 +123,8 @@ class StockEnv(StockBase):
 
     @property
     def positions(self) -> dict[str, F64]:
-        """Positions (3,) [m] of hand and goal, and of the cube if there is one."""
-        return {"hand": self.gripper, "goal": self.goal} | ({"object": self.object} if self.task.has_object else {})
+        """Positions (3,) [m] of the hand, and of the cube if there is one."""
+        return {"hand": self.gripper} | ({"object": self.object} if self.task.has_object else {})
 
     def _remember(self) -> None:
         """Store the positions and velocities that the poses are computed from."""

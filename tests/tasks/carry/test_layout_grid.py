@@ -14,8 +14,7 @@ from manip_il.rewards.paths import cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid, descent
-from manip_il.tasks.carry.layout import Edge, Layout, Part, path_features
-from manip_il.tasks.carry.reward import FEATURES, TASTES, Reward
+from manip_il.tasks.carry.layout import FEATURES, TASTES, Edge, Layout, Part, Reward, path_features
 
 from ...tables import every_robot
 

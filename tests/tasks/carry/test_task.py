@@ -9,9 +9,8 @@ from manip_il.collect.expert import Expert
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry.layout import OBSTACLES, path_features
+from manip_il.tasks.carry.layout import OBSTACLES, TASTES, path_features
 from manip_il.tasks.carry.obstacles import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
-from manip_il.tasks.carry.reward import TASTES
 from manip_il.tasks.carry.task import OBJECT, descent_of
 from manip_il.tasks.envs import make_env
 from manip_il.tasks.starts import UPRIGHT

@@ -105,7 +105,7 @@ def test_positions_are_those_of_the_observation(task: str):
     env = StockEnv(task)
     row = dict(zip(STOCK[task].observed, env.observe().environment_state.tolist(), strict=True))
     found = positions(config(task), env.get_state().to_vector())
-    names = {"hand": "ee", "goal": "goal"} | ({"object": "object"} if STOCK[task].has_object else {})
+    names = {"hand": "ee"} | ({"object": "object"} if STOCK[task].has_object else {})
     assert found.keys() == names.keys()
     for name, observed in names.items():
         assert found[name] == pytest.approx([row[f"{observed}.{axis}"] for axis in "xyz"], abs=1e-4)
