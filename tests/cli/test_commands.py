@@ -107,7 +107,7 @@ def test_train_to_eval(policy, tmp_path, capsys, error):
     assert [episode.seed for episode in result.episodes] == [4_000_000, 4_000_001]
     assert (result.robot, result.task, result.settings.disturbance) == ("panda", "pick_place", "none")
     assert main([*words, "--overwrite=true", "--env.tolerance=0.05", "--suite=knocked"]) == 0
-    assert "config differs" in capsys.readouterr().err
+    assert "config_sha256 differs" in capsys.readouterr().err
     assert "noise" in EvalResult.read(tmp_path / "e").settings.disturbance
     assert main([*words, "--overwrite=true", "--robot.type=fetch"]) == 1
     assert "robot differs: the policy has panda" in error()

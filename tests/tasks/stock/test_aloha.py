@@ -188,8 +188,8 @@ def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_wha
         before = env.scene()
         held = {name: side for side in before.hands for name in before.things if any(before.touches(side, name))}
         assert len(held) == (0 if state is states[10] else len(env.task.grasped))
-        found = [one for _ in range(10) if (one := env.redrawn(state, rng)) is not None]
-        moved = 0
+        found = [one for _ in range(25) if (one := env.redrawn(state, rng)) is not None]
+        moved, anew = 0, 0
         for one in found:
             assert expert.label(one).valid
             env.set_state(one)
@@ -200,8 +200,9 @@ def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_wha
                     seen = [scene.hands[held[name]].sees(scene.things[name].position) for scene in (before, after)]
                     assert np.allclose(*seen, atol=1e-6)
                 else:
-                    assert (thing.position[:2] != before.things[name].position[:2]).all()
+                    anew += bool((thing.position[:2] != before.things[name].position[:2]).all())
         assert 0 < moved < len(found)
+        assert (anew > 0) == (len(held) < len(env.task.objects))
 
 
 @pytest.mark.gl

@@ -28,6 +28,7 @@ MOST_REWARD = 4
 GRIPPERS = np.array([6, 13])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
 _DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
+_ANEW = 0.6  # chance that an untouched object gets a new place; else a hand that reaches for it is still near it
 _STAYS, _ELSEWHERE = 0.4, 0.08  # chance that an arm stays; largest standard deviation of its joints if not [rad]
 _COARSE = 240  # pictures up to this height are drawn from simpler meshes: 2 % of their pixels change by over 8 of 255
 _CELL, _SHADOWS = 0.004, 1024  # least size of such a mesh's cell [m]; size of the shadow map [pixels]
@@ -101,7 +102,7 @@ class AlohaEnv(StockBase):
         return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
 
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
-        """Return a state with new places for what rests untouched on the table, and arms that are somewhat elsewhere.
+        """Return a state in which what rests untouched on the table, and the arms, may be elsewhere.
 
         A hand takes along what it carries. None if anything overlaps.
         """
@@ -112,7 +113,7 @@ class AlohaEnv(StockBase):
         scene = self.scene()
         holders = {name: [side for side in scene.hands if any(scene.touches(side, name))] for name in self.task.objects}
         for name, sides in holders.items():
-            if not sides and scene.on_table(name):
+            if not sides and scene.on_table(name) and rng.random() < _ANEW:
                 at, speed = self._free(name)
                 self.data.qpos[at : at + 2] = fresh[at : at + 2]
                 self.data.qvel[speed : speed + 6] = 0
