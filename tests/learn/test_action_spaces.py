@@ -98,7 +98,7 @@ def test_joint_spaces_lose_nothing(robot, space):
 @pytest.mark.parametrize("settings", [{"width": 8}, ACT], ids=["mlp", "act"])
 def test_both_grippers_of_two_arms_are_absolute_but_an_older_checkpoint_goes_on_as_it_was_trained(settings, tmp_path):
     names = tuple(f"{side}_{number}" for side in ("left", "right") for number in range(7))
-    spec = RobotTaskSpec("aloha", "lift", 50, names, ("e0",), 5, "lift", action_meaning=TWO_ARMS)
+    spec = RobotTaskSpec("aloha", "lift", 50, names, ("e0", "e1"), 5, "lift", action_meaning=TWO_ARMS)
     rng = np.random.default_rng(0)
     states, actions = rng.normal(size=(2, EPISODES * LENGTH, 14)).astype(np.float32)
     episodes = np.repeat(np.arange(EPISODES), LENGTH)
@@ -109,11 +109,11 @@ def test_both_grippers_of_two_arms_are_absolute_but_an_older_checkpoint_goes_on_
     targets = Conversion(JOINT_DELTA, grippers=found.grippers).encode(actions, states)
     absolute = (targets == actions).all(axis=0)
     assert (found.grippers, np.flatnonzero(absolute).tolist()) == ((6, 13), [6, 13])
-    before = LearnedPolicy.load(path).act(states, np.zeros((len(states), 1)))
+    before = LearnedPolicy.load(path).act(states, np.zeros((len(states), 2)))
     for file in (path / "config.json", path / "policy_postprocessor.json"):  # as older versions wrote them
         file.write_text(re.sub(r',\s*"grippers": \[[^]]*\]', "", file.read_text()))
     assert Checkpoint.open(path).grippers == (-1,)
-    after = LearnedPolicy.load(path).act(states, np.zeros((len(states), 1)))
+    after = LearnedPolicy.load(path).act(states, np.zeros((len(states), 2)))
     np.testing.assert_allclose(after - before, states * (np.arange(14) == 6), atol=1e-6)
     more = trainer_of(sources, tmp_path / "more", {"path": str(path)}, None)
     more.fit()
