@@ -37,10 +37,6 @@ _MOST_OFFERED = 3  # names that an error suggests
 _FORMER = {  # options of older files, ignored with these values
     "task.reward": "",
     "eval.stream": "test",
-    "dataset.rgb_encoder.pix_fmt": "yuv420p",
-    "dataset.rgb_encoder.g": 2,
-    "dataset.rgb_encoder.crf": None,
-    "dataset.rgb_encoder.preset": None,
     "ppo.gae_lambda": 0.95,
     "ppo.clip_range": 0.2,
     "ppo.entropy": 0.0,

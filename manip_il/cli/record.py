@@ -50,11 +50,14 @@ class RecordOptions(Varied, Seeded, Resumable):
         """Record; the dataset is written while episodes arrive."""
         from manip_il.collect.environments import env_spec
         from manip_il.collect.job import RolloutJob
+        from manip_il.data.video import try_encoder
         from manip_il.evaluation.suites import varied
 
         env = env_config(self.env)
         cameras = self.camera_config(env) if self.cameras else None
         job = RolloutJob(env, hold=HOLD, cameras=cameras, conditions=varied(self.vary, env, sees=cameras is not None))
+        if cameras:
+            try_encoder(VideoConfig(**self.dataset.rgb_encoder), cameras.size, env.control_hz)
         env_spec(env, cameras)  # raises if no scene can be made, before anything is written
         repo_id = checks.repo_id("repo_id", self.dataset.repo_id or f"local/{env.name}")
         root = self.dataset.root or Path("datasets") / repo_id.rpartition("/")[2]

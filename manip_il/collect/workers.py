@@ -184,16 +184,22 @@ def kill_pool(pool: ProcessPoolExecutor) -> None:
 def start_server(learned: bool) -> None:
     """Start, once per process, the background server that workers are forked from.
 
-    learned: also import policies. The server keeps the current environment variables.
+    learned: also import policies. The server keeps the current environment variables, except for a single OpenMP
+    thread.
     """
     _CONTEXT.set_forkserver_preload(["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])])
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported; one core each
+    threads = os.environ.get("OMP_NUM_THREADS")
     resource_tracker.ensure_running()  # first, because starting it would undo the mask
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # only this process handles Ctrl-C
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
     try:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if threads is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = threads
 
 
 def _end_with_parent() -> None:

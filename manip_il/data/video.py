@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import av
+import av.logging
 import numpy as np
 from av.container import OutputContainer
 from av.packet import Packet
@@ -25,7 +26,8 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.camera import Pictures, open_video
 from manip_il.data.dataset import Dataset
-from manip_il.data.video_config import CODECS, GROUP, PIXELS, VideoConfig
+from manip_il.data.video_config import VideoConfig
+from manip_il.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -86,8 +88,8 @@ class CameraFiles:
             container.close()
 
     def info(self) -> dict[str, Any]:
-        """Return the entry of LeRobot's `info.json` for this camera; its first file, perhaps a copy, must be closed."""
-        path = self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0]
+        """Return the entry of LeRobot's `info.json` for this camera; its first file must be closed."""
+        path, config = self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0], self._config
         with closing(open_video(path)) as container:
             stream = container.streams.video[0]
             found = {
@@ -99,8 +101,7 @@ class CameraFiles:
                 "video.channels": len(stream.format.components),
                 "has_audio": False,
             }
-        crf, preset = CODECS[self._config.vcodec]
-        settings = {"video.g": GROUP, "video.crf": crf, "video.preset": preset, "video.fast_decode": 0}
+        settings = {"video.g": config.g, "video.crf": config.crf, "video.preset": config.preset, "video.fast_decode": 0}
         return {**found, **settings, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}
 
     def _open(self, path: Path, size: tuple[int, int]) -> VideoCodecContext:
@@ -144,7 +145,7 @@ def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoC
 def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: int) -> None:
     os.environ.setdefault("SVT_LOG", "1")  # errors only; otherwise it prints its version for every encoder
     encoder.height, encoder.width = size
-    encoder.pix_fmt = PIXELS
+    encoder.pix_fmt = config.pix_fmt
     encoder.framerate, encoder.time_base = Fraction(fps), Fraction(1, fps)
 
 
@@ -152,3 +153,21 @@ def _video_frame(picture: NDArray[np.uint8], number: int, fps: int) -> av.VideoF
     frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
     frame.pts, frame.time_base = number, Fraction(1, fps)
     return frame
+
+
+def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
+    """Encode one picture of this height and width; raises `UsageError` with the encoder's reason if it fails."""
+    level = av.logging.get_level()
+    av.logging.set_level(av.logging.ERROR)  # otherwise the reason is not logged
+    with av.logging.Capture() as log:
+        try:
+            if len(av.VideoFormat(config.pix_fmt).components) < 3:
+                raise ValueError(f"pixel format {config.pix_fmt} has no colour")
+            encoder = _new_encoder(config, size, fps)
+            _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
+            _encode(encoder, None)
+        except (av.FFmpegError, ValueError) as error:
+            reason = log[0][2].strip() if log else str(error)
+            raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {reason}") from error
+        finally:
+            av.logging.set_level(level)

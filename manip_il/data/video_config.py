@@ -4,30 +4,40 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 
-# Quality and speed. LeRobot's own default is libsvtav1, here with its settings; h264 needs a sixth of its time for the
-# same error, so that encoding keeps up with rendering on one core.
-CODECS: dict[str, tuple[int, int | str]] = {"h264": (23, "ultrafast"), "libsvtav1": (30, 12)}
-PIXELS = "yuv420p"
-GROUP = 2  # frames between key frames: the cost of reading a single frame
+# Default crf and preset. LeRobot's own default is libsvtav1; h264 needs a sixth of its time for the same error, so that
+# encoding keeps up with rendering on one core.
+CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvtav1": (30, 12)}
 
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`. Raises `UnknownName` for the codec."""
+    """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`, with its defaults for `libsvtav1`.
+
+    Raises `UnknownName` for the codec, `UsageError` for g; `try_encoder` checks the rest with the codec itself.
+    """
 
     vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
+    pix_fmt: str = option("yuv420p", "pixel format")
+    g: int | None = option(2, "frames between key frames")  # the cost of reading a single frame
+    crf: float | None = option(None, "quality; lower is better, with larger files; by default 23, for libsvtav1 30")
+    preset: int | str | None = option(None, "the codec's speed preset; by default ultrafast, for libsvtav1 12")
 
     def __post_init__(self) -> None:
         if self.vcodec not in CODECS:
             raise UnknownName("video codec", self.vcodec, CODECS)
+        if self.g is not None and self.g < 1:
+            raise UsageError(f"video setting g={self.g}; expected 1 or more frames between key frames")
+        crf, preset = CODECS[self.vcodec]
+        object.__setattr__(self, "crf", crf if self.crf is None else self.crf)
+        object.__setattr__(self, "preset", preset if self.preset is None else self.preset)
 
     def options(self) -> dict[str, str]:
         """Return the codec's options. One thread: a second saves no time, and changes the bytes of h264."""
-        crf, preset = CODECS[self.vcodec]
-        options = {"g": str(GROUP), "crf": str(crf), "preset": str(preset)}
+        named = {"g": self.g, "crf": self.crf, "preset": self.preset}
+        options = {name: str(value) for name, value in named.items() if value is not None}
         if self.vcodec == "libsvtav1":
             return {**options, "svtav1-params": "fast-decode=0:lp=1"}
         return {**options, "threads": "1", "bf": "0"}  # frames stay in order, so that episodes can be appended
