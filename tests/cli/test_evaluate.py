@@ -53,7 +53,7 @@ def test_a_policy_of_pictures_is_shown_them_in_its_own_light(seeing, tmp_path, c
 def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tmp_path, capsys):
     edit_json(seeing / META_FILE, lambda meta: meta.update(look=None))
     assert evaluate(seeing, tmp_path / "e") == 0
-    [line] = [line for line in capsys.readouterr().err.splitlines() if "size and look" in line]
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "cameras_sha256 differs" in line]
     for fingerprint in (env_fingerprint(ENV, DIM), env_fingerprint(ENV, replace(DIM, look=Look()))):
         assert fingerprint["cameras_sha256"][:12] in line
     (seeing / META_FILE).unlink()

@@ -14,7 +14,7 @@ def test_without_a_display_human_is_refused_in_one_line(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(
-        RenderError, match=r'^no display: .*; use render_mode="rgb_array", or manip-il view --output=.*$'
+        RenderError, match=r'^no display: .*, use render_mode="rgb_array", or manip-il view --output=.*$'
     ):
         gymnasium.make("manip_il/PandaReach-v0", render_mode="human")
     with pytest.raises(UsageError, match=r"unknown render_mode 'humna' \(did you mean 'human'\?\)"):
