@@ -36,7 +36,6 @@ CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
 _MOST_OFFERED = 3  # names that an error suggests
 _FORMER = {  # options of older files, ignored with these values
     "task.reward": "",
-    "eval.stream": "test",
     "ppo.gae_lambda": 0.95,
     "ppo.clip_range": 0.2,
     "ppo.entropy": 0.0,

@@ -41,7 +41,7 @@ class Recording:
     A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes. only_labelled:
     leave out episodes without a valid label. episodes: number of episodes to keep, in seed order; None: all. labels:
     number of valid labels to keep; later ones have `label_valid` 0, and later episodes are left out. provenance: who
-    drove, stored in the dataset. video: the fields of `VideoConfig`; others, of older versions, are not read.
+    drove, stored in the dataset. video: fields of `VideoConfig`.
     """
 
     repo_id: str
@@ -111,7 +111,7 @@ class Recording:
                 )
             provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
 
-        video = VideoConfig(self.video.get("vcodec", VideoConfig.vcodec))
+        video = VideoConfig(**self.video)
         options: dict[str, Any] = {"repo_id": self.repo_id, "fingerprint": about.fingerprint, "video": video}
         return write_dataset(selected(), root, about.spec, provenance, replace=replace, **options), failed
 

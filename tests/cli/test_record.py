@@ -64,7 +64,9 @@ def test_a_damaged_journal_is_named_and_its_seed_runs_again_once_it_is_deleted(r
 @pytest.mark.gl
 def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_or_two(tmp_path):
     pictured = ["--cameras=front,wrist", "--image.height=64", "--image.width=80", "--task.type=reach"]
+    pictured += ["--dataset.rgb_encoder.crf=20"]
     assert main(record(tmp_path / "one", *pictured)) == 0
+    assert '"video.crf": 20' in (tmp_path / "one/meta/info.json").read_text()
     assert main(record(tmp_path / "two", *pictured, "--workers=2")) == 0
     assert files(tmp_path / "one") == files(tmp_path / "two")
     assert main(["data", "build", str(journals_of(tmp_path / "one")), str(tmp_path / "again")]) == 0
