@@ -102,6 +102,8 @@ class Engine:
                 task = tasks.popleft()
                 running[pool.submit(job, task, journal)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
+            if any(isinstance(future.exception(), BrokenExecutor) for future in done):
+                done, _ = wait(running)  # so that each lost seed runs alone
             lost: list[int] = []
             for future in done:
                 task = running.pop(future)

@@ -179,7 +179,7 @@ def test_an_episode_ends_as_the_environments_do(task: str):
 
 
 @every_task
-def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_what_they_hold(task: str):
+def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_or_drop_what_they_hold(task: str):
     env, expert, rng = AlohaEnv(task), make_expert(config(task)), np.random.default_rng(0)
     env.start(4)
     states = solve(env)
@@ -189,7 +189,7 @@ def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_wha
         held = {name: side for side in before.hands for name in before.things if any(before.touches(side, name))}
         assert len(held) == (0 if state is states[10] else len(env.task.grasped))
         found = [one for _ in range(25) if (one := env.redrawn(state, rng)) is not None]
-        moved, anew = 0, 0
+        moved, anew, kept = 0, 0, list[bool]()
         for one in found:
             assert expert.label(one).valid
             env.set_state(one)
@@ -198,10 +198,11 @@ def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_wha
             for name, thing in after.things.items():
                 if name in held:
                     seen = [scene.hands[held[name]].sees(scene.things[name].position) for scene in (before, after)]
-                    assert np.allclose(*seen, atol=1e-6)
+                    kept.append(np.allclose(*seen, atol=1e-6))
                 else:
                     anew += bool((thing.position[:2] != before.things[name].position[:2]).all())
         assert 0 < moved < len(found)
+        assert not held or 0 < len(kept) - sum(kept) < 0.3 * len(kept)  # some are dropped
         assert (anew > 0) == (len(held) < len(env.task.objects))
 
 

@@ -29,6 +29,7 @@ GRIPPERS = np.array([6, 13])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
 _DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
 _ANEW = 0.6  # chance that an untouched object gets a new place; else a hand that reaches for it is still near it
+_DROPPED, _FALL = 0.1, 30  # chance that a hand drops what it carries; most control steps after it has opened
 _STAYS, _ELSEWHERE = 0.4, 0.08  # chance that an arm stays; largest standard deviation of its joints if not [rad]
 _COARSE = 240  # pictures up to this height are drawn from simpler meshes: 2 % of their pixels change by over 8 of 255
 _CELL, _SHADOWS = 0.004, 1024  # least size of such a mesh's cell [m]; size of the shadow map [pixels]
@@ -104,12 +105,14 @@ class AlohaEnv(StockBase):
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
         """Return a state in which what rests untouched on the table, and the arms, may be elsewhere.
 
-        A hand takes along what it carries. None if anything overlaps.
+        A hand takes along what it carries, or has dropped it. None if anything overlaps.
         """
         self.set_state(state)
         self._env.reset(seed=int(rng.integers(2**32)))
         fresh = self.data.qpos.copy()
         self.set_state(state)
+        if rng.random() < 2 * _DROPPED:
+            self._drop(rng)
         scene = self.scene()
         holders = {name: [side for side in scene.hands if any(scene.touches(side, name))] for name in self.task.objects}
         for name, sides in holders.items():
@@ -135,6 +138,16 @@ class AlohaEnv(StockBase):
         if (self.data.contact.dist < -_DEEP).any():
             return None
         return replace(state, physics=self._physics())
+
+    def _drop(self, rng: np.random.Generator) -> None:
+        """Let one of the hands open, if it holds something in the air, and go on for some steps."""
+        scene, number = self.scene(), int(rng.integers(2))
+        hand = list(scene.hands)[number]
+        if any(all(scene.touches(hand, name)) and not scene.on_table(name) for name in self.task.objects):
+            action = self.measured()
+            action[GRIPPERS[number]] = 1.0
+            for _ in range(rng.integers(1, _FALL)):
+                self.advance(action)
 
     def _free(self, name: str) -> tuple[int, int]:
         """Addresses of an object's pose in `qpos` and of its velocity in `qvel`."""
