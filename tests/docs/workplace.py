@@ -11,8 +11,6 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import yaml
-
 from manip_il.cli.main import load
 from manip_il.cli.parsing import parse
 
@@ -73,17 +71,10 @@ class Workplace:
         self.ours.execute(block.text, self.folder, block.where)
 
     def _yaml_block(self, block: Block) -> None:
-        """`# NAME.yaml` in its first line names a file for the lines that follow; else it is a job of Kubernetes."""
-        first = block.text.splitlines()[0]
-        if named := re.fullmatch(r"# ([\w.-]+\.yaml)", first):
-            (self.folder / named[1]).write_text(block.text, encoding="utf-8")
-            return
-        job = yaml.safe_load(block.text)
-        assert job["kind"] == "Job", f"{block.where}: neither a file with a name nor a job"
-        (container,) = job["spec"]["template"]["spec"]["containers"]
-        assert container["command"] == ["sh", "-c"]
-        for words in _as_the_shell_sees(_OF_A_CONTAINER.sub("", container["args"][0]), self.folder):
-            self.run(Line(block.where, (PROGRAM, *words)))
+        """`# NAME.yaml` in its first line names the file for the lines that follow."""
+        named = re.fullmatch(r"# ([\w.-]+\.yaml)", block.text.splitlines()[0])
+        assert named, f"{block.where}: a YAML block without a name"
+        (self.folder / named[1]).write_text(block.text, encoding="utf-8")
 
     def _make(self, line: Line) -> None:
         """What the target would run of this program; the rest of it is machinery that CI runs itself."""
@@ -146,17 +137,3 @@ def _named(word: str) -> str:
     for name, ours in _NAMES.items():
         word = word.replace(name, ours)
     return word
-
-
-def _as_the_shell_sees(text: str, folder: Path) -> list[list[str]]:
-    """The words of every `manip-il` in a script, as `sh` makes them in `folder` in the second pod of a job."""
-    script = f"{PROGRAM}() {{ printf '%s\\0' \"$@\"; printf '\\n'; }}\n{text}"
-    done = subprocess.run(
-        ["bash", "-c", script],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=folder,
-        env={"JOB_COMPLETION_INDEX": "1"},
-    )
-    return [line.split("\0")[:-1] for line in done.stdout.splitlines()]

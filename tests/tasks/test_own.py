@@ -25,7 +25,7 @@ from manip_il.tasks.config import make_config
 from manip_il.tasks.table import get_task
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
-TOUCH = PAGE.read_text().split("```python\n", 1)[1].split("```", 1)[0]
+TOUCH, RAISE = (block.split("```", 1)[0] for block in PAGE.read_text().split("```python\n")[1:])
 
 
 @pytest.fixture
@@ -36,8 +36,10 @@ def touch(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("robot", ["panda", "so101"])
-def test_the_expert_solves_a_task_from_a_file(robot, touch):
-    episodes = RolloutJob(make_config(robot, str(touch)), hold=0).run(range(5))
+@pytest.mark.parametrize("example", [TOUCH, RAISE])
+def test_the_expert_solves_a_task_from_a_file(robot, example, tmp_path):
+    (tmp_path / "own.py").write_text(example)
+    episodes = RolloutJob(make_config(robot, str(tmp_path / "own.py")), hold=0).run(range(5))
     assert all(episode.success for episode in episodes)
 
 
