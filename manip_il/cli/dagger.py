@@ -74,15 +74,15 @@ class DaggerOptions(Varied, Trusting):
         from manip_il.cli.inputs import check_given, round_policy
         from manip_il.collect.query import parse_query  # imports numpy
         from manip_il.evaluation.suites import varied
-        from manip_il.learn.checkpoint import Checkpoint, policy_cameras
+        from manip_il.learn.checkpoint import Checkpoint
 
         policy, start = round_policy(self.fit.get("policy", {}))
         observation, env = self.fit.get("observation"), env_config(self.env)
         sees = policy.get("type") == "cnn" and observation != "state"
         cameras = self.camera_config(env) if self.cameras or sees else None
         if start is not None:
-            observation = observation or Checkpoint.open(start).observation
-            cameras = cameras or policy_cameras(start)
+            checkpoint = Checkpoint.open(start)
+            observation, cameras = observation or checkpoint.observation, cameras or checkpoint.cameras
         config = RunConfig(
             env=env,
             method=self.method,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -108,16 +108,19 @@ def _film(
     policies: Sequence[Path | None], rows: Sequence[PolicyRow], config: RunConfig, stages: Stages
 ) -> tuple[list[Film], str]:
     """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on the first seed."""
-    from manip_il.evaluation.film import Shot, film_shots, run_states
+    from manip_il.evaluation.film import collect_films, film_episode, run_states
     from manip_il.evaluation.runner import Trial
 
     cloned, dagger = rows[1].result.episodes, rows[-1].result.episodes
     won = {episode.seed for episode in dagger if episode.success}
     seed = next((one.seed for one in cloned if not one.success and one.seed in won), cloned[0].seed)
-    trial, shots = Trial.of(config.env, range(seed, seed + 1), "nominal"), list[Shot]()
-    for row, policy in zip(rows, policies, strict=True):
-        episode = run_states(trial.job(policy), seed)
-        caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
-        shots.append(Shot(trial.job(policy), episode, row.name, caption))
-    stages.start("films", len(shots))
-    return film_shots(shots, stages)
+    trial = Trial.of(config.env, range(seed, seed + 1), "nominal")
+
+    def films() -> Iterator[Film]:
+        for row, policy in zip(rows, policies, strict=True):
+            episode = run_states(trial.job(policy), seed)
+            caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
+            yield film_episode(config.env, episode, row.name, caption)
+
+    stages.start("films", len(rows))
+    return collect_films(films(), stages)

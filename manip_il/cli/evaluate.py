@@ -153,7 +153,7 @@ class EvalOptions(Tested, Seeded, Trusting):
 
     def _replay(self, file: Path, seed: int) -> None:
         """Replay one episode with the same policy, seed and conditions; `ManipError` if its outcome differs."""
-        from manip_il.evaluation.film import Shot, run_states
+        from manip_il.evaluation.film import film_episode, run_states
         from manip_il.evaluation.results import EvalResult
         from manip_il.evaluation.runner import episode_result, replay_differences
 
@@ -167,7 +167,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         say(f"seed {seed}, {before.detail.get('condition', 'nominal')}: {ended}")
         say(*(f"  {name}: {json.dumps(value)}" for name, value in before.detail.get("drawn", {}).items()))
         if self.video is not None:
-            write_file(self.video, Shot(job, episode).film().mp4)
+            write_file(self.video, film_episode(job.env, episode).mp4)
             say(f"video: {self.video}")
         if differences := replay_differences(before, episode_result(job, episode)):
             raise ManipError(

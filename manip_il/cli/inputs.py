@@ -20,7 +20,7 @@ from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import SIM_STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
-from manip_il.learn.checkpoint import Checkpoint, policy_cameras
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.sources import check_same_sources
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, make_config
@@ -95,7 +95,7 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
 
     Raises `MismatchError` unless the policy can drive `env`, `ManipError` if it needs `trust`.
     """
-    path, origin, cameras = checkpoint.path, checkpoint.origin, policy_cameras(checkpoint.path)
+    path, origin, cameras = checkpoint.path, checkpoint.origin, checkpoint.cameras
     spec = env_spec(env, cameras)
     checkpoint.check_fits(spec)
     checkpoint.require_trust(trust)

@@ -14,7 +14,7 @@ from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, ga
 from manip_il.collect.rollout import Act, Environment, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError
-from manip_il.learn.checkpoint import Checkpoint, policy_cameras
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
@@ -115,7 +115,7 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
 
     Raises `MismatchError` if the recorded cameras do not include those of the policy.
     """
-    wanted = policy_cameras(job.policy) if job.policy is not None else None
+    wanted = Checkpoint.open(job.policy).cameras if job.policy is not None else None
     if wanted is None or job.cameras is None:
         return job.cameras or wanted
     if not set(wanted.names) <= set(job.cameras.names) or wanted.size != job.cameras.size:

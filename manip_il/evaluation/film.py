@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 
 import av
@@ -25,6 +25,7 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import Progress
 from manip_il.mdp import Episode
 from manip_il.sim.config import FILM, CameraConfig
+from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 FILM_EVERY = 2  # control steps per frame of film
@@ -37,31 +38,21 @@ def run_states(job: RolloutJob, seed: int) -> Episode:
     return next(replace(job, label="last").run([seed]))
 
 
-@dataclass(frozen=True)
-class Shot:
-    """One episode to film. title, caption: shown beside the film."""
-
-    job: RolloutJob
-    episode: Episode
-    title: str = ""
-    caption: str = ""
-
-    def film(self) -> Film:
-        """Return the film, with its last frame as poster. Raises `RenderError` without off-screen OpenGL."""
-        env, fps = self.job.env, self.job.env.control_hz // FILM_EVERY or 1
-        states = self.episode.columns[schema.SIM_STATE][::FILM_EVERY]
-        camera = next(iter(STOCK[env.robot].cameras if env.robot in STOCK else ()), "front")
-        pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
-        frames = list(pictures[schema.IMAGES + camera])
-        return Film(self.title, encode_mp4(frames, fps), self.caption, encode_jpeg(frames[-1]))
+def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str = "") -> Film:
+    """Return a film of an episode, with its last frame as poster. Raises `RenderError` without off-screen OpenGL."""
+    states = episode.columns[schema.SIM_STATE][::FILM_EVERY]
+    camera = next(iter(STOCK[env.robot].cameras if env.robot in STOCK else ()), "front")
+    pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
+    frames = list(pictures[schema.IMAGES + camera])
+    return Film(title, encode_mp4(frames, env.control_hz // FILM_EVERY or 1), caption, encode_jpeg(frames[-1]))
 
 
-def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], str]:
-    """Return a film of every episode; without OpenGL, none and the reason, which is also logged."""
+def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film], str]:
+    """Return the films, made one by one; without OpenGL, none and the reason, which is also logged."""
     films: list[Film] = []
     try:
-        for shot in shots:
-            films.append(shot.film())
+        for film in made:
+            films.append(film)
             progress.step()
     except RenderError as error:
         _LOG.warning("the report has no films: %s", error)
@@ -74,25 +65,25 @@ def film_shots(shots: Iterable[Shot], progress: Progress) -> tuple[list[Film], s
 def film_outcomes(
     engine: Engine, job: RolloutJob, result: EvalResult, most: int, progress: Progress
 ) -> tuple[list[Film], str]:
-    """Rerun up to `most` failures and as many successes of an evaluation and film them; returns what `film_shots` does.
+    """Rerun up to `most` failures and as many successes of an evaluation and film them.
 
-    most: 0 for no films.
+    most: 0 for no films. Returns what `collect_films` does.
     """
     shown = [one for good in (False, True) for one in [e for e in result.episodes if e.success == good][:most]]
     if not shown:
         return [], ""
     progress.start("films", len(shown))
     episodes = {episode.seed: episode for episode in engine.run(job, [one.seed for one in shown])}
-    shots = (
-        Shot(
-            job,
+    made = (
+        film_episode(
+            job.env,
             episodes[one.seed],
             "Success" if one.success else "Failure",
             f"seed {one.seed}, {one.condition}".rstrip(", "),
         )
         for one in shown
     )
-    return film_shots(shots, progress)
+    return collect_films(made, progress)
 
 
 def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:

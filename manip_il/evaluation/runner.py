@@ -22,7 +22,7 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.checkpoint import policy_cameras, policy_sha256
+from manip_il.learn.checkpoint import Checkpoint, policy_sha256
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
 from manip_il.sim.scene import SCENES_KEPT
@@ -236,7 +236,7 @@ class Trial:
     @classmethod
     def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path] = (), trust: bool = False) -> Trial:
         """Return a trial under a suite's conditions, without those on cameras if no policy uses any."""
-        sees = any(policy_cameras(policy) is not None for policy in policies)
+        sees = any(Checkpoint.open(policy).pictures for policy in policies)
         return cls(env, seeds, suite, suite_conditions(suite, env, sees=sees), trust)
 
     def job(self, policy: Path | None) -> RolloutJob:

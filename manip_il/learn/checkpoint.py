@@ -174,6 +174,20 @@ class Checkpoint:
         return "both" if ENVIRONMENT_STATE in self.numbers else "images"
 
     @property
+    def cameras(self) -> CameraConfig | None:
+        """Cameras, size and lighting of its training pictures; None if it takes no pictures.
+
+        The lighting is the default if the checkpoint does not say. Raises `UsageError` for cameras that environments do
+        not have, and for an invalid size.
+        """
+        if not self.pictures:
+            return None
+        known = self.origin is not None and set(self.origin.cameras) == set(self.pictures)
+        names = self.origin.cameras if self.origin and known else tuple(self.pictures)
+        look = self.origin.look if self.origin else None
+        return CameraConfig(names, *next(iter(self.pictures.values())), Look(**(look or {})))
+
+    @property
     def mlp_options(self) -> dict[str, Any] | None:
         """The options for building another mlp of this architecture; None for another kind of policy."""
         if self.kind != MLP:
@@ -208,21 +222,6 @@ def policy_sha256(policy: Path) -> str:
         if path.is_file() and path.name not in _FOR_PEOPLE:
             digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
-
-
-def policy_cameras(policy: Path) -> CameraConfig | None:
-    """Return cameras, size and lighting of a checkpoint's training pictures; None if it takes no pictures.
-
-    The lighting is the default if the checkpoint does not say. Raises `UsageError` for cameras that environments do not
-    have, and for an invalid size.
-    """
-    checkpoint = Checkpoint.open(policy)
-    pictures, origin = checkpoint.pictures, checkpoint.origin
-    if not pictures:
-        return None
-    in_order = origin.cameras if origin is not None and set(origin.cameras) == set(pictures) else tuple(pictures)
-    look = origin.look if origin is not None else None
-    return CameraConfig(in_order, *next(iter(pictures.values())), Look(**(look or {})))
 
 
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:

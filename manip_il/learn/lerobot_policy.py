@@ -10,7 +10,6 @@ from typing import Any
 
 import draccus
 import numpy as np
-import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -31,8 +30,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     """Return a LeRobot policy with new weights, those in `config.pretrained_path`, or those of the run to resume.
 
     An mlp that starts from another mlp's weights has the statistics of its own data, see `warm_start`. Raises
-    `ManipError` for a checkpoint that cannot be loaded, and, with two alternatives in the message, if a backbone's
-    weights would have to be downloaded and cannot be.
+    `ManipError` for a checkpoint that cannot be loaded, and if a backbone's weights cannot be downloaded.
     """
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
     warm = config.type == MLP and start is not None and resumed is None
@@ -41,10 +39,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     if config.pretrained_path is None:
         what = f"cannot build --policy.type={config.type}"
     if weights:
-        what += (
-            f" with {weights} (offline, use --policy.pretrained_backbone_weights=null, or put the file that "
-            f"torchvision names into {torch.hub.get_dir()}/checkpoints)"
-        )
+        what += f" with --policy.pretrained_backbone_weights={weights} (offline, use null)"
     with _lerobot(what):
         policy = make_policy(config, ds_meta=meta)
     if warm:
