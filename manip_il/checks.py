@@ -88,13 +88,6 @@ def number(what: str, value: object, low: float = -math.inf, high: float = math.
     raise ManipError(f"{what} is {shorten(value)}; expected a finite number{limits}")
 
 
-def array(what: str, value: object, longest: int = 1_000_000) -> list[Any]:
-    """Return a list of at most `longest` values."""
-    if not isinstance(value, list | tuple) or len(value) > longest:
-        raise ManipError(f"{what} is {shorten(value)}; expected a list of at most {longest}")
-    return list(value)
-
-
 def mapping(what: str, value: object) -> dict[str, Any]:
     """Return a dict with string keys."""
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):

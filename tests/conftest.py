@@ -34,7 +34,6 @@ IMPORTED_ONCE = [
     "manip_il.cli.record",
     "manip_il.cli.dagger",
     "manip_il.cli.evaluate",
-    "manip_il.cli.study",
     "manip_il.algorithms.run",
     "manip_il.collect.record",
     "manip_il.collect.job",

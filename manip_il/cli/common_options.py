@@ -43,11 +43,8 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
 
 def own_files(env: EnvConfig) -> str:
     """Return the options that name a user's own robot and task; no dataset or policy holds their paths."""
-    from manip_il.robots.table import SUFFIXES
-    from manip_il.tasks.table import SUFFIX
-
     named = {"robot": env.robot, "task": env.task}
-    return "".join(f" --{what}.type={name}" for what, name in named.items() if name.endswith((SUFFIX, *SUFFIXES)))
+    return "".join(f" --{what}.type={name}" for what, name in named.items() if Path(name).suffix)
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:
@@ -92,13 +89,6 @@ class EngineOptions:
         from manip_il.collect.workers import Engine
 
         return Engine(self.workers, self.engine)
-
-
-@dataclass(frozen=True)
-class TrialGroup:
-    """`--eval.*`: the test episodes."""
-
-    n_episodes: int = option(500, "test episodes", at_least=1, grows=True)
 
 
 @dataclass(frozen=True, kw_only=True)

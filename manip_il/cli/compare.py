@@ -1,18 +1,27 @@
-"""`manip-il compare`: two policies or runs on the same seeds, with the confidence in their difference, or a study."""
+"""`manip-il compare`: two policies or runs on the same seeds, with the confidence in their difference, or a study.
+
+A study runs `manip-il dagger` with several arms, each with the same training seeds.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, TrialGroup, Trusting, env_config
-from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
+from manip_il import checks
+from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting, env_config
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.options import Given, Open, command_line, given, group, to_plain
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, publish
+from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, warn
-from manip_il.errors import UsageError
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.option import Seeded, option
+from manip_il.seeding import MAX_SEED, stream_seeds
 from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -21,10 +30,46 @@ if TYPE_CHECKING:
     from manip_il.evaluation.runner import Trial
 
 _YAML = (".yaml", ".yml")
+_OF_STUDY = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
 
 
 @dataclass(frozen=True)
-class CompareOptions(Tested, Seeded, Trusting):
+class TrialGroup:
+    """`--eval.*`: the test episodes."""
+
+    n_episodes: int = option(500, "test episodes", at_least=1, grows=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """Which rounds of the runs are compared, and on how many episodes."""
+
+    checkpoint: Literal["best", "last"] = option("best", "which round of a run: the best on validation, or the last")
+    at: Literal["end", "labels", "episodes", "steps", "seconds"] = option(
+        "end",
+        "which rounds of a run count: end (all), or those within the labels, episodes, steps or seconds (of collecting "
+        "and fitting) that every run reached",
+    )
+    eval: TrialGroup = field(default_factory=TrialGroup)
+
+
+@dataclass(frozen=True)
+class StudyFile(Compared):
+    """Content of a study's YAML file.
+
+    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. If tasks
+    differ, nothing is compared.
+    """
+
+    common: Open = field(default_factory=dict[str, Any])
+    arms: Open = field(default_factory=dict[str, Any])
+    training_seeds: int = option(3, "runs of every arm", at_least=1, at_most=MAX_SEED, grows=True)
+    baseline: str | None = option(None, "the arm to compare others with; by default the first")
+    target: float = option(0.95, "validation success for which the cost is reported", at_least=0.0, at_most=1.0)
+
+
+@dataclass(frozen=True)
+class CompareOptions(Compared, Tested, Seeded, Trusting):
     """Compare two policies, runs, or folders of several training seeds on the same test seeds; or run a whole study.
 
     Each side is an eval.json, a policy, a run of manip-il dagger, or a folder of these named seed_0, seed_1, ...
@@ -36,7 +81,6 @@ class CompareOptions(Tested, Seeded, Trusting):
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
-    first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
         MISSING,
         "two sides, each an eval.json, a policy or a run; or the YAML file of a study",
@@ -44,13 +88,6 @@ class CompareOptions(Tested, Seeded, Trusting):
         exists="",
         free=True,
     )
-    checkpoint: Literal["best", "last"] = option("best", "which round of a run: the best on validation, or the last")
-    at: Literal["end", "labels", "episodes", "steps", "seconds"] = option(
-        "end",
-        "which rounds of a run count: end (all), or those within the labels, episodes, steps or seconds (of collecting "
-        "and fitting) that every run reached",
-    )
-    eval: TrialGroup = field(default_factory=TrialGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     training_seeds: int | None = option(
         None, "seeds of a study, instead of the file's; a resumed study may have more", at_least=1, free=True
@@ -59,7 +96,7 @@ class CompareOptions(Tested, Seeded, Trusting):
     output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")
 
     def run(self) -> None:
-        """Run the missing evaluations, compare, print and write the result."""
+        """Run the missing runs and evaluations, compare, print and write the result."""
         match self.sides:
             case [file] if file.suffix in _YAML:
                 self._run_study(file)
@@ -69,15 +106,16 @@ class CompareOptions(Tested, Seeded, Trusting):
                 raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML file of one study")
 
     def _run_study(self, path: Path) -> None:
-        from manip_il.cli.study import read_plan, run_arms
-        from manip_il.evaluation.arm import select_rounds
+        from manip_il.evaluation.arm import read_arm, select_rounds
         from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
 
         plan = read_plan(path, self.training_seeds, self.trust)
         file = plan.file
         with self.output.open(file) as folder:
-            rule, arms = select_rounds(Rule(file.checkpoint, file.at), run_arms(plan, folder, self.engine))
+            plan.run(folder, self.engine)
+            arms = [replace(read_arm(folder / name), name=name) for name in plan.arms]
+            rule, arms = select_rounds(Rule(file.checkpoint, file.at), arms)
             trials = [self._trial(plan.envs[arm.name], [arm], file.eval.n_episodes) for arm in arms]
             study = Study(self._measure(arms, trials, folder), plan.baseline, rule, file.target)
             result = study.arms[0].members[0].test
@@ -85,7 +123,6 @@ class CompareOptions(Tested, Seeded, Trusting):
             self._report(study, folder, f"Study: {what}, {path.stem}", to_plain(file))
 
     def _compare(self, left: Path, right: Path) -> None:
-        from manip_il.data.fingerprint import compare_fingerprints
         from manip_il.evaluation.arm import read_arm, require_pair, select_rounds
         from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
@@ -107,7 +144,6 @@ class CompareOptions(Tested, Seeded, Trusting):
     def _env(self, arms: Sequence[Arm]) -> EnvConfig:
         """Return the test environment of all arms: that of the runs, else that of the policies."""
         from manip_il.evaluation.arm import require_same_env
-        from manip_il.learn.checkpoint import Checkpoint
 
         given = {name: value for name, value in self.env.items() if value is not None}
         members = [member for arm in arms for member in arm.members]
@@ -120,8 +156,6 @@ class CompareOptions(Tested, Seeded, Trusting):
         """Return the test of these arms; raises, before any episode runs, if a policy does not fit it."""
         from manip_il.cli.inputs import check_policy
         from manip_il.evaluation.runner import Trial
-        from manip_il.learn.checkpoint import Checkpoint
-        from manip_il.seeding import stream_seeds
 
         policies = [one.policy for arm in arms for one in arm.members if one.policy is not None]
         for policy in policies:
@@ -138,11 +172,55 @@ class CompareOptions(Tested, Seeded, Trusting):
         """Write the result and the report, print the tables and the verdict."""
         from manip_il.evaluation.comparison import FILE_NAME
         from manip_il.evaluation.eval_report import compare_report
-        from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.tables import print_table
 
-        write_json(folder / FILE_NAME, study.to_json())
-        compare_report(study, title, command_line(), config).write(folder / REPORT_FILE)
-        for table in study.tables:
-            print_table(table)
-        say(study.verdict, *study.facts, f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+        page = compare_report(study, title, command_line(), config)
+        publish(folder / FILE_NAME, study.to_json(), study.tables, study.verdict, *study.facts, page=page)
+
+
+class Plan(NamedTuple):
+    """A checked study: the options and the environment of every arm, and the arm to compare others with, if any."""
+
+    file: StudyFile
+    arms: Mapping[str, DaggerOptions]
+    envs: Mapping[str, EnvConfig]
+    baseline: str | None
+
+    def run(self, root: Path, engine: EngineOptions) -> None:
+        """Run missing runs, seed by seed, so that a study that is stopped early has all arms."""
+        runs = [(name, seed) for seed in range(self.file.training_seeds) for name in self.arms]
+        for number, (name, seed) in enumerate(runs, start=1):
+            output = ResumableOutput(root / name / f"seed_{seed}", resume=True)
+            if not (output.output_dir / REPORT_FILE).is_file():  # a run's last file
+                say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
+                options = self.arms[name]
+                replace(options, settings=options.settings | {"seed": seed}, output=output, engine=engine).run()
+
+
+def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> Plan:
+    """Return the study in `path`; raises a one-line `UsageError` if something is invalid.
+
+    training_seeds: replaces the file's. trust: option of its runs.
+    """
+    from manip_il.evaluation.arm import require_same_env
+
+    file = from_yaml(path, StudyFile)
+    file = replace(file, training_seeds=training_seeds or file.training_seeds)
+    if not file.arms:
+        raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
+    arms, envs = dict[str, DaggerOptions](), dict[str, EnvConfig]()
+    for name, own in file.arms.items():
+        try:
+            checks.name("its name, which becomes a folder,", name)
+            layers = [("common", file.common), ("its options", own)]
+            if found := next((one for one in _OF_STUDY for _, tree in layers if one in (tree or {})), None):
+                raise UsageError(f"{found} is set by the study for every run; remove it")
+            arms[name] = replace(from_layers(DaggerOptions, layers), trust=trust)
+            envs[name] = arms[name].config().env
+        except ManipError as error:
+            raise UsageError(f"{path}: arm {name!r}: {error}") from error
+    if file.baseline is None and len({env.task for env in envs.values()}) > 1:
+        return Plan(file, arms, envs, None)
+    require_same_env(envs)
+    if file.baseline is not None and file.baseline not in envs:
+        raise UnknownName("arm as a baseline", file.baseline, envs)
+    return Plan(file, arms, envs, file.baseline or next(iter(envs)))

@@ -11,7 +11,10 @@ from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trus
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
+from manip_il.data.atomic import write_json
 from manip_il.data.json_lines import read_lines
+from manip_il.evaluation.suites import varied
+from manip_il.learn.checkpoint import Checkpoint, policy_cameras
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.sim.config import CameraConfig
@@ -21,8 +24,6 @@ if TYPE_CHECKING:
     from manip_il.algorithms.results import Result
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.tables import PolicyRow
-
-_OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,6 @@ class DaggerOptions(Varied, Trusting):
     """
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
-    first: ClassVar[str] = "robot.type task.type demonstrations rounds episodes_per_round policy output_dir resume"
     env: Given = given(EnvConfig)
     method: Method = option(
         "dagger",
@@ -49,7 +49,7 @@ class DaggerOptions(Varied, Trusting):
         "when the expert is queried: every, one, probability:P, ensemble:BOUND or safety:BOUND; "
         "by default every, but one for takeover, and probability:1/STEPS for branch",
     )
-    fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
+    fit: Given = given(FitConfig, prefix="")
     image: Given = given(CameraConfig, **SMALL)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")
@@ -72,9 +72,7 @@ class DaggerOptions(Varied, Trusting):
     def config(self) -> RunConfig:
         """Return the configuration of the run; raises if options contradict each other, or do not fit the inputs."""
         from manip_il.cli.inputs import check_given, round_policy
-        from manip_il.collect.query import parse_query  # imports numpy
-        from manip_il.evaluation.suites import varied
-        from manip_il.learn.checkpoint import Checkpoint
+        from manip_il.collect.query import parse_query
 
         policy, start = round_policy(self.fit.get("policy", {}))
         observation, env = self.fit.get("observation"), env_config(self.env)
@@ -133,7 +131,6 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     """Run all rounds in `folder`, with progress and a printed line per round."""
     from manip_il.algorithms.run import Run
     from manip_il.collect.environments import env_fingerprint
-    from manip_il.evaluation.results import write_json
 
     write_json(folder / "fingerprint.json", env_fingerprint(config.env, config.cameras))
     results: list[Result] = []
@@ -146,18 +143,15 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     return results
 
 
-def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, *films: Any, **parts: Any) -> None:
+def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, **parts: Any) -> None:
     """Write the report in `folder` on the policies of `run`: their table, and success over costs.
 
-    kind: the algorithm's name. films, parts: see `run_report`.
+    kind: the algorithm's name. parts: see `run_report`.
     """
     from manip_il.evaluation.eval_report import run_report
     from manip_il.evaluation.figures import Curve
     from manip_il.evaluation.rounds import METRICS_FILE, history
 
-    records = read_lines(run / METRICS_FILE)
-    curve = Curve(kind, (history(records, str(run)),))
-    fingerprint = rows[-1].result.fingerprint
-    shown, why_none = films or ((), "")
-    page = run_report(rows, shown, why_none, [curve], fingerprint=fingerprint, **parts)
+    curve = Curve(kind, (history(read_lines(run / METRICS_FILE), str(run)),))
+    page = run_report(rows, curves=[curve], fingerprint=rows[-1].result.fingerprint, **parts)
     page.write(folder / REPORT_FILE)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import group
-from manip_il.cli.outputs import Output
+from manip_il.cli.outputs import Output, publish
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
 
 PROGRESS = "progress"  # scores by true progress instead of a reward
@@ -32,32 +30,26 @@ class CheckOptions(OfDataset):
     example: ClassVar[str] = "manip-il data check datasets/demos"
 
     def run(self) -> None:
-        """Check the dataset and print the verdict; raises `NotWhole` if there are errors."""
-        self._say_verdict(self._examine())
-
-    @property
-    def _root(self) -> Path:
-        """The dataset's folder, as a path with a name, because folders beside it are named after it."""
-        return self.dataset if self.dataset.name else self.dataset.absolute()
+        """Check the dataset and print every finding and the verdict; raises `NotWhole` if there are errors."""
+        self._conclude(self._examine())
 
     def _examine(self) -> list[Finding]:
         """Check the dataset and print every finding."""
         from manip_il.doctor.examine import examine_folder
 
-        findings = examine_folder(self._root, [check_robot])
+        findings = examine_folder(self.dataset.absolute())
         say(*map(str, findings))
         return findings
 
-    def _say_verdict(self, findings: list[Finding]) -> None:
-        """Print how many episodes and frames there are; raises `NotWhole` with the counts if there are errors."""
+    def _conclude(self, findings: list[Finding]) -> None:
         from manip_il.data.dataset import Dataset
         from manip_il.doctor.finding import NotWhole
 
         errors = sum(finding.is_error for finding in findings)
         if errors:
-            raise NotWhole(f"{self._root}: errors: {errors}, warnings: {len(findings) - errors}")
-        info = Dataset.open(self._root).info
-        say(f"{self._root}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings: {len(findings)}")
+            raise NotWhole(f"{self.dataset}: errors: {errors}, warnings: {len(findings) - errors}")
+        info = Dataset.open(self.dataset).info
+        say(f"{self.dataset}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings: {len(findings)}")
 
 
 @dataclass(frozen=True)
@@ -73,26 +65,10 @@ class RepairOptions(CheckOptions):
         """Check, repair, check again, and print the verdict; raises `NotWhole` if errors remain."""
         from manip_il.doctor.examine import repair
 
-        findings = self._examine()
-        if findings:
-            say(*(f"repair   {line}" for line in repair(self._root, findings)))
+        if findings := self._examine():
+            say(*(f"repair   {line}" for line in repair(self.dataset.absolute(), findings)))
             findings = self._examine()
-        self._say_verdict(findings)
-
-
-def check_robot(dataset: Dataset) -> Iterator[Finding]:
-    """Compare joints, observations and compiled model with those of the robot and task of this version."""
-    from manip_il.cli.inputs import dataset_differences
-    from manip_il.data.lerobot_layout import OURS
-    from manip_il.doctor.finding import Finding, warning
-
-    if (own := dataset.own) is None:
-        return
-    try:
-        for text in dataset_differences("the dataset", own.spec, own.fingerprint):
-            yield warning(OURS, text, f"for labels of the current expert: manip-il data relabel {dataset.root}")
-    except ManipError as error:
-        yield Finding(OURS, str(error), "use the version of this program that recorded it, or record again")
+        self._conclude(findings)
 
 
 @dataclass(frozen=True)
@@ -110,8 +86,6 @@ class ScoreOptions(OfDataset):
 
     def run(self) -> None:
         """Score, print the worst episodes, write the files."""
-        from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.tables import print_table
         from manip_il.learn.reward import LearnedReward
         from manip_il.preferences import scores as scoring
         from manip_il.preferences.frames import read_frames
@@ -127,7 +101,6 @@ class ScoreOptions(OfDataset):
             raise ManipError(f"{self.dataset} has no progress column; give --reward=FOLDER")
         scores = scoring.Scores(str(self.dataset), self.reward, data, found)
         with self.output.open(self) as folder:
-            write_json(folder / scoring.FILE_NAME, scores.to_json())
             scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
-        print_table(scoring.worst_table(scores))
-        say(*scoring.fact_lines(scores))
+            worst = [scoring.worst_table(scores)]
+            publish(folder / scoring.FILE_NAME, scores.to_json(), worst, *scoring.fact_lines(scores))

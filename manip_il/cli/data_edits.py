@@ -13,6 +13,7 @@ from manip_il.cli.options import Given, given
 from manip_il.cli.outputs import Replacing, prepare_output, require_replaceable
 from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import exclusive
+from manip_il.evaluation.suites import varied
 from manip_il.option import Seeded, option
 from manip_il.sim.config import CameraConfig, Look
 
@@ -32,7 +33,6 @@ class BuildOptions(Replacing):
     example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
     journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True, exists="")
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
-    repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded")
 
     def run(self) -> None:
         """Build the dataset."""
@@ -40,7 +40,7 @@ class BuildOptions(Replacing):
 
         require_replaceable(self.dataset, self.overwrite)
         with exclusive(self.dataset):
-            info, failed = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
+            info, failed = build(self.journals, self.dataset, replace=self.overwrite)
         say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")
         say(f"dataset: {self.dataset}")
 
@@ -159,7 +159,6 @@ class RedrawOptions(Edit, Varied, Seeded):
         """Draw all scenes; TARGET appears when it is complete."""
         from manip_il.collect.edits import redraw_dataset
         from manip_il.collect.scenes import CHUNK, Scenes
-        from manip_il.evaluation.suites import varied
 
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
         with self.open("redrawn", root, -(-self.frames // CHUNK)) as (source, target):

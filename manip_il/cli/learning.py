@@ -19,7 +19,6 @@ from manip_il.option import option
 from manip_il.tasks.config import make_config
 
 if TYPE_CHECKING:
-    from manip_il.collect.workers import Engine
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.checkpoint import Origin
 
@@ -29,7 +28,6 @@ class Learning:
     """Options, run, progress and report that these commands share."""
 
     method: ClassVar[str]
-    first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"
     init: Path | None = option(None, "a cloned mlp, or its run, to start from; by default a new policy")
     settings: Given = given(LearningConfig, prefix="")
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -38,14 +36,20 @@ class Learning:
 
     def run(self) -> None:
         """Run all iterations, or continue them, and write the report."""
-        from manip_il.algorithms.results import learning_report, validations
+        from manip_il.algorithms.results import Watch, learning_report, validations
+        from manip_il.algorithms.run import Run
         from manip_il.evaluation.rounds import METRICS_FILE
 
         config = self.learning_config()
         with self.output.open(self) as folder:
             kept = f"every finished iteration, in {folder}"
             with Stages(kept) as stages, self.engine.open() as engine:
-                self._learn(config, folder, engine, stages)
+                watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
+                stages.start(f"{self.method.upper()}, steps", config.steps)
+                for result in Run(config, folder, engine, watch).results():
+                    stages.log({"step": result.steps} | result.metrics)
+                    if result.validated is not None:
+                        say(f"{result.steps:,} steps: validation success {result.validated.success}")
             title, found = f"{self.method.upper()} on {config.env.robot} {config.env.task}", validations(folder)
             records, command = read_lines(folder / METRICS_FILE), command_line()
             learning_report(title, found, records, command, to_plain(self)).write(folder / REPORT_FILE)
@@ -62,17 +66,6 @@ class Learning:
         env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
         start = None if self.init is None else find_policy(self.init)
         return LearningConfig(method=self.method, env=env, ppo=self.ppo, start=start, **more, **self.settings)
-
-    def _learn(self, config: LearningConfig, folder: Path, engine: Engine, stages: Stages) -> None:
-        from manip_il.algorithms.results import Watch
-        from manip_il.algorithms.run import Run
-
-        watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
-        stages.start(f"{self.method.upper()}, steps", config.steps)
-        for result in Run(config, folder, engine, watch).results():
-            stages.log({"step": result.steps} | result.metrics)
-            if result.validated is not None:
-                say(f"{result.steps:,} steps: validation success {result.validated.success}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
-import select
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -88,7 +87,7 @@ RENAMED = {
     **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
 }
 
-HELP = ("--help", "-h", "--help=all")
+HELP = ("--help", "-h")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
   --quiet      show no progress on standard error"""
@@ -97,15 +96,15 @@ _GLOBAL_HELP = """\
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0 (done), 1 (the work failed), 2 (invalid command line) or 130 (interrupted)."""
     given = list(sys.argv[1:] if argv is None else argv)
-    own = _own(given)
-    words = [word for word in own if word not in ("--debug", "--quiet")] + given[len(own) :]
-    progress.set_quiet("--quiet" in own)
+    end = given.index("--") if "--" in given else len(given)  # the words after it are another program's
+    own = [word for word in given[:end] if word not in ("--debug", "--quiet")]
+    progress.set_quiet("--quiet" in given[:end])
     try:
-        _dispatch(words)
+        _dispatch(own, given[end:])
     except (Exception, KeyboardInterrupt) as error:
-        if "--debug" in own:
-            print(_clean(traceback.format_exc(), words), file=sys.stderr, end="")
-        return _report(error, words)
+        if "--debug" in given[:end]:
+            print(_clean(traceback.format_exc(), given), file=sys.stderr, end="")
+        return _report(error, given)
     return 0
 
 
@@ -122,70 +121,39 @@ def load(name: str) -> type:
     return getattr(importlib.import_module(f"manip_il.cli.{module}"), options_class)
 
 
-def _dispatch(words: list[str]) -> None:
-    if not words or words[0] in (*HELP, "help"):
+def _dispatch(own: list[str], others: list[str]) -> None:
+    count = 2 if own and own[0] in GROUPS else 1
+    name, words = " ".join(own[:count]), own[count:]
+    if name in ("", "help", *HELP):
         print(_help())
-    elif words[0] == "--version":
+    elif name == "--version":
         print(f"{PROGRAM} {__version__}")
-    elif words[0] in GROUPS and (len(words) == 1 or words[1] in HELP):
-        print(_group_help(words[0]))
+    elif own[0] in GROUPS and (not own[1:] or own[1] in HELP):
+        print(_group_help(own[0]))
+    elif own[0] in RENAMED:
+        raise UsageError(f"{own[0]!r} was renamed: {PROGRAM} {RENAMED[own[0]]}")
+    elif {*HELP} & {*words}:
+        print(_command_help(name, load(name), words))
     else:
-        name, words = _split(words)
-        if {*HELP} & {*_own(words)}:
-            print(_command_help(name, load(name), words))
-        else:
-            options = parse(load(name), words, command=name)
-            check_paths(options)
-            silence_ffmpeg_warning()
-            options.run()
-
-
-def _own(words: list[str]) -> list[str]:
-    """Return the words before `--`; those after it are another program's."""
-    return words[: words.index("--")] if "--" in words else words
-
-
-def _split(words: list[str]) -> tuple[str, list[str]]:
-    """Return a command's name, of one or two words, and the words after it."""
-    name, two_words = words[0], " ".join(words[:2])
-    if name in RENAMED:
-        raise UsageError(f"{name!r} was renamed: {PROGRAM} {RENAMED[name]}")
-    if name not in GROUPS:
-        return name, words[1:]
-    if two_words not in COMMANDS:
-        raise UnknownName("command", two_words, _commands_of(name))
-    return two_words, words[2:]
-
-
-def _commands_of(group: str) -> list[str]:
-    """Return the commands of a group."""
-    return [name for name in COMMANDS if name.startswith(f"{group} ")]
+        options = parse(load(name), [*words, *others], command=name)
+        check_paths(options)
+        silence_ffmpeg_warning()
+        options.run()
 
 
 def _report(error: BaseException, words: list[str]) -> int:
     """Print an error as one line on standard error; return the exit code."""
     code = 1
-    if isinstance(error, BrokenPipeError) and _is_reader_gone():
-        return code
+    if isinstance(error, BrokenPipeError):  # the reader of standard output, such as `head`, may have ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if isinstance(error, KeyboardInterrupt):
         text, code = f"interrupted{f'; {error}' if error.args else ''}", EXIT_INTERRUPTED
     elif isinstance(error, ManipError):
         text, code = f"error: {error}", error.exit_code
-    elif isinstance(error, OSError) and error.strerror and error.filename:
-        text = f"error: {error.strerror}: {error.filename}"
     else:
         text = f"error: {told(error)}; run again with --debug for the traceback"
     print(f"{PROGRAM}: {' '.join(_clean(text, words).split())}", file=sys.stderr, flush=True)
     return code
-
-
-def _is_reader_gone() -> bool:
-    """Return whether the reader of standard output, such as `head`, has ended; then let nothing be written to it."""
-    pipe = select.poll()
-    pipe.register(sys.stdout.fileno(), 0)
-    if gone := any(event & select.POLLERR for _, event in pipe.poll(0)):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return gone
 
 
 def _clean(text: str, words: list[str]) -> str:
@@ -208,24 +176,17 @@ def _help() -> str:
 
 
 def _group_help(group: str) -> str:
-    rows = {name: COMMANDS[name].summary for name in _commands_of(group)}
+    rows = {name: command.summary for name, command in COMMANDS.items() if name.startswith(f"{group} ")}
     return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
-    """Return the help of one command: its most used options (`first`), or all with `--help=all`.
-
-    words: the command line: `--policy.type=act` also lists the options of that policy.
-    """
+    """Return the help of one command. words: with `--policy.type=act` it also lists the options of that policy."""
     options = options_of(cls)
-    first = () if "--help=all" in words else getattr(cls, "first", "").split()
     positional = [option for option in options if option.positional]
     places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
-    rows = dict(_row(one) for one in options if not first or one.positional or one.name in first)
-    rest = len(options) - len(rows)
+    rows = dict(map(_row, options))
     rows["--config_path=FILE.yaml"] = "read options from YAML; the command line overrides them"
-    if rest:
-        rows["--help=all"] = f"also list the other {rest} options"
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     more = ""
     if kind and any(one.is_open for one in options):

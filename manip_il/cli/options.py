@@ -15,7 +15,7 @@ import shlex
 import sys
 import types
 import typing
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Union
@@ -33,12 +33,9 @@ def group(default: Any, prefix: str | None = None) -> Any:
     return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
 
 
-def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **own: Any) -> Any:
-    """Return a `Given` field: the options that `cls` declares.
-
-    only: names of fields, by default all. own: defaults that replace those of `cls`, always in the dict.
-    """
-    metadata = {"given": cls, "only": only}
+def given(cls: type, prefix: str | None = None, **own: Any) -> Any:
+    """Return a `Given` field: the options that `cls` declares. own: defaults that replace those, always in the dict."""
+    metadata = {"given": cls}
     names = {} if prefix is None else {"prefix": prefix}
     return field(default_factory=functools.partial(dict, own), metadata=metadata | names)
 
@@ -95,7 +92,7 @@ def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, .
         kind, default = type_of(cls, one), default_of(one, base)
         if source := one.metadata.get("given"):
             for theirs in dataclasses.fields(source):
-                if "help" in theirs.metadata and theirs.name in (one.metadata["only"] or (theirs.name,)):
+                if "help" in theirs.metadata:
                     name = theirs.metadata.get("flag", inner + theirs.name)
                     own = default.get(theirs.name, default_of(theirs))
                     found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, theirs.metadata))
@@ -156,7 +153,9 @@ def metavar(option_type: Any) -> str:
     option_type = without_none(option_type)
     if typing.get_origin(option_type) is list:
         return f"{metavar(typing.get_args(option_type)[0])},..."
-    return "|".join(choices(option_type)) or _METAVARS.get(option_type, "VALUE")
+    if typing.get_origin(option_type) is Literal:
+        return "|".join(typing.get_args(option_type))
+    return _METAVARS.get(option_type, "VALUE")
 
 
 def from_word(option_type: Any, word: str) -> Any:
@@ -198,9 +197,3 @@ def without_none(option_type: Any) -> Any:
     if typing.get_origin(option_type) not in (Union, types.UnionType):
         return option_type
     return next(member for member in typing.get_args(option_type) if member is not types.NoneType)
-
-
-def choices(option_type: Any) -> tuple[str, ...]:
-    """Return the names of a `Literal` or `Literal | None`; () for any other type."""
-    option_type = without_none(option_type)
-    return typing.get_args(option_type) if typing.get_origin(option_type) is Literal else ()

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
-from manip_il.data.atomic import PARTIAL, clear, exclusive, write_file
+from manip_il.cli.progress import say
+from manip_il.data.atomic import clear, exclusive, write_file, write_json
 from manip_il.errors import FolderExistsError, MismatchError, UsageError
 from manip_il.option import option
+
+if TYPE_CHECKING:
+    from manip_il.evaluation.report import Report
+    from manip_il.evaluation.tables import Table
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
 # Files that identify a folder of ours. Any LeRobot dataset has meta/info.json; only ours has both actions.
@@ -80,11 +85,7 @@ def prepare_output(
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
-    if resume:
-        for left in folder.rglob(f".*{PARTIAL}"):  # partial files of a killed writer; folders have locks
-            if left.is_file():
-                left.unlink()
-    elif folder.exists():
+    if not resume and folder.exists():
         require_replaceable(folder, overwrite, sources)
         clear(folder)
 
@@ -105,6 +106,22 @@ def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] =
             f"{folder} holds files that manip-il did not make (it has no config.yaml, meta/info.json or eval.json of "
             "ours); choose another folder, or delete it by hand"
         )
+
+
+def publish(
+    path: Path, content: Mapping[str, Any], tables: Iterable[Table], *lines: str, page: Report | None = None
+) -> None:
+    """Write a result as JSON, and its report beside it if there is one; print its tables, lines and files."""
+    from manip_il.evaluation.tables import print_table
+
+    written = [f"result: {path}"]
+    write_json(path, content)
+    if page is not None:
+        page.write(path.with_name(REPORT_FILE))
+        written.append(f"report: {path.with_name(REPORT_FILE)}")
+    for table in tables:
+        print_table(table)
+    say(*lines, *written)
 
 
 def save_options(folder: Path, options: Any) -> None:

@@ -17,7 +17,6 @@ from manip_il import __version__
 from manip_il.checks import read_yaml, shorten
 from manip_il.cli.options import (
     Option,
-    choices,
     decode,
     default_of,
     from_word,
@@ -34,19 +33,13 @@ from manip_il.option import check_bound
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
 _MOST_OFFERED = 3  # names that an error suggests
-_FORMER = {  # options of older files, ignored with these values
-    "task.reward": "",
-    "ppo.gae_lambda": 0.95,
-    "ppo.clip_range": 0.2,
-    "ppo.entropy": 0.0,
-    "ppo.target_kl": 0.05,
-}
 type Known = Mapping[str, Option]
 
 
-class _RawValue(NamedTuple):
+class _Value(NamedTuple):
     """A value as the user gave it. origin: `--NAME`, or the file and key, for error messages."""
 
+    option: Option
     value: Any
     origin: str
 
@@ -57,9 +50,11 @@ def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
     command: its name, for error messages.
     """
     known = {option.name: option for option in options_of(cls)}
-    raw, paths = _read_words(words, known, command)
-    trees = [(str(path), read_yaml(path, "a YAML file of options")) for path in map(Path, paths)]
-    return from_layers(cls, trees, raw)
+    file = Option(CONFIG_PATH, (), Path, None, {})
+    raw = _read_words(words, known | {CONFIG_PATH: file}, command)
+    config = raw.pop(CONFIG_PATH, None)
+    layers = [] if config is None else [(config.value, read_yaml(Path(config.value), "a YAML file of options"))]
+    return from_layers(cls, layers, raw)
 
 
 def from_yaml[T](path: Path, cls: type[T]) -> T:
@@ -67,27 +62,24 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
     return from_layers(cls, [(str(path), read_yaml(path, "a YAML file of options"))])
 
 
-def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _RawValue] | None = None) -> T:
+def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: dict[str, _Value] | None = None) -> T:
     """Read options from trees that YAML gave; later trees override earlier ones, and `words` override all.
 
     layers: pairs of a tree's origin, for error messages, and the tree. Raises `UsageError` as `parse` does.
     """
-    known, raw = {option.name: option for option in options_of(cls)}, dict[str, _RawValue]()
+    known, raw = {option.name: option for option in options_of(cls)}, dict[str, _Value]()
     for origin, tree in layers:
         raw |= _read_tree(tree, known, origin)
-    raw |= words or {}
     values: dict[tuple[str, ...], Any] = {}
-    for option in known.values():
+    for name, one in (raw | (words or {})).items():
+        option = one.option
         if option.is_open:
-            inside = {name: one for name, one in raw.items() if name.startswith(f"{option.name}.")}
-            for name, one in inside.items():
-                held = values.setdefault(option.path, dict(option.default))
-                held[name.removeprefix(f"{option.name}.")] = _decode_raw(option, one)
-        elif option.name in raw:
-            one = raw[option.name]
-            if one.value is not None or without_none(option.type) is not option.type:  # else null: the default is used
-                values[option.path] = _decode_raw(option, one)
-        elif option.default is MISSING:
+            held = values.setdefault(option.path, dict(option.default))
+            held[name.removeprefix(f"{option.name}.")] = _decode(one)
+        elif one.value is not None or without_none(option.type) is not option.type:  # else null: the default is used
+            values[option.path] = _decode(one)
+    for option in known.values():
+        if option.default is MISSING and option.path not in values:
             raise UsageError(f"{option.label} is missing; expected {metavar(option.type)}")
     return _build(cls, values)
 
@@ -111,71 +103,62 @@ def dump_yaml(options: Any) -> str:
     return header + yaml.safe_dump(to_plain(options), sort_keys=False)
 
 
-def _read_words(words: Sequence[str], known: Known, command: str) -> tuple[dict[str, _RawValue], list[str]]:
-    """Return each option's value as given, and the YAML files to read."""
-    raw: dict[str, _RawValue] = {}
-    config_paths: list[str] = []
+def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _Value]:
+    """Return each option's value as given."""
+    raw: dict[str, _Value] = {}
     places = [option for option in known.values() if option.positional]
     rest = list(words)
     while rest:
         word = rest.pop(0)
         if word == "--" and places and places[-1].is_list:  # the rest is another program's command line
-            raw[places[-1].name] = _RawValue(rest, places[-1].label)
+            raw[places[-1].name] = _Value(places[-1], rest, places[-1].label)
             break
         if not word.startswith("--"):
             if not places or word.startswith("-"):
-                wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
+                wanted = f"write options as --name=value; manip-il {command} --help lists them"
                 raise UsageError(f"unexpected {shorten(word)}; {wanted}")
             option = places[0] if places[0].is_list else places.pop(0)
             before = raw[option.name].value if option.is_list and option.name in raw else []
-            raw[option.name] = _RawValue([*before, word] if option.is_list else word, option.label)
+            raw[option.name] = _Value(option, [*before, word] if option.is_list else word, option.label)
             continue
         name, equals, value = word[2:].partition("=")
-        if (ours := name.replace("-", "_")) in known:  # accept --output-dir
-            name = ours
-        kind = Path if name == CONFIG_PATH else _type_of(name, known, command)
+        name = name.replace("-", "_")  # accept --output-dir
+        option = _find(name, known)
+        if option is None or option.positional:
+            raise _unknown_option("option", name, known, "--", command)
+        kind = Any if option.is_open else option.type
         if not equals and kind is bool and (not rest or rest[0] not in ("true", "false")):
             value = "true"
         elif not equals:
             if not rest or rest[0].startswith("--"):
                 raise UsageError(f"--{name} has no value; expected {metavar(kind)}")
             value = rest.pop(0)
-        if name == CONFIG_PATH:
-            config_paths.append(value)
-        else:
-            raw[name] = _RawValue(from_word(kind, value), f"--{name}")
-    return raw, config_paths
+        raw[name] = _Value(option, from_word(kind, value), f"--{name}")
+    return raw
 
 
-def _type_of(name: str, known: Known, command: str) -> Any:
-    """Return the type of a named option, `Any` for an option of an open group."""
-    if _is_inside(name, known):
-        return Any
-    if name not in known or known[name].positional or known[name].is_open:
-        raise _unknown_option("option", name, known, "--", command)
-    return known[name].type
+def _find(name: str, known: Known) -> Option | None:
+    """Return the option of a name, or the open group that it is in."""
+    if name in known and not known[name].is_open:
+        return known[name]
+    return next((one for one in known.values() if one.is_open and name.startswith(f"{one.name}.")), None)
 
 
-def _is_inside(name: str, known: Known) -> bool:
-    """Whether `name` is an option of an open group."""
-    return name not in known and any(one.is_open and name.startswith(f"{one.name}.") for one in known.values())
-
-
-def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _RawValue]:
+def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _Value]:
     """Return each option's value in a tree."""
     if not isinstance(tree, dict | None):
         where = f"{origin}: {prefix[:-1]}" if prefix else origin
         raise UsageError(f"{where}: expected a mapping of options, got {shorten(tree)}")
-    raw: dict[str, _RawValue] = {}
+    raw: dict[str, _Value] = {}
     for key, value in typing.cast(dict[Any, Any], tree or {}).items():
         name = f"{prefix}{key}"
-        if (name in known and not known[name].is_open) or _is_inside(name, known):
-            raw[name] = _RawValue(value, f"{origin}: {name}")
-            if value is not None and name in known and known[name].metadata.get("command_line_only"):
+        if option := _find(name, known):
+            raw[name] = _Value(option, value, f"{origin}: {name}")
+            if value is not None and option.metadata.get("command_line_only"):
                 raise UsageError(f"{origin}: {name} can only be set on the command line; give --{name}=...")
-        elif any(option == name or option.startswith(f"{name}.") for option in known):
+        elif any(other == name or other.startswith(f"{name}.") for other in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
-        elif name not in _FORMER or value != _FORMER[name]:
+        else:
             raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
     return raw
 
@@ -195,18 +178,17 @@ def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, pa
     return cls(**arguments)
 
 
-def _decode_raw(option: Option, raw: _RawValue) -> Any:
-    kind, is_word = Any if option.is_open else option.type, raw.origin.startswith("--")
-    if option.is_open and not is_word:
-        return raw.value
+def _decode(one: _Value) -> Any:
+    kind = Any if one.option.is_open else one.option.type
+    if one.option.is_open and not one.origin.startswith("--"):
+        return one.value
     try:
-        value = decode(kind, raw.value)
+        value = decode(kind, one.value)
     except ManipError:  # from a class with its own `parse`
         raise
     except Exception:  # draccus also raises plain Exception
-        hint = nearest(raw.value, choices(kind)) if isinstance(raw.value, str) else ""
-        raise UsageError(f"{raw.origin}: expected {metavar(kind)}, got {shorten(raw.value)}{hint}") from None
-    check_bound(raw.origin, value, option.metadata)
+        raise UsageError(f"{one.origin}: expected {metavar(kind)}, got {shorten(one.value)}") from None
+    check_bound(one.origin, value, one.option.metadata)
     return value
 
 
@@ -215,8 +197,6 @@ def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: st
 
     `num_episodes` finds `dataset.num_episodes`. kind: `option`, or the file's key. dashes: prefix of the names.
     """
-    if inside := [one.label for one in known.values() if one.label.startswith(f"--{name}.")]:
-        return UsageError(f"{dashes}{name} is a group of options; known: {', '.join(inside)}")
-    named = [dashes + one.name for one in known.values() if not one.is_open and not (dashes and one.positional)]
+    named = [one.label.replace("--", dashes) for one in known.values() if not one.positional]
     near = nearest(dashes + name, named, _MOST_OFFERED)
-    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help=all lists all")
+    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help lists all")

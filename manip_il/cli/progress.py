@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from manip_il.errors import ManipError, UsageError, printable
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EpisodeResult
     from manip_il.mdp import Episode
 
-INTERVAL = 5.0  # [s] between plain lines
 _STOPPING = b"\nstopping after the current step (press Ctrl-C again to stop at once)\n"
 
 _quiet = False
@@ -38,19 +36,46 @@ def has_bars() -> bool:
 def say(*lines: str) -> None:
     """Print lines on standard output."""
     for line in lines:
-        print(printable(line), flush=True)
+        _print(printable(line), sys.stdout)
 
 
 def warn(*lines: str) -> None:
     """Print warnings on standard error, one line each."""
     for line in lines:
-        print(f"manip-il: warning: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
+        _print(f"manip-il: warning: {printable(' '.join(line.split()))}", sys.stderr)
+
+
+def _print(line: str, file: TextIO) -> None:
+    from tqdm import tqdm  # imported here because help needs none
+
+    tqdm.write(line, file)  # above a bar, if there is one
+    file.flush()
+
+
+class _Log:
+    """The file of a bar that is not on a terminal: every update is a line on standard error."""
+
+    def write(self, text: str) -> None:
+        if line := text.strip():
+            print(line, file=sys.stderr)
+
+    def flush(self) -> None:
+        sys.stderr.flush()
+
+
+_PLAIN: dict[str, Any] = {
+    "file": _Log(),
+    "mininterval": 5.0,  # [s]
+    "miniters": 1,
+    "unit": "",
+    "bar_format": "{desc}: {n_fmt}/{total_fmt} ({rate_noinv_fmt}{postfix})",
+}
 
 
 class Stages:
     """Progress of work in stages, each a number of steps; use as a context manager.
 
-    Shows a bar on a terminal, else lines like `record: 12/50 (3.4/s, success 0.92)`; nothing if progress is switched
+    Shows a bar on a terminal, else lines like `record: 12/50 (3.40/s, success=0.92)`; nothing if progress is switched
     off. The first Ctrl-C or SIGTERM stops the work after the current step, the second at once. kept: what is saved and
     can be resumed, for the message if the work is interrupted or fails.
     """
@@ -58,8 +83,6 @@ class Stages:
     def __init__(self, kept: str = ""):
         self.kept, self._stopping, self._handlers = kept, False, dict[int, Any]()
         self._bar: Any = None
-        self._fields: dict[str, object] = {}
-        self._began = self._printed = 0.0
         self._solved = 0
 
     def __enter__(self) -> Stages:
@@ -84,66 +107,38 @@ class Stages:
 
     def start(self, description: str, total: int | None) -> None:
         """Close the previous stage's bar and open a new one. total: number of steps, None if unknown."""
-        from rich import progress
-        from rich.console import Console
+        from tqdm import tqdm
 
         self.close()
         self.check()
-        columns = (
-            progress.TextColumn("{task.description}", markup=False),
-            progress.BarColumn(),
-            progress.MofNCompleteColumn(),
-            progress.TimeRemainingColumn(),
-            progress.TextColumn("{task.fields[details]}", markup=False),
-        )
-        # Redirection would send output to standard error with the bar, and `manip-il ... > file` would lose it.
-        redirect, hidden = sys.stdout.isatty(), total == 0 or not has_bars()
-        self._bar = progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=redirect, disable=hidden)
-        self._bar.add_task(description, total=total, details="")
-        self._bar.start()
-        self._fields, self._solved = {}, 0
-        self._began = self._printed = time.monotonic()
+        how: dict[str, Any] = {"dynamic_ncols": True} if sys.stderr.isatty() else _PLAIN
+        self._bar = tqdm(total=total, desc=description, disable=_quiet or total == 0, **how)
+        self._solved = 0
 
     def close(self) -> None:
         """Close the bar."""
         if self._bar is not None:
-            self._bar.stop()
-            if self._done:
-                self._print()
+            self._bar.close()
             self._bar = None
 
-    @property
-    def _done(self) -> int:
-        return int(self._bar.tasks[0].completed) if self._bar else 0
-
-    def _print(self) -> None:
-        self._printed = time.monotonic()
-        if self._bar is not None and self._bar.disable and not _quiet:
-            task, rate = self._bar.tasks[0], f"{self._done / max(self._printed - self._began, 1e-9):.3g}/s"
-            count = self._done if task.total is None else f"{self._done}/{task.total:.0f}"
-            details = ", ".join(filter(None, [rate, task.fields["details"]]))
-            print(f"{task.description}: {count} ({details})", file=sys.stderr, flush=True)
-
-    def step(self, n: int = 1, **fields: object) -> None:
-        """Count `n` finished steps; `fields` (loss=0.12, success=0.9) update the displayed ones."""
+    def step(self, n: int = 1, **fields: float) -> None:
+        """Count `n` finished steps. fields: shown beside the bar (loss=0.12, success=0.9) until others are."""
         if self._bar is not None:
-            self._fields |= fields
-            texts = {name: f"{one:.4g}" if isinstance(one, float) else one for name, one in self._fields.items()}
-            self._bar.update(0, advance=n, details=", ".join(f"{name} {text}" for name, text in texts.items()))
-            if time.monotonic() - self._printed >= INTERVAL:
-                self._print()
+            if fields:
+                self._bar.set_postfix(fields, refresh=False)
+            self._bar.update(n)
         self.check()
 
     def episode(self, episode: Episode | EpisodeResult) -> None:
         """Count a finished episode."""
         self._solved += episode.success
-        self.step(success=self._solved / (self._done + 1))
+        self.step(success=self._solved / (self._bar.n + 1) if self._bar is not None else 0.0)
 
     def log(self, record: dict[str, Any]) -> None:
         """Show that a fit or a run has reached a step, with its metrics. record: {} if there are none."""
-        if record:
+        if record and self._bar is not None:
             shown = {name: record[name] for name in ("loss", "success", "kl") if name in record}
-            self.step(record["step"] - self._done, **shown)
+            self.step(record["step"] - self._bar.n, **shown)
         self.check()
 
     def check(self) -> None:

@@ -13,13 +13,13 @@ from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, 
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
+from manip_il.evaluation.suites import varied
 from manip_il.option import Seeded, option
+from manip_il.seeding import stream_seeds
 from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-
-HOLD = 10  # control steps that a demonstration continues after success
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,6 @@ class RecordOptions(Varied, Seeded, Resumable):
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
-    first: ClassVar[str] = "robot.type task.type dataset.root dataset.num_episodes cameras seed resume"
     env: Given = given(EnvConfig)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     engine: EngineOptions = group(EngineOptions(), prefix="")
@@ -51,7 +50,7 @@ class RecordOptions(Varied, Seeded, Resumable):
         from manip_il.collect.environments import env_spec
         from manip_il.collect.job import RolloutJob
         from manip_il.data.video import try_encoder
-        from manip_il.evaluation.suites import varied
+        from manip_il.evaluation.runner import HOLD
 
         env = env_config(self.env)
         cameras = self.camera_config(env) if self.cameras else None
@@ -69,12 +68,12 @@ class RecordOptions(Varied, Seeded, Resumable):
                 check_same_options(journals, self)
             self._record(job, root, journals, repo_id)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
+        say(f"to watch the expert: manip-il view --robot.type={env.robot} --task.type={env.task}")
 
     def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
-        from manip_il.seeding import stream_seeds
 
         count = self.dataset.num_episodes
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, self.seed)

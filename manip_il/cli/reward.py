@@ -8,11 +8,12 @@ from typing import ClassVar, Literal
 
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output, OutputFile
+from manip_il.cli.outputs import Output, OutputFile, publish
 from manip_il.cli.progress import progress, say
-from manip_il.data.atomic import write_file
+from manip_il.data.atomic import write_file, write_json
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import Seeded, option
+from manip_il.seeding import rng_for, stream_base
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,7 @@ class IrlOptions(OfDataset, Seeded):
     def run(self) -> None:
         """Read, learn, write the reward and the report, print the weights."""
         from manip_il.algorithms import inverse
-        from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.tables import print_table
         from manip_il.rewards.methods import learn
-        from manip_il.seeding import rng_for, stream_base
 
         with progress(None, f"irl {self.dataset}") as bar:
             carried = inverse.read_carried(self.dataset, bar.step)
@@ -48,10 +46,7 @@ class IrlOptions(OfDataset, Seeded):
         found = inverse.Inverse(str(self.dataset), tuple(carried), learnt)
         with self.output.open(self) as folder:
             page = inverse.inverse_report(found, command_line(), to_plain(self))
-            page.write(folder / REPORT_FILE)
-            write_json(folder / inverse.FILE_NAME, found.to_json())
-        print_table(inverse.weight_table(found))
-        say(f"report: {folder / REPORT_FILE}")
+            publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page)
         say(f"next: manip-il eval --policy.type=expert --task.type=carry:{folder / inverse.FILE_NAME}")
 
 
@@ -72,11 +67,9 @@ class PairsOptions(Seeded):
 
     def run(self) -> None:
         """Read the sources, choose, and write the pairs."""
-        from manip_il.evaluation.results import write_json
         from manip_il.learn.reward import LearnedReward
         from manip_il.preferences.frames import find_datasets
         from manip_il.preferences.pairs import choose_pairs
-        from manip_il.seeding import rng_for, stream_base
 
         self.file.check()
         reward = LearnedReward.load(find_policy(self.reward)) if self.reward else None
@@ -128,10 +121,8 @@ class AnswerOptions(OfPairs, Seeded):
 
     def run(self) -> None:
         """Compare every pair and write the answers."""
-        from manip_il.evaluation.results import write_json
         from manip_il.preferences.answers import Teacher, answer_pairs
         from manip_il.preferences.pairs import Pairs, read_clips
-        from manip_il.seeding import rng_for, stream_base
 
         self.file.check()
         teacher = Teacher.parse(self.teacher)
@@ -159,13 +150,11 @@ class FitOptions(OfPairs, Seeded):
     def run(self) -> None:
         """Fit, measure on held-out pairs, write the reward."""
         from manip_il.data.dataset import Dataset
-        from manip_il.evaluation.results import write_json
         from manip_il.learn.reward import shape_for, write_reward
         from manip_il.learn.training_state import PRETRAINED_MODEL
         from manip_il.preferences.answers import Preferences, join_answers
         from manip_il.preferences.fitting import fit_answers, summary_lines
         from manip_il.preferences.pairs import Pairs, join_pairs, read_clips
-        from manip_il.seeding import stream_base
 
         pairs = [Pairs.read(path) for path in (self.pairs, *self.more_pairs)]
         answers = join_answers([Preferences.read(path, pairs) for path in self.answers])

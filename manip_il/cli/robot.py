@@ -10,8 +10,9 @@ from typing import ClassVar
 from manip_il import checks
 from manip_il.cli.common_options import EngineOptions, env_config
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import Output, OutputFile, Replacing
+from manip_il.cli.outputs import Output, OutputFile, Replacing, publish
 from manip_il.cli.progress import progress, say
+from manip_il.data.atomic import write_file, write_json
 from manip_il.errors import ManipError, RenderError
 from manip_il.option import Seeded, option
 from manip_il.tasks import NAMES
@@ -37,7 +38,6 @@ class RobotNewOptions(Replacing):
     def run(self) -> None:
         """Write the YAML file, check the robot, print what is left to do. Raises `ManipError` if it can do no task."""
         from manip_il.collect.workers import Engine
-        from manip_il.data.atomic import write_file
         from manip_il.evaluation.robot_check import advice, check_robot, verdict
         from manip_il.robots.suggest import suggest, yaml_of
 
@@ -76,7 +76,6 @@ class RobotCheckOptions:
         """Measure, print the tables, write the report. Raises `ManipError` if a task cannot be done."""
         from manip_il.collect.workers import Engine
         from manip_il.evaluation import robot_check
-        from manip_il.evaluation.results import write_json
         from manip_il.evaluation.tables import print_table
         from manip_il.robots.gripper import sweep
         from manip_il.robots.table import get_robot
@@ -109,7 +108,6 @@ class CertifyOptions(Seeded):
     """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json."""
 
     example: ClassVar[str] = "manip-il robot certify --task.type=stack --output_dir=runs/certificate"
-    first: ClassVar[str] = "robot.type task.type cases output_dir"
     env: Given = given(EnvConfig)
     cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)
     engine: EngineOptions = group(EngineOptions(), prefix="")
@@ -118,16 +116,12 @@ class CertifyOptions(Seeded):
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
         from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
-        from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.tables import print_table
 
         env = env_config(self.env)
         with self.output.open(self) as folder:
             count = count_episodes(env, self.cases)
             with progress(count, f"certify {env.robot} {env.task}") as bar, self.engine.open() as engine:
                 certificate = certify(engine, env, self.cases, self.seed, lambda _: bar.step())
-            write_json(folder / FILE_NAME, certificate.to_json(), indent=None)
-        print_table(certificate.table(), empty="-")
-        if certificate.mu is not None:
-            say(f"u of Ross et al. (2011) is at least {certificate.mu} steps")
-        say(f"result: {folder / FILE_NAME}")
+            mu = certificate.mu
+            lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)
+            publish(folder / FILE_NAME, certificate.to_json(), [certificate.table()], *lines)

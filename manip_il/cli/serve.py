@@ -10,6 +10,8 @@ from manip_il.cli.common_options import Trusting, Varied
 from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say
 from manip_il.errors import UnknownName, UsageError
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.suites import varied
 from manip_il.option import option
 from manip_il.serve.config import LEADERS, ServoConfig, SessionConfig
 from manip_il.tasks.config import EnvConfig
@@ -27,7 +29,6 @@ class ServeOptions(Varied, Trusting):
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
-    first: ClassVar[str] = "task.type cameras leader servo log output_dir"
     command: list[str] = option(list, "a LeRobot program and its options, after `--`", positional=True)
     env: Given = given(EnvConfig, robot="so101")
     session: Given = given(SessionConfig, prefix="")
@@ -37,8 +38,6 @@ class ServeOptions(Varied, Trusting):
         """Serve until the program ends or the user presses Ctrl-C."""
         from manip_il.cli.inputs import open_driver
         from manip_il.data.atomic import exclusive
-        from manip_il.evaluation.policy_folder import find_policy
-        from manip_il.evaluation.suites import varied
         from manip_il.serve.session import serve
         from manip_il.sim.window import has_display
 

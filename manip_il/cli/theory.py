@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.options import command_line, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, Output
-from manip_il.cli.progress import progress, say
+from manip_il.cli.outputs import Output, publish
+from manip_il.cli.progress import progress
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -33,8 +33,6 @@ class TheoryOptions:
 
     def run(self) -> None:
         """Compute and measure; write the report and the JSON file; print the slopes."""
-        from manip_il.evaluation.results import write_json
-        from manip_il.evaluation.tables import print_table
         from manip_il.theory.bounds import all_curves
         from manip_il.theory.linear import drifts
         from manip_il.theory.report import FILE_NAME, Theory, slope_table, theory_report
@@ -42,10 +40,9 @@ class TheoryOptions:
         with self.output.open(self) as folder:
             shift = self._shift(self.source) if self.source else None
             theory = Theory(tuple(all_curves()), tuple(drifts()), shift)
-            write_json(folder / FILE_NAME, theory.to_json())
-            theory_report(theory, command_line(), to_plain(self)).write(folder / REPORT_FILE)
-        print_table(slope_table(theory))
-        say(f"policies above their bound: {theory.above}", f"report: {folder / REPORT_FILE}")
+            page = theory_report(theory, command_line(), to_plain(self))
+            fact = f"policies above their bound: {theory.above}"
+            publish(folder / FILE_NAME, theory.to_json(), [slope_table(theory)], fact, page=page)
 
     def _shift(self, run: Path) -> Shift:
         from manip_il.evaluation.arm import read_arm

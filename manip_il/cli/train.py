@@ -16,6 +16,7 @@ from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import Seeded, option
+from manip_il.seeding import stream_base
 
 if TYPE_CHECKING:  # the learner takes a second to import
     from manip_il.data.dataset import Dataset
@@ -48,7 +49,6 @@ class TrainOptions(Seeded, Trusting):
     example: ClassVar[str] = (
         "manip-il train --dataset.root=datasets/demos --policy.type=act --observation=state --output_dir=runs/act"
     )
-    first: ClassVar[str] = "dataset.root policy observation action_space steps batch_size output_dir resume"
     dataset: SourceGroup
     weights: Path | None = option(
         None, "rabc.parquet from manip-il data score: sampling weights of frames, as in LeRobot's RA-BC", exists=""
@@ -98,8 +98,6 @@ class TrainOptions(Seeded, Trusting):
 
     def config(self) -> FitConfig:
         """Return the trainer's configuration; `UsageError` if options contradict each other."""
-        from manip_il.seeding import stream_base
-
         if self.weights is not None and len(self.dataset.root) > 1:
             raise UsageError("--weights is for the frames of one dataset; give one --dataset.root")
         policy, seed = start_policy(self.fit.get("policy", {})), stream_base("training", self.seed)

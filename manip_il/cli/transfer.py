@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import group
@@ -95,7 +95,6 @@ class ExportOptions:
 
     example: ClassVar[str] = "manip-il export runs/dagger --output=policy.onnx"
     policy: Path = option(MISSING, "a run, a checkpoint or its pretrained_model", positional=True, exists="")
-    format: Literal["onnx"] = option("onnx", "file format")
     file: OutputFile = group(OutputFile(Path("policy.onnx")), prefix="")
 
     def run(self) -> None:

@@ -12,14 +12,15 @@ from manip_il.cli.common_options import OF_POLICY, Tested, Trusting, default_cam
 from manip_il.cli.options import Given, given
 from manip_il.cli.progress import say
 from manip_il.errors import UsageError
+from manip_il.evaluation.suites import suite_conditions
 from manip_il.option import Seeded, option
+from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.collect.rollout import Environment
     from manip_il.evaluation.watch import RerunLog, WindowScreen
 
-HOLD = 10  # control steps that an episode continues after success
 IN_A_FILE = 3  # episodes written to a file by default
 SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
 
@@ -44,7 +45,6 @@ class ViewOptions(Tested, Seeded, Trusting):
     """
 
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
-    first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     n_episodes: int | None = option(None, f"episodes; by default unlimited, {IN_A_FILE} in a file", at_least=1)
@@ -55,10 +55,9 @@ class ViewOptions(Tested, Seeded, Trusting):
         from manip_il.cli.inputs import open_driver
         from manip_il.collect.environments import make_env
         from manip_il.collect.job import RolloutJob, observed_cameras, run_steps
-        from manip_il.evaluation.suites import suite_conditions
+        from manip_il.evaluation.runner import HOLD
         from manip_il.evaluation.watch import outcome
         from manip_il.mdp import LONGEST_EPISODE
-        from manip_il.seeding import BLOCK, stream_seeds
         from manip_il.sim.config import FILM, CameraConfig, Look
         from manip_il.sim.window import has_display
         from manip_il.tasks.stock.table import ROBOTS as STOCK

@@ -6,10 +6,12 @@ import contextlib
 import ctypes
 import errno
 import fcntl
+import json
 import os
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from pathlib import Path
+from typing import Any
 
 from manip_il.errors import FolderExistsError, ManipError
 
@@ -85,6 +87,11 @@ def clear(folder: Path) -> None:
     """Delete everything in a folder, but not the folder itself, which may be locked or a mount point."""
     for path in folder.iterdir():
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -> None:
+    """Write `content` as `write_file` does."""
+    write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
 def write_file(path: Path, data: bytes) -> None:

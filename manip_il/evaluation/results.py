@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
-from manip_il.data.atomic import write_file
+from manip_il.data.atomic import write_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.sim.conditions import NOMINAL, Condition
@@ -254,12 +253,6 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
         raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes merge")
     episodes = [episode for part in parts.values() for episode in part.episodes]
     return replace(one, episodes=tuple(sorted(episodes, key=lambda episode: episode.seed)))
-
-
-def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -> None:
-    """Write `content` atomically, creating the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
 def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:

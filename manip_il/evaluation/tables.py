@@ -39,8 +39,8 @@ class Table:
         return Table(tuple(self.columns[i] for i in keep), rows, self.colours)
 
 
-def print_table(table: Table, console: Console | None = None, empty: str = "") -> None:
-    """Print the non-empty columns: in colour on a terminal, else as plain text. empty: text for an empty cell."""
+def print_table(table: Table, console: Console | None = None) -> None:
+    """Print the non-empty columns: in colour on a terminal, else as plain text."""
     console = console or Console(highlight=False)
     terminal = console.is_terminal
     if not terminal:
@@ -52,7 +52,7 @@ def print_table(table: Table, console: Console | None = None, empty: str = "") -
     for index, row in enumerate(table.rows):
         style = table.colours[index] if terminal and table.colours else None
         # Text objects, because Rich would parse the brackets of an interval as markup
-        drawn.add_row(*(Text(printable(cell or empty)) for cell in row), style=style)
+        drawn.add_row(*(Text(printable(cell or "-")) for cell in row), style=style)
     console.print(drawn)
 
 

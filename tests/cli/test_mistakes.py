@@ -61,15 +61,15 @@ def test_a_mistyped_command_or_option_imports_nothing_heavy(tmp_path):
 
 TRAIN, EXPERT = "train --dataset.root=SAMPLE", "eval --policy.type=expert"
 MISTAKES = {
-    "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: data build, ",
+    "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: ",
     "doctor x --repair": "'doctor' was renamed: manip-il data check, or manip-il data repair",
     "train": "--dataset.root is missing",
     "train --dataset.root=missing": "missing does not exist; expected a LeRobot v3.0 dataset",
     f"train --dataset.root={ROOT / 'docs'}": "is not a LeRobot dataset: meta/info.json is missing",
     "train --dataset.root=lerobot/pusht": "manip-il pull hf://datasets/lerobot/pusht FOLDER",
     f"{TRAIN} --policy.path=missing": "no policy in missing",
-    f"{TRAIN} --policy=act": "--policy is a group of options; known: --policy.NAME",
-    f"{TRAIN} --action_space=ee_detla": "did you mean 'ee_delta'?",
+    f"{TRAIN} --policy=act": "did you mean '--policy.NAME'",
+    f"{TRAIN} --action_space=ee_detla": "--action_space: expected joint_target|joint_delta|ee_delta, got 'ee_detla'",
     f"{TRAIN} --wandb.projekt=a --policy.type=act": "did you mean 'project'",
     "eval": "--policy.path=DIR",
     "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://lerobot/act_aloha FOLDER",
@@ -92,7 +92,7 @@ MISTAKES = {
     "data redraw SAMPLE SAMPLE --overwrite=true": "overlaps",
     "push SAMPLE": "REMOTE is missing",
     "push missing hf://me/x": "missing does not exist; expected a dataset, a run or a policy",
-    "view --policy.type=slider": "did you mean 'sliders'?",
+    "view --policy.type=slider": "--policy.type: expected expert|random|sliders, got 'slider'",
     "robot new missing.xml": "missing.xml does not exist; expected the arm's MJCF",
     "robot certify --cases=2000000": "--cases is 2000000; expected 1 to 1,000,000",
     "theory missing": "a run of manip-il dagger",

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.compare import read_plan
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import main
-from manip_il.cli.study import read_plan
 from manip_il.errors import MismatchError
 
 from .made_runs import make_run
@@ -130,12 +130,12 @@ def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after
 def test_arms_of_different_tasks_have_no_baseline_and_each_its_own_environment(here):
     text = FILE.replace("  dagger:", "  lift: {task.type: lift}")
     (here / "x.yaml").write_text(text)
-    plan = read_plan(here / "x.yaml", None)
+    plan = read_plan(here / "x.yaml")
     assert plan.baseline is None
     assert [env.task for env in plan.envs.values()] == ["reach", "lift"]
     (here / "x.yaml").write_text(text + "baseline: lift\n")
     with pytest.raises(MismatchError, match="task differs: cloning has reach, lift has lift"):
-        read_plan(here / "x.yaml", None)
+        read_plan(here / "x.yaml")
 
 
 def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_path):
@@ -144,7 +144,7 @@ def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_pa
     for path in paths:
         copy = tmp_path / path.name
         copy.write_text(re.sub(r"dataset\.root: \w+/[^,}\n]+,? ?", "", path.read_text()))  # which are made before
-        plan = read_plan(copy, None)
+        plan = read_plan(copy)
         assert (plan.baseline is None) == (len({env.task for env in plan.envs.values()}) > 1)
         first = path.read_text().splitlines()[0]
         assert first == f"# manip-il compare configs/studies/{path.name} --output_dir=runs/{path.stem}"

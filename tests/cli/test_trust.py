@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.compare import read_plan
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import load, main
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import dump_yaml, parse
-from manip_il.cli.study import read_plan
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.lerobot_config import lerobot_options
@@ -86,10 +86,10 @@ def test_a_study_trusts_for_its_runs_what_its_file_may_not(tmp_path):
     path = tmp_path / "s.yaml"
     path.write_text("arms: {a: {rounds: 1}, b: {trust: true}}\ntraining_seeds: 1\n")
     with pytest.raises(UsageError, match=r"its options: trust can only be set on the command line"):
-        read_plan(path, None)
+        read_plan(path)
     path.write_text("arms: {a: {rounds: 1}}\ntraining_seeds: 1\n")
     for trust in (False, True):
-        options = read_plan(path, None, trust=trust).arms["a"]
+        options = read_plan(path, trust=trust).arms["a"]
         assert isinstance(options, DaggerOptions)
         assert options.trust is trust
 
