@@ -5,9 +5,8 @@ Commands import this module only when they run, because it imports the environme
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.cli.common_options import env_config, start_policy
@@ -17,7 +16,7 @@ from manip_il.collect.drivers import Driver, PolicyDriver, driver_of
 from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.data.dataset import Dataset
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.schema import SIM_STATE, RobotTaskSpec, check_same_spec
+from manip_il.data.schema import SIM_STATE, check_same_spec
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.checkpoint import Checkpoint
@@ -54,25 +53,33 @@ def check_given(config: RunConfig) -> None:
             advice = "train a policy on it with manip-il train, and start from that: --policy.path=RUN"
             raise ManipError(f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}")
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
-        warn(*dataset_differences(str(root), given.spec, given.fingerprint))
+        _compare_with_here(given)
     if config.start is not None:
         check_policy(Checkpoint.open(config.start), config.env, trust=config.fit.trust)
 
 
-def dataset_differences(name: str, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> list[str]:
-    """Return a line for each difference between the versions and model that made a dataset and this machine's.
+def open_datasets(roots: Sequence[Path], *, pictures: bool, language: bool = False) -> list[Dataset]:
+    """Return the datasets; raise `MismatchError` unless they agree with each other and with this program.
 
-    name: the dataset's name for messages. Raises `MismatchError` if joints or observations differ. A dataset of a
-    user's own arm or task holds only its name, and is not compared.
+    pictures, language: see `check_same_sources`. Warns of datasets from other versions or models than this machine's.
     """
-    if not is_known(spec.robot, spec.task, spec.object):
-        return []
-    env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
-    check_same_spec(name, spec, "this program", env_spec(env))
-    # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are not compared, either.
-    here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}
-    theirs = {key: value for key, value in fingerprint.items() if key not in _NOT_COMPARED}
-    return compare_fingerprints(name, theirs, "this machine", here)
+    datasets = [*map(Dataset.open, roots)]
+    check_same_sources(roots, [one.spec for one in datasets], pictures=pictures, language=language)
+    for one in datasets:
+        _compare_with_here(one)
+    return datasets
+
+
+def _compare_with_here(dataset: Dataset) -> None:
+    """Check joints and observations, and warn of other versions and models; one's own arm or task is not compared."""
+    spec, name = dataset.spec, str(dataset.root)
+    if is_known(spec.robot, spec.task, spec.object):
+        env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
+        check_same_spec(name, spec, "this program", env_spec(env))
+        # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are not compared.
+        here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}
+        theirs = {key: value for key, value in dataset.fingerprint.items() if key not in _NOT_COMPARED}
+        warn(*compare_fingerprints(name, theirs, "this machine", here))
 
 
 def open_driver(

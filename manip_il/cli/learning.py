@@ -10,9 +10,8 @@ from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.cli.common_options import DatasetRoots, EngineOptions, own_files
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
-from manip_il.cli.progress import Stages, say, warn
+from manip_il.cli.progress import Stages, say
 from manip_il.data.json_lines import read_lines
-from manip_il.errors import UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import option
@@ -84,16 +83,10 @@ class GailOptions(Learning):
 
     def learning_config(self) -> LearningConfig:
         """Return the configuration of the run; raises if the demonstrations are not of one known environment."""
-        from manip_il.cli.inputs import dataset_differences
-        from manip_il.data.dataset import Dataset
-        from manip_il.learn.sources import check_same_sources
+        from manip_il.cli.inputs import open_datasets
 
-        opened = [Dataset.open(root) for root in self.dataset.root]
-        check_same_sources(self.dataset.root, [one.spec for one in opened], pictures=False, language=False)
-        for one in opened:
-            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
-        more = {"datasets": tuple(self.dataset.root), "discriminator": self.discriminator}
-        return self._config(opened[0].spec, **more)
+        first, *_ = open_datasets(self.dataset.root, pictures=False)
+        return self._config(first.spec, datasets=tuple(self.dataset.root), discriminator=self.discriminator)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +111,7 @@ class PpoOptions(Learning):
 
     method: ClassVar[str] = "ppo"
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
+    init: Path = option(MISSING, "the cloned mlp, or its run, to improve", exists="")
     reward: Path = option(MISSING, "the reward: a folder from manip-il reward fit", exists="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/ppo")), prefix="")
 
@@ -126,8 +120,6 @@ class PpoOptions(Learning):
         from manip_il.collect.environments import env_spec
         from manip_il.learn.reward import LearnedReward
 
-        if self.init is None:
-            raise UsageError("--init is missing; expected the path of a cloned policy for PPO to improve")
         reward = LearnedReward.load(found := find_policy(self.reward))
         config = self._config(reward.origin, reward=found)
         reward.check_fits("the environment", env_spec(config.env))

@@ -144,8 +144,9 @@ def _dispatch(own: list[str], others: list[str]) -> None:
 def _report(error: BaseException, words: list[str]) -> int:
     """Print an error as one line on standard error; return the exit code."""
     code = 1
-    if isinstance(error, BrokenPipeError):  # the reader of standard output, such as `head`, may have ended
+    if isinstance(error, BrokenPipeError):  # the reader of standard output, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return code
     if isinstance(error, KeyboardInterrupt):
         text, code = f"interrupted{f'; {error}' if error.args else ''}", EXIT_INTERRUPTED
     elif isinstance(error, ManipError):

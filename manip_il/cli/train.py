@@ -7,19 +7,16 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from manip_il.cli.common_options import DatasetRoots, Trusting, start_policy
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
-from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
+from manip_il.cli.progress import Stages, progress, say, set_quiet
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import Seeded, option
 from manip_il.seeding import stream_base
-
-if TYPE_CHECKING:  # the learner takes a second to import
-    from manip_il.data.dataset import Dataset
 
 RANK = "RANK"  # environment variable with the process's index in distributed training
 
@@ -58,20 +55,22 @@ class TrainOptions(Seeded, Trusting):
 
     def run(self) -> None:
         """Read the datasets, fit, and print the checkpoint's path."""
+        from manip_il.cli.inputs import open_datasets
+        from manip_il.learn.lerobot_config import lerobot_options
+        from manip_il.learn.names import PLAIN
+        from manip_il.learn.samples import rabc_weights
+        from manip_il.learn.sources import input_columns
+        from manip_il.learn.train import Trainer
+
         writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
         if not writes:
             set_quiet(True)
-        config, folder = self.config(), self.output.output_dir
-        datasets, weights = self._datasets(config), None
-        # Imported after the datasets are checked: these take seconds.
-        from manip_il.cli.inputs import dataset_differences
-        from manip_il.learn.lerobot_config import lerobot_options
-        from manip_il.learn.samples import rabc_weights
-        from manip_il.learn.train import Trainer
-
-        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
+        config, folder, weights = self.config(), self.output.output_dir, None
+        language = config.kind not in PLAIN
+        datasets = open_datasets(self.dataset.root, pictures=config.takes_images, language=language)
         for one in datasets:
-            warn(*dataset_differences(str(one.root), one.spec, one.fingerprint))
+            input_columns(config, one.root, one.info)  # raises if the dataset lacks one
+        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         if self.weights is not None:
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
@@ -102,16 +101,3 @@ class TrainOptions(Seeded, Trusting):
             raise UsageError("--weights is for the frames of one dataset; give one --dataset.root")
         policy, seed = start_policy(self.fit.get("policy", {})), stream_base("training", self.seed)
         return FitConfig(**dict(self.fit, policy=policy, seed=seed, trust=self.trust))
-
-    def _datasets(self, config: FitConfig) -> list[Dataset]:
-        """Return the datasets; raises unless they agree with each other and have the policy's inputs."""
-        from manip_il.data.dataset import Dataset
-        from manip_il.learn.names import PLAIN
-        from manip_il.learn.sources import check_same_sources, input_columns
-
-        datasets = [*map(Dataset.open, self.dataset.root)]
-        specs, language = [one.spec for one in datasets], config.kind not in PLAIN
-        check_same_sources(self.dataset.root, specs, pictures=config.takes_images, language=language)
-        for one in datasets:
-            input_columns(config, one.root, one.info)
-        return datasets

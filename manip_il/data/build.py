@@ -134,15 +134,13 @@ def local_id(folder: str) -> str:
     return f"local/{name[: checks.LONGEST_NAME] or 'dataset'}"
 
 
-def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> tuple[Info, int]:
+def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, int]:
     """Build a LeRobot dataset from a folder of journals, in seed order; equal to the one that `record` writes.
 
     Returns what `Recording.make` returns. Raises what reading raises, `ManipError` if there is no journal,
     `FolderExistsError` if `root` is not empty, unless `replace` swaps it for the new one at the end.
     """
     recording = Recording.read(journals)
-    if repo_id is not None:
-        recording = dataclasses.replace(recording, repo_id=repo_id)
     if not (paths := list_episodes(journals)):
         raise ManipError(f"{journals} holds no episode")
     return recording.make(map(read_journal, paths), root, replace=replace)
