@@ -15,6 +15,7 @@ from manip_il.cli.outputs import ResumableOutput
 from manip_il.cli.progress import Stages, progress, say, set_quiet
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.names import PLAIN
 from manip_il.option import Seeded, option
 from manip_il.seeding import stream_base
 
@@ -56,11 +57,7 @@ class TrainOptions(Seeded, Trusting):
     def run(self) -> None:
         """Read the datasets, fit, and print the checkpoint's path."""
         from manip_il.cli.inputs import open_datasets
-        from manip_il.learn.lerobot_config import lerobot_options
-        from manip_il.learn.names import PLAIN
-        from manip_il.learn.samples import rabc_weights
         from manip_il.learn.sources import input_columns
-        from manip_il.learn.train import Trainer
 
         writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
         if not writes:
@@ -70,6 +67,11 @@ class TrainOptions(Seeded, Trusting):
         datasets = open_datasets(self.dataset.root, pictures=config.takes_images, language=language)
         for one in datasets:
             input_columns(config, one.root, one.info)  # raises if the dataset lacks one
+        # Imported after the datasets are checked: these take seconds.
+        from manip_il.learn.lerobot_config import lerobot_options
+        from manip_il.learn.samples import rabc_weights
+        from manip_il.learn.train import Trainer
+
         options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         if self.weights is not None:
             first = datasets[0]
