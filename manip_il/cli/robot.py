@@ -88,7 +88,7 @@ class RobotCheckOptions:
         with self.output.open(self) as folder:
             with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar, Engine(None) as engine:
                 found = robot_check.check_robot(self.robot, tasks, self.episodes, engine, lambda _: bar.step())
-            write_json(folder / robot_check.FILE_NAME, found.to_json(), indent=2)
+            write_json(folder / robot_check.FILE_NAME, found.to_json())
             try:
                 pictures, no_pictures = robot_check.looks(self.robot), ""
             except RenderError as error:

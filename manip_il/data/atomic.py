@@ -89,9 +89,9 @@ def clear(folder: Path) -> None:
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -> None:
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write `content` as `write_file` does."""
-    write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
+    write_file(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
 def write_file(path: Path, data: bytes) -> None:
