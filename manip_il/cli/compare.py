@@ -81,6 +81,7 @@ class CompareOptions(Compared, Tested, Seeded, Trusting):
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
+    first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
         MISSING,
         "two sides, each an eval.json, a policy or a run; or the YAML file of a study",

@@ -14,7 +14,7 @@ from manip_il.cli.progress import Stages, say
 from manip_il.data.atomic import write_json
 from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.suites import varied
-from manip_il.learn.checkpoint import Checkpoint, policy_cameras
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.sim.config import CameraConfig
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from manip_il.algorithms.results import Result
     from manip_il.collect.workers import Engine
     from manip_il.evaluation.tables import PolicyRow
+
+_OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class DaggerOptions(Varied, Trusting):
     """
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
+    first: ClassVar[str] = "robot.type task.type demonstrations rounds episodes_per_round policy output_dir resume"
     env: Given = given(EnvConfig)
     method: Method = option(
         "dagger",
@@ -49,7 +52,7 @@ class DaggerOptions(Varied, Trusting):
         "when the expert is queried: every, one, probability:P, ensemble:BOUND or safety:BOUND; "
         "by default every, but one for takeover, and probability:1/STEPS for branch",
     )
-    fit: Given = given(FitConfig, prefix="")
+    fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
     image: Given = given(CameraConfig, **SMALL)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")

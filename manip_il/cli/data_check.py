@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -15,6 +16,7 @@ from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 
 if TYPE_CHECKING:
+    from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
 
 PROGRESS = "progress"  # scores by true progress instead of a reward
@@ -37,7 +39,7 @@ class CheckOptions(OfDataset):
         """Check the dataset and print every finding."""
         from manip_il.doctor.examine import examine_folder
 
-        findings = examine_folder(self.dataset.absolute())
+        findings = examine_folder(self.dataset.absolute(), [check_robot])
         say(*map(str, findings))
         return findings
 
@@ -69,6 +71,21 @@ class RepairOptions(CheckOptions):
             say(*(f"repair   {line}" for line in repair(self.dataset.absolute(), findings)))
             findings = self._examine()
         self._conclude(findings)
+
+
+def check_robot(dataset: Dataset) -> Iterator[Finding]:
+    """Compare joints, observations and compiled model with those of the robot and task of this version."""
+    from manip_il.cli.inputs import differences
+    from manip_il.data.lerobot_layout import OURS
+    from manip_il.doctor.finding import Finding, warning
+
+    if dataset.own is None:
+        return
+    try:
+        for text in differences(dataset):
+            yield warning(OURS, text, f"for labels of the current expert: manip-il data relabel {dataset.root}")
+    except ManipError as error:
+        yield Finding(OURS, str(error), "use the version of this program that recorded it, or record again")
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class DemoOptions:
         with self.output.open(self) as folder, Stages(kept) as stages, self.engine.open() as engine:
             engine.warm_up(learned=True)
             policies, rows = self._measure(config, folder, engine, stages)
-            films = _film(policies, rows, config, stages)
+            films, no_films = _film(policies, rows, config, stages)
         _, first, more, dagger = rows
         verdict, *facts = (
             f"{prefix}{Comparison(one.name, dagger.name, ((getattr(one, test), getattr(dagger, test)),)).verdict}"
@@ -63,10 +63,10 @@ class DemoOptions:
             for one in (more, first)
         )
         facts.append(f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.")
-        title = f"Demo: {config.env.robot} {config.env.task}"
-        parts = {"title": title, "verdict": verdict, "facts": tuple(facts), "command": command_line()}
-        write_page(folder, folder / "dagger", rows, "DAgger", *films, config=to_plain(self), **parts)
-        print_table(policy_table(rows), empty="-")
+        parts = {"title": f"Demo: {config.env.robot} {config.env.task}", "verdict": verdict, "facts": tuple(facts)}
+        parts |= {"films": films, "no_films": no_films, "command": command_line(), "config": to_plain(self)}
+        write_page(folder, folder / "dagger", rows, "DAgger", **parts)
+        print_table(policy_table(rows))
         say(verdict, *facts)
         say(f"report: {folder / REPORT_FILE}")
         say(f"next: manip-il eval --policy.path={policies[-1]} --eval.films=3 --output_dir={folder}_eval")

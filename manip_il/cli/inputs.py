@@ -53,7 +53,7 @@ def check_given(config: RunConfig) -> None:
             advice = "train a policy on it with manip-il train, and start from that: --policy.path=RUN"
             raise ManipError(f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}")
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
-        _compare_with_here(given)
+        warn(*differences(given))
     if config.start is not None:
         check_policy(Checkpoint.open(config.start), config.env, trust=config.fit.trust)
 
@@ -66,20 +66,25 @@ def open_datasets(roots: Sequence[Path], *, pictures: bool, language: bool = Fal
     datasets = [*map(Dataset.open, roots)]
     check_same_sources(roots, [one.spec for one in datasets], pictures=pictures, language=language)
     for one in datasets:
-        _compare_with_here(one)
+        warn(*differences(one))
     return datasets
 
 
-def _compare_with_here(dataset: Dataset) -> None:
-    """Check joints and observations, and warn of other versions and models; one's own arm or task is not compared."""
+def differences(dataset: Dataset) -> list[str]:
+    """Return a line for each difference between the versions and model that made a dataset and this machine's.
+
+    Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm or task holds only its name,
+    and is not compared.
+    """
     spec, name = dataset.spec, str(dataset.root)
-    if is_known(spec.robot, spec.task, spec.object):
-        env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
-        check_same_spec(name, spec, "this program", env_spec(env))
-        # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are not compared.
-        here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}
-        theirs = {key: value for key, value in dataset.fingerprint.items() if key not in _NOT_COMPARED}
-        warn(*compare_fingerprints(name, theirs, "this machine", here))
+    if not is_known(spec.robot, spec.task, spec.object):
+        return []
+    env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
+    check_same_spec(name, spec, "this program", env_spec(env))
+    # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are not compared.
+    here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}
+    theirs = {key: value for key, value in dataset.fingerprint.items() if key not in _NOT_COMPARED}
+    return compare_fingerprints(name, theirs, "this machine", here)
 
 
 def open_driver(

@@ -27,6 +27,7 @@ class Learning:
     """Options, run, progress and report that these commands share."""
 
     method: ClassVar[str]
+    first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"
     init: Path | None = option(None, "a cloned mlp, or its run, to start from; by default a new policy")
     settings: Given = given(LearningConfig, prefix="")
     ppo: PPOConfig = field(default_factory=PPOConfig)

@@ -87,7 +87,7 @@ RENAMED = {
     **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
 }
 
-HELP = ("--help", "-h")
+HELP = ("--help", "-h", "--help=all")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
   --quiet      show no progress on standard error"""
@@ -182,12 +182,19 @@ def _group_help(group: str) -> str:
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
-    """Return the help of one command. words: with `--policy.type=act` it also lists the options of that policy."""
+    """Return the help of one command: its most used options (`first`), or all with `--help=all`.
+
+    words: the command line: `--policy.type=act` also lists the options of that policy.
+    """
     options = options_of(cls)
+    first = () if "--help=all" in words else getattr(cls, "first", "").split()
     positional = [option for option in options if option.positional]
     places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
-    rows = dict(map(_row, options))
+    rows = dict(_row(one) for one in options if not first or one.positional or one.name in first)
+    rest = len(options) - len(rows)
     rows["--config_path=FILE.yaml"] = "read options from YAML; the command line overrides them"
+    if rest:
+        rows["--help=all"] = f"also list the other {rest} options"
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     more = ""
     if kind and any(one.is_open for one in options):

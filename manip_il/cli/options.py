@@ -15,7 +15,7 @@ import shlex
 import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Union
@@ -33,9 +33,12 @@ def group(default: Any, prefix: str | None = None) -> Any:
     return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
 
 
-def given(cls: type, prefix: str | None = None, **own: Any) -> Any:
-    """Return a `Given` field: the options that `cls` declares. own: defaults that replace those, always in the dict."""
-    metadata = {"given": cls}
+def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **own: Any) -> Any:
+    """Return a `Given` field: the options that `cls` declares.
+
+    only: names of fields, by default all. own: defaults that replace those of `cls`, always in the dict.
+    """
+    metadata = {"given": cls, "only": only}
     names = {} if prefix is None else {"prefix": prefix}
     return field(default_factory=functools.partial(dict, own), metadata=metadata | names)
 
@@ -92,7 +95,7 @@ def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, .
         kind, default = type_of(cls, one), default_of(one, base)
         if source := one.metadata.get("given"):
             for theirs in dataclasses.fields(source):
-                if "help" in theirs.metadata:
+                if "help" in theirs.metadata and theirs.name in (one.metadata["only"] or (theirs.name,)):
                     name = theirs.metadata.get("flag", inner + theirs.name)
                     own = default.get(theirs.name, default_of(theirs))
                     found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, theirs.metadata))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
 from manip_il.cli.progress import say
-from manip_il.data.atomic import clear, exclusive, write_file, write_json
+from manip_il.data.atomic import PARTIAL, clear, exclusive, write_file, write_json
 from manip_il.errors import FolderExistsError, MismatchError, UsageError
 from manip_il.option import option
 
@@ -85,7 +85,11 @@ def prepare_output(
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
-    if not resume and folder.exists():
+    if resume:
+        for left in folder.rglob(f".*{PARTIAL}"):  # partial files of a killed writer; folders have locks
+            if left.is_file():
+                left.unlink()
+    elif folder.exists():
         require_replaceable(folder, overwrite, sources)
         clear(folder)
 

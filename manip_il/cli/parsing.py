@@ -33,6 +33,13 @@ from manip_il.option import check_bound
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
 _MOST_OFFERED = 3  # names that an error suggests
+_FORMER = {  # options of older files, ignored with these values
+    "task.reward": "",
+    "ppo.gae_lambda": 0.95,
+    "ppo.clip_range": 0.2,
+    "ppo.entropy": 0.0,
+    "ppo.target_kl": 0.05,
+}
 type Known = Mapping[str, Option]
 
 
@@ -115,7 +122,7 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
             break
         if not word.startswith("--"):
             if not places or word.startswith("-"):
-                wanted = f"write options as --name=value; manip-il {command} --help lists them"
+                wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
                 raise UsageError(f"unexpected {shorten(word)}; {wanted}")
             option = places[0] if places[0].is_list else places.pop(0)
             before = raw[option.name].value if option.is_list and option.name in raw else []
@@ -158,7 +165,7 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
                 raise UsageError(f"{origin}: {name} can only be set on the command line; give --{name}=...")
         elif any(other == name or other.startswith(f"{name}.") for other in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
-        else:
+        elif name not in _FORMER or value != _FORMER[name]:
             raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
     return raw
 
@@ -199,4 +206,4 @@ def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: st
     """
     named = [one.label.replace("--", dashes) for one in known.values() if not one.positional]
     near = nearest(dashes + name, named, _MOST_OFFERED)
-    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help lists all")
+    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help=all lists all")

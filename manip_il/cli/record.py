@@ -41,6 +41,7 @@ class RecordOptions(Varied, Seeded, Resumable):
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
+    first: ClassVar[str] = "robot.type task.type dataset.root dataset.num_episodes cameras seed resume"
     env: Given = given(EnvConfig)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     engine: EngineOptions = group(EngineOptions(), prefix="")

@@ -108,6 +108,7 @@ class CertifyOptions(Seeded):
     """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json."""
 
     example: ClassVar[str] = "manip-il robot certify --task.type=stack --output_dir=runs/certificate"
+    first: ClassVar[str] = "robot.type task.type cases output_dir"
     env: Given = given(EnvConfig)
     cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)
     engine: EngineOptions = group(EngineOptions(), prefix="")

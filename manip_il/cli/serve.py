@@ -29,6 +29,7 @@ class ServeOptions(Varied, Trusting):
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
+    first: ClassVar[str] = "task.type cameras leader servo log output_dir"
     command: list[str] = option(list, "a LeRobot program and its options, after `--`", positional=True)
     env: Given = given(EnvConfig, robot="so101")
     session: Given = given(SessionConfig, prefix="")

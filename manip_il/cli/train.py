@@ -47,6 +47,7 @@ class TrainOptions(Seeded, Trusting):
     example: ClassVar[str] = (
         "manip-il train --dataset.root=datasets/demos --policy.type=act --observation=state --output_dir=runs/act"
     )
+    first: ClassVar[str] = "dataset.root policy observation action_space steps batch_size output_dir resume"
     dataset: SourceGroup
     weights: Path | None = option(
         None, "rabc.parquet from manip-il data score: sampling weights of frames, as in LeRobot's RA-BC", exists=""

@@ -45,6 +45,7 @@ class ViewOptions(Tested, Seeded, Trusting):
     """
 
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
+    first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     n_episodes: int | None = option(None, f"episodes; by default unlimited, {IN_A_FILE} in a file", at_least=1)

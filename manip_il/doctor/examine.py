@@ -31,11 +31,11 @@ _FILE = re.compile(r"(?:meta|data|videos)/[\w.\-/]*\w")
 _PICTURES = 100  # pictures per camera from which statistics are computed
 
 
-def examine_folder(root: Path) -> list[Finding]:
+def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
     """Return all findings about a folder, [] for a sound dataset. Never raises.
 
     Every file is first opened in a child process; if that needs too much memory or time, or the folder is not a
-    dataset, this is the only finding.
+    dataset, this is the only finding. more: additional checks.
     """
     try:
         check_arrived(root, strict=False)
@@ -43,7 +43,7 @@ def examine_folder(root: Path) -> list[Finding]:
     except ManipError as problem:
         found = [_explain(root, problem)]
     else:
-        found = [finding for check in CHECKS for finding in _run(check, dataset)]
+        found = [finding for check in (*CHECKS, *more) for finding in _run(check, dataset)]
     # several checks may report the same file
     return list(dict.fromkeys(replace(one, remedy=one.remedy or mend(root, one)) for one in found))
 

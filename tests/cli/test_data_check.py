@@ -67,6 +67,16 @@ def test_repair_builds_again_and_exits_0_or_1_if_something_stays_wrong(root, cap
     assert "there are no journals to repair it from: pull or record it again" in capsys.readouterr().out
 
 
+def test_the_robots_joints_are_compared(root, capsys):
+    edit_json(root / layout.OURS, lambda ours: ours["fingerprint"].update(model_sha256="0" * 64))
+    assert main(["data", "check", str(root)]) == 0
+    out = capsys.readouterr().out
+    assert "warning  meta/manip_il.json: model_sha256 differs: {root} has 000000000000" in out
+    edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "elbow"))
+    assert main(["data", "check", str(root)]) == 1
+    assert "error    meta/manip_il.json: joint_names differs: " in capsys.readouterr().out
+
+
 def test_two_datasets_become_one_with_the_episodes_of_both(root, capsys):
     other = shutil.copytree(root, root.with_name("other"))
     words = ["data", "merge", str(root), str(other), f"--output={root.with_name('both')}"]

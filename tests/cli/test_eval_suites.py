@@ -163,7 +163,7 @@ def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     assert "has seeds 4000000 to 4000001" in error()
 
 
-def test_a_replay_finds_a_policy_that_has_moved(here, capsys, error):
+def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, capsys, error):
     act = write_checkpoint(here / "act", "act", env_spec(ENV))
     assert evaluate("e", "--policy.path=act", "--eval.n_episodes=1", "--task.type=pick_place", *SMALL) == 0
     act.rename(here / "moved")
@@ -171,6 +171,10 @@ def test_a_replay_finds_a_policy_that_has_moved(here, capsys, error):
     assert main(["eval", "e", "--replay=4000000"]) == 2
     assert "no policy in act" in error()
     assert main(["eval", "e", "--replay=4000000", "--policy.path=moved"]) == 0
+    assert "files differ" not in capsys.readouterr().err
+    other = write_checkpoint(here / "other", "act", env_spec(ENV), chunk_size=4)
+    assert main(["eval", "e", "--replay=4000000", f"--policy.path={other}"]) in (0, 1)
+    assert "is not the policy of e: its files differ" in capsys.readouterr().err
 
 
 @pytest.mark.gl

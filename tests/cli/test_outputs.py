@@ -39,6 +39,12 @@ def test_a_new_or_empty_folder_is_fine_and_a_full_one_is_refused_with_the_ways_o
         prepare_output(ours, resume=True, overwrite=True)
 
 
+def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
+    (ours / ".fingerprint.json.x.partial").touch()
+    prepare_output(ours, resume=True)
+    assert [path.name for path in ours.iterdir()] == ["config.yaml"]
+
+
 def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(tmp_path):
     options = RecordOptions(dataset=DatasetGroup(root=tmp_path / "demos"))
     (tmp_path / f".{CONFIG_FILE}.123.tmp").write_text("# manip-")
