@@ -57,7 +57,7 @@ class _Log:
 
     def write(self, text: str) -> None:
         if line := text.strip():
-            print(line, file=sys.stderr)
+            print(line.replace("( ", "("), file=sys.stderr)  # tqdm pads rates
 
     def flush(self) -> None:
         sys.stderr.flush()
