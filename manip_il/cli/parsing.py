@@ -129,7 +129,8 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
             raw[option.name] = _Value(option, [*before, word] if option.is_list else word, option.label)
             continue
         name, equals, value = word[2:].partition("=")
-        name = name.replace("-", "_")  # accept --output-dir
+        if _find(ours := name.replace("-", "_"), known):  # accept --output-dir
+            name = ours
         option = _find(name, known)
         if option is None or option.positional:
             raise _unknown_option("option", name, known, "--", command)

@@ -71,7 +71,7 @@ def test_the_robots_joints_are_compared(root, capsys):
     edit_json(root / layout.OURS, lambda ours: ours["fingerprint"].update(model_sha256="0" * 64))
     assert main(["data", "check", str(root)]) == 0
     out = capsys.readouterr().out
-    assert "warning  meta/manip_il.json: model_sha256 differs: {root} has 000000000000" in out
+    assert f"warning  meta/manip_il.json: model_sha256 differs: {root} has 000000000000" in out
     edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "elbow"))
     assert main(["data", "check", str(root)]) == 1
     assert "error    meta/manip_il.json: joint_names differs: " in capsys.readouterr().out
