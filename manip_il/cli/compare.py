@@ -41,7 +41,7 @@ class TrialGroup:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compared:
+class ComparisonOptions:
     """Which rounds of the runs are compared, and on how many episodes."""
 
     checkpoint: Literal["best", "last"] = option("best", "which round of a run: the best on validation, or the last")
@@ -54,7 +54,7 @@ class Compared:
 
 
 @dataclass(frozen=True)
-class StudyFile(Compared):
+class StudyFile(ComparisonOptions):
     """Content of a study's YAML file.
 
     common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. If tasks
@@ -69,7 +69,7 @@ class StudyFile(Compared):
 
 
 @dataclass(frozen=True)
-class CompareOptions(Compared, Tested, Seeded, Trusting):
+class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
     """Compare two policies, runs, or folders of several training seeds on the same test seeds; or run a whole study.
 
     Each side is an eval.json, a policy, a run of manip-il dagger, or a folder of these named seed_0, seed_1, ...
@@ -178,7 +178,7 @@ class CompareOptions(Compared, Tested, Seeded, Trusting):
         publish(folder / FILE_NAME, study.to_json(), study.tables, study.verdict, *study.facts, page=page)
 
 
-class Plan(NamedTuple):
+class StudyPlan(NamedTuple):
     """A checked study: the options and the environment of every arm, and the arm to compare others with, if any."""
 
     file: StudyFile
@@ -197,7 +197,7 @@ class Plan(NamedTuple):
                 replace(options, settings=options.settings | {"seed": seed}, output=output, engine=engine).run()
 
 
-def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> Plan:
+def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:
     """Return the study in `path`; raises a one-line `UsageError` if something is invalid.
 
     training_seeds: replaces the file's. trust: option of its runs.
@@ -220,8 +220,8 @@ def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False
         except ManipError as error:
             raise UsageError(f"{path}: arm {name!r}: {error}") from error
     if file.baseline is None and len({env.task for env in envs.values()}) > 1:
-        return Plan(file, arms, envs, None)
+        return StudyPlan(file, arms, envs, None)
     require_same_env(envs)
     if file.baseline is not None and file.baseline not in envs:
         raise UnknownName("arm as a baseline", file.baseline, envs)
-    return Plan(file, arms, envs, file.baseline or next(iter(envs)))
+    return StudyPlan(file, arms, envs, file.baseline or next(iter(envs)))
