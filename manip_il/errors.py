@@ -10,7 +10,6 @@ import traceback
 from collections.abc import Iterable
 
 OWN = "manip_il_own_"  # prefix of the modules of users' own files
-_MOST_OFFERED = 3  # names that an error suggests
 _LONGEST_PRINTED = 200  # [characters]
 
 
@@ -37,10 +36,10 @@ class UnknownName(UsageError):
     """A name is unknown; the message lists the known names and the nearest."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str], where: str = ""):
-        """Take the known names. where: what lists them, if they are many; then only the nearest are named."""
+        """Take the known names. where: what the message says in place of these."""
         known = sorted(known)
-        near = nearest(name, known, _MOST_OFFERED if where else 1)
-        super().__init__(f"unknown {kind} {shorten(name)}{near}; {where or f'known: {", ".join(known)}'}")
+        listed = where or f"known: {', '.join(known)}"
+        super().__init__(f"unknown {kind} {shorten(name)}{nearest(name, known)}; {listed}")
 
 
 class MismatchError(ManipError):

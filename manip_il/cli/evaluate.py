@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
+from manip_il.cli.outputs import ResumableOutput, publish
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, MismatchError, UsageError
@@ -131,13 +131,10 @@ class EvalOptions(Tested, Seeded, Trusting):
         """Write the result and its report, and print its tables."""
         from manip_il.evaluation.eval_report import eval_report
         from manip_il.evaluation.results import FILE_NAME
-        from manip_il.evaluation.tables import evaluation_table, print_table
+        from manip_il.evaluation.tables import evaluation_table
 
-        result.write(folder / FILE_NAME)
         page = eval_report(result, command_line(), to_plain(self), films, no_films)
-        page.write(folder / REPORT_FILE)
-        print_table(evaluation_table(result))
-        say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
+        publish(folder / FILE_NAME, result.to_json(), [evaluation_table(result)], page=page)
 
     def _merge(self) -> None:
         """Merge evaluations; warn if they were made with different versions or models."""

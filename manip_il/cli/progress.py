@@ -67,6 +67,7 @@ _PLAIN: dict[str, Any] = {
     "file": _Log(),
     "mininterval": 5.0,  # [s]
     "miniters": 1,
+    "delay": 1.0,
     "unit": "",
     "bar_format": "{desc}: {n_fmt}/{total_fmt} ({rate_noinv_fmt}{postfix})",
 }
@@ -113,11 +114,13 @@ class Stages:
         self.check()
         how: dict[str, Any] = {"dynamic_ncols": True} if sys.stderr.isatty() else _PLAIN
         self._bar = tqdm(total=total, desc=description, disable=_quiet or total == 0, **how)
+        self._bar.delay = 0.0  # it only kept `tqdm` from writing a line at once
         self._solved = 0
 
     def close(self) -> None:
         """Close the bar."""
         if self._bar is not None:
+            self._bar.leave = self._bar.n > 0
             self._bar.close()
             self._bar = None
 
