@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-eyes test test-fast lint format docker docker-test bench lock clean
+.PHONY: help setup demo demo-eyes test test-together test-clock test-fast lint format docker docker-test bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= $(or $(shell command -v python3.12),$(shell command -v python3.13),python3.12)
@@ -47,10 +47,14 @@ demo-eyes: setup  ## a policy from pictures, from nothing, in half an hour: runs
 # A file's tests stay in one worker, so that what they share is made once; tests/conftest.py puts long files first.
 # A worker that dies ends the run: what comes after it would wait for ever.
 TWO := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0 --ignore=tests/serve
-# Those that run by the clock come last and alone: LeRobot waits 50 ms for an answer.
-test: setup .venv/.robots  ## every test
+# Those that run by the clock come last, and nothing heavy beside them: LeRobot waits 50 ms for an answer.
+test: test-together test-clock  ## every test
+
+test-together: setup .venv/.robots
 	@.ci/system browser sshd
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO)
+
+test-clock: setup .venv/.robots
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/serve
 
 test-fast: setup .venv/.robots  ## the tests that take seconds and need no OpenGL
