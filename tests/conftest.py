@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -48,7 +47,7 @@ IMPORTED_ONCE = [
 forkserver.set_forkserver_preload(IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
 
-LARGE, TOO_LARGE = 1_500_000_000, 2_600_000_000  # of a process [bytes]
+LARGE = 1_500_000_000  # of a process [bytes]
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
 
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
@@ -88,30 +87,16 @@ def _take_back() -> None:
 def _memory_goes_back(request: pytest.FixtureRequest) -> Iterator[None]:
     """What a file keeps for its own tests is let go after them, and what the allocator holds of it given back.
 
-    Compiled scenes are kept for the next file unless this process has grown large: the finest take 64 MB each.
+    Caches of the package are kept for the next file unless this process has grown large: the finest scenes take 64 MB.
     """
     yield
-    _let_go([request.module, *(_ours() if _resident() > LARGE else [])])
-
-
-@pytest.fixture(autouse=True)
-def _memory_has_a_bound() -> Iterator[None]:
-    """Nothing is kept for the next test either if this process has grown too large."""
-    yield
-    if _resident() > TOO_LARGE:
-        _let_go(_ours())
-
-
-def _ours() -> list[ModuleType]:
-    return [module for name, module in sys.modules.items() if name.startswith("manip_il.")]
-
-
-def _let_go(modules: list[ModuleType]) -> None:
-    """Empty the caches of some modules, and give the memory back."""
-    for kept in [one for module in modules for one in vars(module).values()]:
+    large = _resident() > LARGE
+    modules = [module for name, module in sys.modules.items() if large and name.startswith("manip_il.")]
+    for kept in [one for module in (request.module, *modules) for one in vars(module).values()]:
         if isinstance(kept, functools._lru_cache_wrapper):
             kept.cache_clear()
-    gc.collect()
+    if large:
+        gc.collect()
     if _TRIM is not None:
         _TRIM(0)
 
