@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import select
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -144,8 +145,7 @@ def _dispatch(own: list[str], others: list[str]) -> None:
 def _report(error: BaseException, words: list[str]) -> int:
     """Print an error as one line on standard error; return the exit code."""
     code = 1
-    if isinstance(error, BrokenPipeError):  # the reader of standard output, such as `head`, has ended
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if isinstance(error, BrokenPipeError) and _is_reader_gone():
         return code
     if isinstance(error, KeyboardInterrupt):
         text, code = f"interrupted{f'; {error}' if error.args else ''}", EXIT_INTERRUPTED
@@ -155,6 +155,15 @@ def _report(error: BaseException, words: list[str]) -> int:
         text = f"error: {told(error)}; run again with --debug for the traceback"
     print(f"{PROGRAM}: {' '.join(_clean(text, words).split())}", file=sys.stderr, flush=True)
     return code
+
+
+def _is_reader_gone() -> bool:
+    """Return whether the reader of standard output, such as `head`, has ended; then let nothing be written to it."""
+    pipe = select.poll()
+    pipe.register(sys.stdout.fileno(), 0)
+    if gone := any(event & select.POLLERR for _, event in pipe.poll(0)):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return gone
 
 
 def _clean(text: str, words: list[str]) -> str:
