@@ -193,6 +193,6 @@ def start_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
         for success, name, marker, colour in ((True, "solved", ".", BASELINE), (False, "failed", "x", CLONING)):
             starts = [start[:2] for outcome, start in known if outcome == success]
             axis.plot(*np.reshape(starts, (-1, 2)).T, marker, color=colour, ms=5, label=name)
-        axis.set(xlabel="x, away from the robot [m]", ylabel="y, to its left [m]", aspect="equal")
+        axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         drawn.legend(loc="outside lower left")
         return (to_figure(drawn, "Starts of solved and failed episodes, seen from above"),)

@@ -50,10 +50,7 @@ class EpisodeResult:
 
     @property
     def start(self) -> list[float] | None:
-        """Where the object, or the hand if the task has none, starts; None if unknown.
-
-        x away from the robot, y to its left, z above the table's top [m].
-        """
+        """Where the object, or the hand if the task has none, starts: x, y, z [m]; None if unknown."""
         found = self.detail.get("start", {})
         return found.get("object", found.get("hand"))
 

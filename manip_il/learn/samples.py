@@ -138,6 +138,7 @@ def load_data(
     table = joined_columns(meta.roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     for key in numbers:
+        table[key] = table[key].reshape(len(table[key]), -1)  # a column of one number a frame is a vector, too
         require_finite(f"column {key}", table[key])
     if encode is not None:
         table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])

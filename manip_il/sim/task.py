@@ -46,7 +46,10 @@ class Rung:
 
 @dataclass(frozen=True)
 class Start:
-    """Drawn start of an episode: (position (3,) [m], quaternion wxyz (4,)) of objects and mocap bodies."""
+    """Drawn start of an episode: (position (3,) [m], quaternion wxyz (4,)) of objects and mocap bodies.
+
+    What it does not name starts where `build` put it.
+    """
 
     poses: Mapping[str, tuple[F64, F64]]
 

@@ -92,3 +92,12 @@ def test_tasks_of_several_datasets_are_numbered_together(spec, tmp_path):
     assert batch["task"] == ["reach", "reach", "touch", "touch"]
     assert batch["index"].tolist() == [0, 239, 240, 479]
     assert batch["episode_index"].tolist() == [0, 11, 12, 23]
+
+
+def test_an_environment_state_of_one_number_is_a_vector(spec, tmp_path):
+    one = replace(spec, environment_state_names=("e0",))
+    table = make_table()
+    table["observation.environment_state"] = table["observation.environment_state"][:, :1]
+    trainer = Trainer(write_table(table, tmp_path / "data", one), FitConfig(steps=2, batch_size=8), tmp_path / "run")
+    assert trainer.data.columns["observation.environment_state"].shape == (240, 1)
+    trainer.fit()
