@@ -87,7 +87,7 @@ def _take_back() -> None:
 def _memory_goes_back(request: pytest.FixtureRequest) -> Iterator[None]:
     """What a file keeps for its own tests is let go after them, and what the allocator holds of it given back.
 
-    Caches of the package are kept for the next file unless this process has grown large: the finest scenes take 64 MB.
+    Caches of the package and of MuJoCo are kept for the next file unless this process has grown large.
     """
     yield
     large = _resident() > LARGE
@@ -96,6 +96,9 @@ def _memory_goes_back(request: pytest.FixtureRequest) -> Iterator[None]:
         if isinstance(kept, functools._lru_cache_wrapper):
             kept.cache_clear()
     if large:
+        import mujoco  # imported here: manip_il chooses its OpenGL platform first
+
+        mujoco.mj_clearCache(mujoco.mj_getCache())  # of compiled meshes
         gc.collect()
     if _TRIM is not None:
         _TRIM(0)

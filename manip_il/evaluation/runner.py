@@ -6,7 +6,6 @@ import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,9 +24,8 @@ from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.checkpoint import Checkpoint, policy_sha256
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
-from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.task import objects_in
-from manip_il.sim.world import World
+from manip_il.sim.world import World, once_per_scene
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene
 from manip_il.tasks.stock.envs import described_stock
@@ -38,7 +36,7 @@ HOLD = 10  # control steps for which an episode continues after success, to see 
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
 FOLDER = "evaluations"  # folder for the evaluations of several policies
-_world = lru_cache(SCENES_KEPT)(World)
+_world = once_per_scene(World)
 
 
 class Progress(Protocol):
@@ -102,7 +100,7 @@ def evaluate(
 
 
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
-    """Return the control steps from success to an episode's end; stock environments define their own end."""
+    """Return the control steps from success to an episode's end, None for no end; stock environments have their own."""
     if env.robot not in STOCK:
         return hold
     return 0 if STOCK[env.robot].ends_solved else None
@@ -136,9 +134,9 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
 
 
 def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
-    """Return the true positions [m] in one row of `sim_state` (m,), of `hand` and objects.
+    """Return the true positions [m] of the hand and the objects in one row of `sim_state` (m,): name -> [x, y, z].
 
-    The first object that the episode is about is named `object`.
+    The hand is named `hand`, the first object that the episode is about `object`.
     """
     state = State.from_vector(sim_state)
     if env.robot in STOCK:
@@ -200,16 +198,14 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
         records = read_lines(path)
         results = [EpisodeResult.from_json(record) for record in records[1:]]
     except (KeyError, TypeError, ValueError, ManipError) as error:
-        raise ManipError(
-            f"{path}: a line that is not an episode ({error}); start again with --overwrite=true"
-        ) from error
+        raise ManipError(f"{path}: a line is not an episode ({error}); start again with --overwrite=true") from error
     if not records:
         append_line(path, common)
         return {}
     for key, now in common.items():
         if (before := records[0].get(key)) != now:
             what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
-            raise MismatchError(what, "then", before, "now", now)
+            raise MismatchError(what, "the earlier run", before, "this one", now)
     return {result.seed: result for result in results}
 
 
@@ -217,7 +213,7 @@ def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]
     """Return the differences between two runs of one episode. Raises `MismatchError` if their conditions differ."""
     now = dict(after.detail["drawn"])
     if before.detail.get("drawn", {}) != now:
-        raise MismatchError("what is drawn for the episode", "then", before.detail.get("drawn"), "now", now)
+        raise MismatchError("what is drawn for the episode", "the file", before.detail.get("drawn"), "the replay", now)
     pairs = {name: (getattr(before, name), getattr(after, name)) for name in ("success", "success_at_end", "steps")}
     pairs |= {"return": (before.ret, after.ret)}
     return [f"{name} was {was}, is {value}" for name, (was, value) in pairs.items() if was != value]

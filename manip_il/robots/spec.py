@@ -1,4 +1,4 @@
-"""A robot's model as a spec of its own: motorised, with the site `ee`, without anything of a scene."""
+"""A robot's model as an `MjSpec`: with position control and the site `ee`, without what belongs to a scene."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _to_radians(spec: mujoco.MjSpec) -> None:
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
     """Return a robot's model with its gripper's attached to its hand, without what belongs to a scene.
 
-    robot: its name. camera: the one on the hand, kept as `wrist`.
+    robot: its name. camera: name of the camera on the hand, kept as `wrist`.
     Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is missing.
     """
     spec = load(files, robot)
@@ -148,6 +148,7 @@ def arm_model(robot: Robot) -> mujoco.MjModel:
         spec.delete(spec.joint(name))
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
+    spec.compiler.discardvisual = True  # meshes take up to 64 MB
     return spec.compile()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -21,28 +21,29 @@ from manip_il.sim.config import CAMERAS, CameraConfig, Episodes, Look, require_c
 from manip_il.sim.events import Events, draw_posture
 from manip_il.sim.points import points_in
 from manip_il.sim.render import Picture, pictures, projections
-from manip_il.sim.scene import SCENES_KEPT, build_scene
+from manip_il.sim.scene import build_scene
 from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task, instruction_in
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.window import Window, require_display
-from manip_il.sim.world import Scene, World
+from manip_il.sim.world import Scene, World, once_per_scene
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 
 
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
-    """Joint-position control of one arm on one task. `manip_il.tasks.envs.make_env` makes it by names.
+    """Joint-position control of one arm on one task. `manip_il.tasks.envs.make_env` makes it from names.
 
     Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32. Observation: a dict
     of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends only at the horizon (truncated), so that
-    "solved once" and "solved at the end" can both be read. conditions: how episodes differ from the nominal world, in
-    turn by their seeds; `drawn` has the current values. The state is the true one, whatever is observed.
-    render_mode: `rgb_array`, or `human`: MuJoCo's viewer in real time, from `reset` and `step`.
-    Raises `UnknownName` for a camera or render_mode, `UsageError` for a size of pictures that
-    `CameraConfig` refuses, `RenderError` for `human` without a display.
+    "solved once" and "solved at the end" can both be measured. conditions: how episodes differ from the nominal world;
+    seeds take them in turn, and `drawn` has the current episode's values. `get_state` returns the true state, without
+    the noise and delay of observations.
+    render_mode: `rgb_array`, or `human`: `reset` and `step` then update MuJoCo's viewer, in real time.
+    Raises `UnknownName` for an unknown camera or render_mode, `UsageError` if the scene cannot be built,
+    `RenderError` for `human` without a display.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -123,7 +124,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         mujoco.mj_forward(world.model, data)
 
     def _begin(self, seed: int, drawn: dict[str, Any]) -> None:
-        """Prepare an episode with these values."""
+        """Reset counters, events and observations for an episode with these drawn values."""
         self.drawn, self._step, self._streak, self._ever = drawn, 0, 0, False
         self._events = Events(self.world, drawn, seed)
         self._noise = rng_for(seed, "observation noise")
@@ -149,7 +150,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             self._streak = 0
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (n,) for one control step; returns it as it reached the robot.
+        """Apply one action (n,) for one control step; returns it with the events' noise, before clipping.
 
         Raises `NotFiniteError`, `MismatchError`.
         """
@@ -165,7 +166,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return executed
 
     def count_step(self) -> None:
-        """Count a control step that has passed, and whether the task is solved after it."""
+        """Count a control step, and the consecutive ones within the tolerance."""
         self._step += 1
         self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
         self._ever = self._ever or self.solved
@@ -285,7 +286,7 @@ def environment_state(world: World) -> F32:
     return np.array(numbers, np.float32)
 
 
-@lru_cache(SCENES_KEPT)
+@once_per_scene
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of the k entries of `environment_state`; lengths in [m]."""
     world, names = World(scene), list[str]()

@@ -27,15 +27,16 @@ from manip_il.sim.world import Scene
 PREFIX = "robot/"  # prefix of the robot's names in a scene
 TABLE = "table"  # name of the table's geom
 _THICK = 0.04  # thickness of the table's top [m]
-SCENES_KEPT = 8  # compiled scenes cached per process: the finest meshes take 64 MB
+SCENES_KEPT = 4  # compiled scenes cached per process: the finest meshes take 64 MB
 _TURN, _SPARE_TURN = 0.1, 0.1  # test rotation of the last joint, to find its direction; margin to its limits [rad]
-SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of a workspace that cameras see from these places [m]
-# From the workspace's middle on the table; cameras look at a point over that, with a vertical field of view.
+SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of the workspace for which `_CAMERAS` are placed [m]
+# Positions from the workspace's middle on the table, height of the point above it that the cameras look at, and
+# vertical field of view.
 _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
 _LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
 _ON_TABLE = 0.02  # a robot stands on the table only if its lowest point is this near to the table's top [m]
 _PEDESTAL = 0.13  # half the pedestal's width [m]
-_SHADOW_SIZE = 1024  # the shadow map is the main cost on a software renderer
+_SHADOW_SIZE = 1024  # side of the shadow map [pixels]: the main cost on a software renderer
 
 
 @lru_cache(SCENES_KEPT)
@@ -115,7 +116,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
 
 
 def _yaws(robot: Robot, model: mujoco.MjModel, roll: Any) -> tuple[float, float]:
-    """Least and greatest yaw to which its last joint turns the hand, from the one that counts as zero [rad]."""
+    """Least and greatest yaw to which a robot's last joint turns the hand, relative to `yaw_ahead` [rad]."""
     if not robot.faces_ahead or not roll.limited[0]:
         return -np.inf, np.inf
     data, yaws = mujoco.MjData(model), []
@@ -228,7 +229,7 @@ def _table_x(robot: Robot) -> float:
 
 
 def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> None:
-    """Add one from the floor to the robot's lowest point, if that is in the air and not on the table."""
+    """Add a pedestal from the floor to the robot's lowest point, unless the robot stands on the floor or the table."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     touching = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -17,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import SCENES_KEPT, SEEN, TABLE, camera_id
+from manip_il.sim.scene import SEEN, TABLE, camera_id
 from manip_il.sim.variation import part, seen_objects
-from manip_il.sim.world import Scene
+from manip_il.sim.world import Scene, once_per_scene
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -109,7 +108,7 @@ class ViewModel:
             vectors[in_world] = vectors[in_world] @ rotation.T
 
 
-@lru_cache(SCENES_KEPT)
+@once_per_scene
 def _with_few_faces(scene: Scene) -> mujoco.MjModel:
     model = copy.copy(scene.model)
     simplify_meshes(model, min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL)
@@ -140,9 +139,9 @@ def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
 
 
 def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple[F64, Indices, Indices]:
-    """Merge the vertices (v, 3) in each cell of a grid: positions (c, 3), an original vertex each (c,), faces (f, 3).
+    """Merge vertices (v, 3) that share a cell of a grid into positions (c, 3), original vertices (c,), faces (f, 3).
 
-    finest: least size of a cell [m]. The original is the one nearest to the mean of its cell; its normal shades a
+    finest: least size of a cell [m]. The original of a cell is the vertex nearest to its mean; its normal shades a
     coarse mesh like the fine one.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)

@@ -8,9 +8,9 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from dataclasses import dataclass, field
+from functools import cached_property, wraps
+from typing import Any, NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
@@ -28,7 +28,6 @@ from manip_il.sim.shape import ANY
 from manip_il.sim.variation import Object
 
 F64 = NDArray[np.float64]
-T = TypeVar("T")
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08  # heights and distance at which a hand may hit a neighbour of an object [m]
 _MOST_TURNS = 4  # symmetric turns considered, to either side
@@ -48,9 +47,9 @@ class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of its named parts.
 
     task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies by name.
-    hulls: those of meshes.
-    ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest of the hand,
-    from the one that counts as zero [rad]. nominal: the variation of the model as compiled, (v,).
+    hulls: convex hulls of the objects that are meshes.
+    ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest yaw of the hand,
+    relative to `World.ahead` [rad]. nominal: the variation of the model as compiled, (v,).
     """
 
     robot: Robot
@@ -66,6 +65,7 @@ class Scene:
     yaws: tuple[float, float]
     nominal: F64
     hulls: Mapping[str, Hull]
+    kept: dict[Any, Any] = field(default_factory=dict[Any, Any])  # results of `once_per_scene`
 
     @cached_property
     def state_size(self) -> int:
@@ -82,6 +82,18 @@ class Scene:
     def name(self) -> str:
         """Robot and task, for messages."""
         return f"{self.robot.name} {self.task.name}"
+
+
+def once_per_scene[T](compute: Callable[[Scene], T]) -> Callable[[Scene], T]:
+    """Return `compute` as a function whose result is kept as long as the scene exists."""
+
+    @wraps(compute)
+    def kept(scene: Scene) -> T:
+        if compute not in scene.kept:
+            scene.kept[compute] = compute(scene)
+        return scene.kept[compute]
+
+    return kept
 
 
 class World:
@@ -162,7 +174,7 @@ class World:
 
     # Readings
 
-    def remember(self, key: Any, compute: Callable[[], T]) -> T:
+    def remember[T](self, key: Any, compute: Callable[[], T]) -> T:
         """Return the result of `compute`, cached until the world changes."""
         if key not in self._cache:
             self._cache[key] = compute()
@@ -179,22 +191,22 @@ class World:
 
     @property
     def goal(self) -> F64:
-        """Position of the goal marker, (3,)."""
+        """Position of the goal marker, (3,) [m]."""
         return self.data.mocap_pos[self._mocap_goal]
 
     @property
     def opening(self) -> float:
-        """Opening between the gripper's pads."""
+        """Opening between the gripper's pads [m]."""
         return self.remember("opening", lambda: self.gripper.opening(self.data.qpos))
 
     def ahead(self, position: F64) -> float:
-        """Return the yaw that counts as zero for a hand at a position (3,) [rad]."""
+        """Return the zero direction of the yaw of a hand at a position (3,) [m], as a yaw in the world [rad]."""
         return yaw_ahead(self.robot, self.data.xanchor[self.scene.shoulder], position)
 
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
-        """Return how far a hand at a position (3,) [m] may be turned from straight ahead to have a yaw [rad].
+        """Return the turns from `ahead` [rad] that give a hand at a position (3,) [m] a yaw [rad], or one like it.
 
-        alike: turn after which the grasp looks the same [rad].
+        alike: turn after which the grasp looks the same [rad]. If none is within the arm's range, return the smallest.
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)
@@ -202,7 +214,7 @@ class World:
         return [way for way in ways if low <= way <= high] or [off]
 
     def turned(self, position: F64) -> float:
-        """Return how far the hand is turned from straight ahead at a position (3,) [m]; [rad]."""
+        """Return how far the hand is turned from `ahead` at a position (3,) [m]; [rad]."""
         low, high = self.scene.yaws
         middle = (low + high) / 2 if math.isfinite(low) else 0.0
         return middle + math.remainder(self.hand_yaw - self.ahead(position) - middle, 2 * math.pi)
@@ -214,7 +226,7 @@ class World:
         return angle_across(hand) if self.robot.leans else angle_ahead(hand)
 
     def off_down(self, yaw: float) -> float:
-        """Return how far the hand is from pointing down at a yaw [rad]; for an arm that leans, only from the yaw."""
+        """Return the angle from the hand to one that points down at a yaw [rad]; for an arm that leans, in yaw only."""
         hand = self.ee.rotation
         return off_yaw(hand, yaw) if self.robot.leans else angle_from_down(hand, yaw)
 
@@ -249,9 +261,9 @@ class World:
         return self.remember(("touched", name), lambda: self.gripper.touches(self.model, self.data, geom))
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:
-        """Return the offsets, x and y, of the nearest points of an object's neighbours from its centre, within 8 cm.
+        """Return the offsets (x, y) [m] from an object's centre to the nearest point of each neighbour within 8 cm.
 
-        Furniture and other objects count as boxes along x and y, if a hand over the object could hit them.
+        Neighbours are furniture and other objects that a hand over the object could hit, as boxes along x and y.
         """
         others = self._standing[name]
         if not len(others):

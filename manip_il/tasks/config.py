@@ -14,7 +14,7 @@ from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.tasks import NAMES, SEVERAL
 from manip_il.tasks.stock import table as stock
 
-LIMITS_HZ = 20  # control rate of the tasks' limits; at other rates these last equally long [Hz]
+LIMITS_HZ = 20  # control rate at which the tasks' limits count steps; at other rates they last as long [Hz]
 ROBOT_HELP = (
     f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or {stock.ROBOT} or {stock.ALOHA}: gymnasium-robotics' "
     "Fetch and gym_aloha's two arms, unmodified"
@@ -92,7 +92,7 @@ def _with_task(config: EnvConfig) -> EnvConfig:
 
 
 def _of_stock(config: EnvConfig) -> EnvConfig:
-    """Return settings with those of the stock environments; raises `UsageError` for other nonzero values."""
+    """Return settings with the stock robot's fixed values; raises `UsageError` if another value was given."""
     robot = stock.ROBOTS[config.robot]
     stock.get_stock(config.task, config.robot)
     if config.object:

@@ -111,9 +111,9 @@ def is_in_drawer(world: World) -> bool:
 
 
 def _yaw(world: World) -> float:
-    """Yaw at which the fingers close along the drawer's motion [rad]: the first of two, or one that is much nearer.
+    """Yaw at which the fingers close along the drawer's motion [rad]: pi/2, or -pi/2 if that is much nearer.
 
-    By distance alone the two would be equally near from most starts, and a learner would stop between them.
+    From most starts both are about equally near; if the nearer were taken, a learner would stop between them.
     """
     at, quarter = angle_ahead(world.ee.rotation), math.pi / 2
     return quarter if abs(quarter - at) < abs(-quarter - at) + MUCH_NEARER else -quarter
@@ -270,7 +270,7 @@ class Drawer:
         return max(0.0, pulled(world)) + missing
 
     def progress(self, world: World) -> float:
-        """Return progress of opening, putting in and closing."""
+        """Return progress of opening the drawer, putting the object in and closing it."""
         opened = min(1.0, max(0.0, pulled(world) / OPEN))
         if is_in_drawer(world):
             if _is_shut(world):

@@ -1,4 +1,4 @@
-"""Grasps of an object as it lies, by a downward hand, from the symmetry of its shape."""
+"""How a downward hand can grasp an object as it lies, from the symmetry of its shape."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ ANGLE_FREE = 0.1  # orientation error that counts for nothing [rad]
 TIGHT = 0.35  # share of the open hand's clearance that misalignment may take up
 OPEN_SLACK = 0.016  # how much wider than the object the hand must open before it descends, if it can [m]
 OPEN_SHARE = 0.6  # the same, as a share of the open gripper's clearance around the object, if that is less
-PREFER_ZERO = 0.3  # weight of a grasp's yaw against its distance from the hand's
+PREFER_ZERO = 0.3  # weight of a grasp's own yaw, relative to its angle from the hand's yaw
 WIDTH_AS_ANGLE = 20.0  # extra turn accepted for a grasp that is a metre narrower [rad/m]
 FUNNEL_STEEP = 4.0  # `FUNNEL_SLOPE` if the object has neighbours
 FINGER = (0.014, 0.010, 0.016)  # a finger's thickness, half width, and distance at which a neighbour is clear [m]
 SHORT = 0.02  # missing room for a finger at which a grasp counts as fully crowded [m]
-BESIDE_JAW, NEARER = 0.008, 0.002  # gap to the fixed jaw as the hand comes down; how much less will do [m]
+BESIDE_JAW, NEARER = 0.008, 0.002  # gap to the fixed jaw as the hand comes down; how much less is tolerated [m]
 BY_JAW = 0.004  # `FUNNEL_RADIUS` of a hand with one moving jaw [m]
 NARROW = 0.024  # opening beyond the object's width if a neighbour is in the way of the fully open hand [m]
 CROWDED = 3.0  # extra turn accepted for a grasp whose fingers have room [rad]
@@ -76,7 +76,7 @@ class Grasp(NamedTuple):
     that pose [rad].
     at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough: they pass on both
     sides of it. off: misalignment of the hand, angle included [m]. funnel: height over the object that this requires
-    [m]; height: the same, but no more than clears its top [m]. lean: how much the hand leans to reach it, 0 to 1.
+    [m]; height: the same, but at most what clears its top [m]. lean: how much the hand leans to reach it, 0 to 1.
     """
 
     offset: tuple[float, float, float]
@@ -119,7 +119,7 @@ def lie_of(world: World, name: str) -> Lie:
 
 @once_per_state
 def grasp_of(world: World, name: str) -> Grasp:
-    """Return the pose of an object relative to the hand."""
+    """Return the best grasp of an object from the hand's present pose."""
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
     neighbours = world.neighbours(name)
     yaw, width, length, (off_x, off_y, off_z) = _nearest(
@@ -179,9 +179,9 @@ def _nearest(
 ) -> tuple[float, float, float, Way]:
     """The grasp whose yaw is nearest to the hand's, with a small preference for zero yaw and narrow grasps.
 
-    Nearest to the hand, not to zero: a learner that averages both sides of the boundary between two grasps then leaves
-    it with any turn, and does not stop in the middle. position: the object's (3,) [m]. widest: width that the fingers
-    go around [m]. neighbours: offsets of what stands around the object; grasps that they obstruct come last.
+    It depends on the hand so that a learner does not stop between two grasps, where it averages their labels: any turn
+    makes one of them the nearer. position: the object's (3,) [m]. widest: width that the fingers go around [m].
+    neighbours: offsets (x, y) [m] of what stands around the object; grasps that they obstruct come last.
     """
     grasps, at, ahead = lie.grasps[lie.level], world.hand_yaw, world.ahead(position)
     if world.robot.faces_ahead:
@@ -281,7 +281,7 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
 
 
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
-    """Return a hand's angle from pointing down [rad], less what the hand (3, 3) may lean."""
+    """Return the angle of a hand (3, 3) from pointing down [rad], less what it may lean (`lean`: 0 to 1)."""
     if not lean:
         return angle
     free = min(angle_off_vertical(hand), lean * LEAN)

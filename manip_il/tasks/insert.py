@@ -1,4 +1,4 @@
-"""Insert: a square peg into a hole, from wherever it stands or lies."""
+"""Insert: put a square peg, which stands or lies anywhere on the table, into a hole."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # peg [m], [m], [kg]
 DEPTH, WALL = 0.03, 0.018  # depth of the hole, and thickness of the walls around it [m]
 CHAMFER, SLIPPERY = 0.005, 0.05  # chamfer of the walls' inner edges, as high as wide [m], and its friction
 GUIDED = 0.003  # peg error up to which the chamfer guides it into the hole [m]
-AT_RIM, GENTLE = 0.005, 0.003  # this near to the rim's height, the peg is lowered by at most `GENTLE` [m]
+AT_RIM, GENTLE = 0.005, 0.003  # within `AT_RIM` of the rim's height, the peg is lowered by at most `GENTLE` [m]
 EXACT = 0.02  # error below which the hand is placed exactly [m]
 IN = 0.003  # distance from the hole's floor at which the peg is inserted [m]
-SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 4.0  # yaw range of a hand tilted by `TILTED` [rad]; weight outside it
-NOT_NEARER = 0.10  # how much nearer than the workspace's middle the hole may be, for a tilted hand's reach [m]
+SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 4.0  # best yaws of a hand tilted by `TILTED` [rad]; weight of other yaws
+NOT_NEARER = 0.10  # largest distance of the hole from the workspace's middle towards the robot, for a tilted hand [m]
 APART = 0.14  # least distance of peg and hole at the start [m]
 NOT_FARTHER = 0.05  # how far beyond the workspace's middle a lying peg may start [m]
 _QUARTER = math.pi / 2
@@ -55,7 +55,7 @@ def is_inserted(world: World) -> bool:
 
 @once_per_state
 def to_hole(world: World) -> Way:
-    """Return the remaining motion of a peg that hangs from the hand, by the easiest of four rotations that fit."""
+    """Return the remaining motion of a peg that hangs from the hand, to the easiest of the four rotations that fit."""
     peg, hole, hand = world.pose(PEG), world.pose(HOLE), world.ee.rotation
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
@@ -155,7 +155,7 @@ class Insert:
         return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, peg, hole, the vectors between them, and the turn of the hand that makes the peg fit."""
+        """Return hand, peg, hole, the vectors between them, and the hand's remaining rotation vector [rad]."""
         peg, hole, lie = world.pose(PEG).position, world.pose(HOLE), lie_of(world, PEG)
         yaw = angle_ahead(hole.rotation)
         way = to_hole(world)

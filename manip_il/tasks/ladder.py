@@ -26,7 +26,7 @@ CLEAR = 0.03  # clearance of the hand over the object's top at which the fingert
 RISE_FIRST = 0.03  # a hand this far below its path only rises [m]
 AT_GRASP = (0.015, 0.015, 0.015)  # bounds on the object's centre in the ee frame, x y z, to start closing [m]
 AT_GRASP_ANGLE = 0.3  # [rad]
-EMPTY = 0.4  # share of a mesh's width below which the fingers have nothing between them
+EMPTY = 0.4  # opening, as a share of a mesh's width, below which the fingers have missed it
 LEAST_DEEP, DEEP_SHARE = 0.004, 0.15  # tolerated height over a mesh's grasp [m], and as a share of its height
 IN_HAND = (0.009, 0.020, 0.011)  # bounds on a held object's centre in the ee frame, x and z beyond half its size [m]
 RELEASE = 0.03  # how much wider than an object the hand opens to release it, if it can [m]
@@ -41,7 +41,7 @@ class LiftProfile(NamedTuple):
     """Height of a carried object over its goal, by the horizontal distance still to go [m].
 
     most: height far from the goal [m]. slope: height per distance beyond `free`. free: distance without height [m].
-    rise_first: this far below its height, it only rises [m]. max_step: how far the target runs ahead of the hand [m].
+    rise_first: lag below that height at which it only rises [m]. max_step: how far the target is ahead of the hand [m].
     """
 
     most: float = 0.05
@@ -63,8 +63,8 @@ def held(world: World, name: str) -> bool:
     x, y, z = IN_HAND
     half = max(world.extents(name)) / 2
     if math.dist(world.pose(name).position.tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
-        return False  # saves computing its grasps
-    if world.hull(name) is not None:  # whatever its rotation in the hand
+        return False  # too far away; grasps need not be computed
+    if world.hull(name) is not None:  # a mesh may be at any rotation in the hand
         return _is_between(world, name, half) and world.touched(name)
     g = grasp_of(world, name)
     return is_inside(g.offset, (g.length / 2 + x, y, g.half + z)) and world.touched(name)
@@ -78,11 +78,11 @@ def _is_between(world: World, name: str, half: float) -> bool:
 
 
 def at_grasp(world: World, name: str) -> bool:
-    """Return whether closing the fingers now would hold the object; with hysteresis once they have begun to close."""
+    """Return whether closing the fingers now would hold the object; bounds are wider once they have begun to close."""
     g = grasp_of(world, name)
     box = AT_GRASP if g.open_enough else CLOSING
     if world.hull(name) is not None:
-        # Its sides may be round, and the fingers would slip off higher up.
+        # A mesh's sides may be round: fingers that close too high slip off.
         deep = max(LEAST_DEEP, DEEP_SHARE * lie_of(world, name).tall)
         over = float(world.ee.position[2]) - g.at[2]
         if world.opening < EMPTY * g.width or over > (deep if g.open_enough else 2 * deep):
@@ -100,8 +100,8 @@ def rise_first(at: F64, to: Sequence[float]) -> F64:
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
     """Approach from above: over the object and down around it, fingers open; straight up if too low beside it.
 
-    hover: least height over the object on the way there, if more than what clears its top [m]; rise: least height over
-    the grasp [m].
+    hover: height over the grasp on the way there, if more than what clears the object's top [m]; rise: least height
+    over the grasp [m].
     """
     g = grasp_of(world, name)
     x, y, z = g.at

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from manip_il.mdp import F64
 from manip_il.robots.reach import ARRIVES, reach_of
 from manip_il.robots.rotations import angle_across, angle_between, rotation_matrix, rotation_vector
 from manip_il.sim.task import Rung, Target
-from manip_il.sim.world import Scene, World
+from manip_il.sim.world import Scene, World, once_per_scene
 from manip_il.tasks.grasp import OPEN_SLACK, lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 
@@ -21,10 +20,10 @@ PEG, HOLE = "peg", "hole"
 _OPEN_SHARE = 0.85  # share of the gripper's opening beyond the peg, if that is less than the slack
 FROM_END = 0.04  # distance of the grip from the peg's upper end [m]
 LOWEST = 0.024  # least height of the hand over the table at a lying peg [m]
-BACK = 0.05  # distance of a point behind the hand; the peg's end nearer to that point is the upper one [m]
+BACK = 0.05  # a held peg's upper end is the one nearer to a point that is this far behind the hand [m]
 STANDS = 0.4  # tilt below which the peg stands and is grasped from above [rad]
 LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
-LEAN_BY_ROOM = 3.0  # limit of that lean per spare reach, because the wrist is farther out [rad/m]
+LEAN_BY_ROOM = 3.0  # largest lean per distance to the end of the arm's reach, as the wrist is farther out [rad/m]
 AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # errors up to which to close, to keep closing [m]
 AT_ANGLE = 0.25  # [rad]
 OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # height over the grip on approach [m]; per error; tolerated error [m]
@@ -34,8 +33,8 @@ LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m];
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
 SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
 FARTHER = 1.5  # factor on the distance that an exact move aims for, because the arm's weight stops it short
-TURN = 0.15  # largest lead of the target's rotation over the hand's, which need not wait for it to move [rad]
-LET_GO, RELEASE = 0.012, 0.03  # opening beyond the peg's width: if the peg is free, and as commanded [m]
+TURN = 0.15  # how far the target's rotation runs ahead of the hand's, while the hand also moves [rad]
+LET_GO, RELEASE = 0.012, 0.03  # opening beyond the peg's width at which the peg is free, and the one commanded [m]
 CLEAR = 0.03  # clearance of the hand over the peg after release [m]
 ASIDE = (math.radians(55), math.radians(70))  # range of yaw, to either side, at which the hand sets the peg up [rad]
 NEAR_MIDDLE = 0.05  # largest distance from the workspace's middle along x at which the peg is set up [m]
@@ -49,8 +48,8 @@ IN_AIR, BESIDE = 0.006, 0.045  # least height of a falling peg; largest distance
 class Grip(NamedTuple):
     """Grip of the hand on the peg: pose of `ee`, position (3,) [m] and rotation (3, 3).
 
-    off: misalignment of the hand, angle included [m]; angle: to that pose [rad]; height: over the grip that this
-    requires [m]. open_enough: the fingers pass on both sides of the peg.
+    off: misalignment of the hand, angle included [m]; angle: the hand's to that pose [rad]; height: over the grip, as
+    the misalignment requires [m]. open_enough: the fingers pass on both sides of the peg.
     """
 
     position: F64
@@ -62,7 +61,7 @@ class Grip(NamedTuple):
 
 
 def hand_at(yaw: float, pitch: float) -> F64:
-    """Return rotation of `ee` with the hand pointing down at 0 `pitch`, and along `yaw` at a quarter turn; (3, 3)."""
+    """Return `ee`'s rotation (3, 3), the hand pointing down at `pitch` 0 and level along `yaw` at pi/2 [rad]."""
     c, s = math.cos(yaw), math.sin(yaw)
     along, up = np.array([c, s, 0.0]), np.array([0.0, 0.0, 1.0])
     z = math.sin(pitch) * along - math.cos(pitch) * up
@@ -143,7 +142,7 @@ def grip_of(world: World) -> Grip:
     return Grip(position, rotation, off, angle, height, world.opening >= width + slack)
 
 
-@lru_cache(8)
+@once_per_scene
 def _farthest(scene: Scene) -> float:
     """Farthest x at which the hand reaches the table [m]."""
     x, y = scene.robot.workspace.centre
@@ -155,9 +154,9 @@ def _farthest(scene: Scene) -> float:
 class Way(NamedTuple):
     """Remaining motion of a held peg.
 
-    rotation: the hand's once the peg is upright, and aligned if it is for the hole, (3, 3); turn: rotation vector to
-    it, (3,) [rad]. off: horizontal offset left [m], (2,). error: both together [m]. low: height of the peg's lower end
-    over the table once it is upright [m].
+    rotation: of the hand once the peg is upright and, on its way to the hole, aligned with it, (3, 3); turn: rotation
+    vector to it, (3,) [rad]. off: horizontal offset left, (2,) [m]. error: off and turn, as one length [m]. low: height
+    of the peg's lower end over the table once it is upright [m].
     """
 
     rotation: F64
@@ -232,10 +231,10 @@ def _set_up(world: World) -> Target:
 
 
 def _set_up_height(world: World, way: Way) -> float:
-    """Height of the lower end over the table, and over the walls if beside the hole [m]."""
+    """Target height of the lower end over the table, greater near the walls of the hole [m]."""
     room = math.dist(world.pose(PEG).position[:2], world.pose(HOLE).position[:2]) - FROM_HOLE
     most = LIFT + OVER_WALLS * min(1.0, max(0.0, 1 - room / OVER_WALLS))
-    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # not the hand's yaw, which may be out of reach
+    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # without the hand's yaw, which may be out of reach
     error = math.hypot(*way.off) + ANGLE_AS_LENGTH * tilt
     return min(most, LIFT_SLOPE * max(0.0, error - SET_DOWN)) - 0.001
 
@@ -243,7 +242,7 @@ def _set_up_height(world: World, way: Way) -> float:
 def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
     """Return the target that moves the peg with the hand.
 
-    missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m].
+    missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m]; exact: see `Target`.
     """
     sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
     turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))

@@ -61,7 +61,7 @@ class PickPlace:
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, goal, cube and the vectors between them; the yaw times four, as the cube's faces are alike."""
+        """Return hand, goal, cube and the vectors between them; cosine and sine of four times a cube's yaw."""
         return observe_cube(world, OBJECT)
 
     def error(self, world: World) -> float:

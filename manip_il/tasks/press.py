@@ -1,4 +1,4 @@
-"""Press: push a button, anywhere on the table, to its stop."""
+"""Press: push a button, which stands anywhere on the table, to its stop."""
 
 from __future__ import annotations
 

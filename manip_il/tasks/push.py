@@ -35,7 +35,7 @@ class PushStyle(NamedTuple):
     """Dimensions of a pushing hand. behind: distance at which it starts behind the puck's middle [m].
 
     opening: that of the fingers across the push, so that the puck rests against both [m]. touching: distance behind the
-    puck's middle at which it touches the puck [m]; lower: `LOW_ENOUGH` at the distance `behind` [m].
+    puck's middle at which it touches the puck [m]; lower: value of `LOW_ENOUGH` at the distance `behind` [m].
     """
 
     behind: float
@@ -45,7 +45,7 @@ class PushStyle(NamedTuple):
 
 
 UPRIGHT_STYLE = PushStyle(0.05, 0.04, 0.0, LOW_ENOUGH)
-LEANING_STYLE = PushStyle(0.065, 0.02, 0.045, 0.006)  # for a weak arm, which would ride on the puck on its way down
+LEANING_STYLE = PushStyle(0.065, 0.02, 0.045, 0.006)  # for a weak arm, which would otherwise come down on the puck
 
 
 def _style(world: World) -> PushStyle:
@@ -156,7 +156,7 @@ class Push:
         add_goal(spec, flat=True)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the puck, and a goal some way off such that the hand reaches behind the puck."""
+        """Draw the puck, and a goal at a distance from it such that the hand reaches behind the puck."""
         at, height = draw_resting(rng, world, PUCK, ROOM + 0.02), resting_height(world, PUCK)
 
         def fits(goal: F64) -> bool:

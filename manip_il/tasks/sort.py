@@ -21,7 +21,7 @@ from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, rest
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
 BINS = {name: f"{name}_bin" for name in COLOURS}
-ASKED = "asked"  # an invisible mocap body: x is the cube's number, z the sentence's
+ASKED = "asked"  # an invisible mocap body: its x is the number of the named cube, its z that of the sentence
 SENTENCES = (
     "Put the {colour} cube into the {colour} bin.",
     "Sort the {colour} cube into its bin.",
@@ -32,17 +32,17 @@ SENTENCES = (
 INSIDE = (0.046, 0.068)  # half a bin's inner length and width [m]
 PITCH = 0.105  # spacing of the bins, which stand in a row away from the robot [m]
 SIDE = 0.19  # offset of the row from the workspace's middle, left or right [m]
-SHIFT = 0.08  # largest shift of everything from the workspace's middle to where the arm reaches widest [m]
+SHIFT = 0.08  # largest shift of cubes and bins along x, to where the arm reaches farthest to both sides [m]
 HALF = 0.018  # half a cube's edge length [m]
 APART = 0.085  # least distance between cubes at the start [m]
 FROM_BINS = 0.14  # least sideways distance of a cube from the row's middle at the start [m]
 BEYOND = 0.15  # largest distance of a cube from the workspace's middle on the side without bins [m]
-LOWER = 0.028  # how much lower a cube is released than in a deeper box, so that it does not bounce far [m]
+LOWER = 0.028  # how far below `drop_place` a cube is released, so that it does not bounce far [m]
 STEP = 0.1  # how far the target runs ahead of the carrying hand: a fast hand drops fewer cubes [m]
 SLOPE = 5.0  # slope of the path around other bins: distance from the row per distance along it
-NEAR_WALL, BY_WALL = 0.045, 0.065  # distance from a wall, in a bin and beside it, at which a finger has no room [m]
+NEAR_WALL, BY_WALL = 0.045, 0.065  # distances from a wall, in a bin and beside it, below which fingers lack room [m]
 NARROW = 0.024  # opening beyond the width of a cube near a bin's wall [m]
-TURNED = 0.3  # angle to such a grasp above which the hand stays over the cube [rad]
+TURNED = 0.3  # angle to the grasp near a wall above which the hand stays over the cube [rad]
 _HIGH = 0.04  # clearance of a cube that is carried across a bin's walls [m]
 _WRONG = 0.1  # error for each other cube in a bin [m]
 
@@ -69,7 +69,7 @@ def _place(world: World) -> F64:
 
 
 def _to(world: World) -> F64:
-    """Release point of the named cube, (3,) [m], or a place beside the bins while it is not at its own."""
+    """Release point of the named cube, (3,) [m]; shifted off the row of bins until the cube is level with its own."""
     name = asked(world)
     place = _place(world)
     along = abs(place[0] - world.pose(name).position[0])
@@ -85,7 +85,7 @@ def _carry_progress(world: World) -> float:
 
 
 def _other_held(world: World) -> str:
-    """The other cube that is in the hand; empty if there is none."""
+    """Name of the wrong cube in the hand; "" if there is none."""
     return next((name for name in COLOURS if name != asked(world) and held(world, name)), "")
 
 
@@ -95,7 +95,7 @@ def _put_back(world: World) -> Target:
     at, ee = world.pose(name).position, world.ee.position
     low = at[2] - lie_of(world, name).tall / 2
     centre, row = world.scene.robot.workspace.centre[1], world.pose(BINS[name]).position[1]
-    inwards = FROM_BINS - abs(at[1] - row)  # still to go until it is off the bins
+    inwards = FROM_BINS - abs(at[1] - row)  # distance to move until it is off the bins
     if inwards <= 0:
         return Target(ee - [0.0, 0.0, max(0.0, low)], hand_down(0.0), CLOSED if low > 0.008 else world.gripper.most)
     missing = WALL + _HIGH - low
@@ -217,7 +217,7 @@ class Sort:
         }
 
     def error(self, world: World) -> float:
-        """Return how far the named cube is from its bin's middle [m], 0 if inside; more if another is in a bin."""
+        """Return the named cube's distance from its bin's middle [m], 0 inside, plus 0.1 m per other cube in a bin."""
         name = asked(world)
         off = math.dist(world.pose(name).position, world.pose(BINS[name]).position)
         return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)

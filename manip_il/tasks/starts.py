@@ -16,10 +16,10 @@ from manip_il.tasks.grasp import is_cube
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
 FROM_HAND = 0.1  # least horizontal distance from hand to object, as in gymnasium-robotics' FetchPickAndPlace [m]
 FROM_HAND_SHARE = 0.75  # the same as a share of the workspace's half width, if that is less
-LIFT_HEIGHT = 0.45  # workspace height for the full `LIFT`, which is less in lower ones [m]
+LIFT_HEIGHT = 0.45  # workspace height from which the full `LIFT` is used; lower workspaces scale it down [m]
 IN_AIR = 0.5  # share of goals above the table, as in FetchPickAndPlace
 LIFT = (0.1, 0.25)  # height of a goal above the object's start [m]
-FEW_DRAWS = 50  # draws of one place before all are drawn again
+FEW_DRAWS = 50  # draws of one place before the other places are drawn again, too
 _MOST_DRAWS = 1_000
 _BOX, _SPHERE, _CAPSULE = (int(kind) for kind in (mjtGeom.mjGEOM_BOX, mjtGeom.mjGEOM_SPHERE, mjtGeom.mjGEOM_CAPSULE))
 _HALF = np.sqrt(0.5)
@@ -29,8 +29,8 @@ _UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
     """Draw the side an object rests on, its position and its yaw: (3,) [m] and quaternion wxyz (4,).
 
-    Sides that look alike count once; a capsule lies; a mesh rests as modelled, or on the nearest side. A cube's yaw is
-    within an eighth of a turn, as its faces are alike.
+    Sides that look alike count once. A capsule lies on its side; a mesh rests as modelled or, if it cannot, on the side
+    nearest to that. A cube's yaw is within +-pi/4, as its faces are alike.
     """
     lengths = world.extents(name)
     if (hull := world.hull(name)) is not None:
@@ -53,7 +53,7 @@ def _upright(down: F64) -> F64:
 
 
 def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
-    """Axes that may point up, one of each length, if the object can rest that way."""
+    """Axes (0 to 2) that may point up when the object rests; of axes with the same length, one."""
     if kind in (_SPHERE, _CAPSULE):
         return [0]
     return [axis for axis in range(3) if lengths[axis] not in lengths[:axis] or (kind != _BOX and axis == 2)]
@@ -81,7 +81,7 @@ def draw_resting_place(rng: np.random.Generator, world: World, name: str, height
 def has_room(world: World, at: F64, room: float) -> bool:
     """Return whether the hand reaches a point (3,) and the points `room` around it [m].
 
-    An object that is knocked then stays within reach.
+    With that margin, an object that is knocked stays within reach.
     """
     around = ((room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0)) if room else ()
     return world.reach.has(at) and all(world.reach.has(at + np.array(way)) for way in around)

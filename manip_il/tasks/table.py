@@ -132,7 +132,6 @@ def _of_file(path: Path) -> Task:
 
 
 def _made(what: str, cls: Any) -> Task:
-    """The task of a class."""
     if lacks := [name for name in _MEMBERS if not hasattr(cls, name)]:
         raise UsageError(f"{what} lacks {', '.join(lacks)}; docs/new-task.md says what each is for")
     try:

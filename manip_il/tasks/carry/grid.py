@@ -1,7 +1,7 @@
 """A grid over a layout's free space, its costs-to-go for a reward, and their descent from anywhere.
 
-The goal is one of the grid's nodes. Its edges have the features of straight lines, by the same integral as any path,
-so that inverse reinforcement learning compares like with like.
+The goal is one of the grid's nodes. Features are integrated along the grid's edges as along any path, so that inverse
+reinforcement learning can compare demonstrated paths with those on the grid.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ _WORSE = 1e-4  # how much less room than at the start is tolerated on the way ou
 
 
 class _Links(NamedTuple):
-    """Edges of a grid, sorted by the node they leave: nodes, places on the grid twice as fine, and lengths in cells."""
+    """Edges of a grid, sorted by the node they leave."""
 
-    edges: I64  # (E, 2)
-    fine: I64  # (E, 3): from, middle, to
-    cells: F64  # (E,): length
+    edges: I64  # (E, 2): numbers of the nodes, from and to
+    fine: I64  # (E, 3): from, middle and to, as numbers of points on a grid twice as fine
+    cells: F64  # (E,): lengths, in cells from `_links`, in [m] from `Grid._links`
 
 
 @lru_cache(4)
@@ -82,7 +82,7 @@ class Grid:
 
     @cached_property
     def _fine(self) -> F64:
-        """Places of nodes and of the middles between them, (F, 3) [m]."""
+        """Places of nodes and of the points halfway between them, (F, 3) [m]."""
         fine = tuple(2 * count - 1 for count in self.shape)
         return self.origin + self.cell / 2 * np.argwhere(np.ones(fine, bool))
 
@@ -204,10 +204,10 @@ class Descent:
         return np.array([nearest] if off[nearest] < OUTSIDE * self.grid.layout.scale else [], np.int64)
 
     def look(self, position: F64) -> tuple[float, F64 | None]:
-        """Return the cost-to-go at a position (3,) [m], and a point to head for, about `AHEAD` cells away, (3,).
+        """Return the cost-to-go at a position (3,) [m], and a point to head for, about `AHEAD` cells away, (3,) [m].
 
-        The cost is that of the cheapest straight line to a node and of the path from there. It is infinite, and the
-        point None, if no free line leads to a node with a path.
+        The cost is that of the cheapest way: a straight line to a node, and the path from there. It is infinite, and
+        the point None, if no free line leads to a node with a path.
         """
         nodes = self._around(position)
         ends = self.grid.points[nodes]
@@ -232,7 +232,7 @@ class Descent:
         return self.grid.layout.densities(points) @ self.weights
 
     def _heading(self, position: F64, price: float, nodes: I64, ends: F64, totals: F64, off: F64, spare: float) -> F64:
-        """Mean of the best nodes, farther ones preferred, so that neighbouring positions head alike, (3,) [m]."""
+        """Mean of the best nodes, farther ones preferred, so that it changes smoothly with the position, (3,) [m]."""
         layout, radius = self.grid.layout, AHEAD * self.grid.cell
         late = np.where(nodes == self.grid.goal, 0.0, _SHORT * price * (radius - off))
         shares = np.exp(-(totals + late - (totals + late).min()) / (_STEEP * layout.scale * price))

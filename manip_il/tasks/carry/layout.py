@@ -52,7 +52,7 @@ HEIGHT = 0.1  # unit of the feature `height` [m]
 OVER = 0.015  # standard deviation of the `above` features beside an obstacle [m]
 NEAR = 0.08  # standard deviation of the `near` features of obstacles [m]
 NEAR_EDGE = 0.05  # standard deviation of `near_edge` [m]
-STEP = 0.005  # longest quadrature step along a path [m]
+STEP = 0.005  # half the spacing of the points at which a line's room is checked [m]
 
 
 class Edge(NamedTuple):
@@ -73,9 +73,9 @@ class Part(NamedTuple):
 class Layout:
     """What stands on the table in one episode.
 
-    scale: of all lengths, 1 for a workspace of `FULL`. goal: target of the object's centre [m]. places: (x, y) [m] of
-    the obstacles present, by name. edge: None if none is near. half: half the object's height [m]. parts: of object and
-    hand, relative to the object's centre.
+    scale: of all lengths, 1 for a workspace of half width `FULL`. goal: target of the object's centre [m]. places:
+    (x, y) [m] of the obstacles present, by name. edge: None if none is near. half: half the object's height [m]. parts:
+    of object and hand, relative to the object's centre.
     """
 
     scale: float
@@ -159,7 +159,7 @@ def path_features(layout: Layout, positions: F64) -> F64:
 
 @dataclass(frozen=True)
 class Reward:
-    """Weights, in the order of `FEATURES`: the costs of a metre of path.
+    """Weights, in the order of `FEATURES`: the cost of a metre of path at which a feature is 1.
 
     Raises `UsageError` for weights that are not finite or below 0, and for a `length` of 0: paths could otherwise have
     any length.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import mujoco
@@ -12,7 +11,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.geometry import outline
-from manip_il.sim.world import Scene, World
+from manip_il.sim.world import Scene, World, once_per_scene
 from manip_il.tasks.carry.layout import DEFAULT, FEATURES, FULL, OBSTACLES, TASTES, Edge, Layout, Part, Reward
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.objects import add_furniture, add_part
@@ -119,7 +118,7 @@ def _numbers(vector: F64) -> tuple[float, float, float]:
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout of an episode with an object by that name, from the numbers of `environment_state` by name."""
+    """Return the layout that an observation describes. name: the object's; seen: `environment_state` by name."""
 
     def vector(of: str) -> F64:
         return np.array([seen[f"{of}.{axis}"] for axis in "xyz"], dtype=np.float64)
@@ -140,9 +139,9 @@ def observe_obstacles(world: World) -> dict[str, F64 | float]:
 
 
 class Box(NamedTuple):
-    """Upright box around a part of the hand: its lowest point over `ee`, its middle (2,) and half lengths (2,) [m].
+    """Upright box around a part of the hand, relative to `ee`.
 
-    The latter two are along the hand's own x and y, from `ee`.
+    bottom: height of its lowest point [m]. middle, half: middle and half lengths along the hand's x and y, (2,) [m].
     """
 
     bottom: float
@@ -151,9 +150,9 @@ class Box(NamedTuple):
 
 
 class HandShape(NamedTuple):
-    """The open, downward hand: its parts as heights and radii about the vertical through `ee`, and as boxes.
+    """The open, downward hand. parts: bottoms and radii about the vertical through `ee`; boxes: upright ones around it.
 
-    home: where `ee` is at home, (3,) [m].
+    home: position of `ee` in the arm's home pose, (3,) [m].
     """
 
     parts: tuple[Part, ...]
@@ -161,9 +160,9 @@ class HandShape(NamedTuple):
     home: F64
 
 
-@lru_cache(8)
+@once_per_scene
 def hand_of(scene: Scene) -> HandShape:
-    """Return the hand of a scene's robot at home, (3,) [m]; computed once."""
+    """Return the shape of the hand of a scene's robot, in its home pose; cached."""
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[scene.arm_q] = scene.robot.home
     data.qpos[scene.gripper.q] = scene.gripper.command(scene.gripper.most)
@@ -197,7 +196,7 @@ def _box(points: F64, axes: F64) -> Box:
 
 
 def fits(hand: HandShape, at: F64, yaw: float, layout: Layout) -> bool:
-    """Return whether a hand at a point (3,) [m], turned by a yaw [rad], is clear of the obstacles of a layout."""
+    """Return whether a downward hand, `ee` at a point (3,) [m] and a yaw [rad], is clear of a layout's obstacles."""
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])  # the hand's x and y
     for _, middle, half, height in layout.boxes:
         for box in hand.boxes:

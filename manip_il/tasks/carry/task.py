@@ -90,7 +90,7 @@ def _safe_height(world: World) -> float:
 
 
 def _rise(world: World) -> float:
-    """Return the height over its grasp at which the hand clears the obstacles around, by its misalignment [m]."""
+    """Least height of the hand over the grasp [m]; it grows with misalignment until the hand clears every obstacle."""
     g = grasp_of(world, OBJECT)
     return min(STEEP * max(0.0, g.off - OVER), max(0.0, _safe_height(world) - g.at[2]))
 
@@ -112,7 +112,7 @@ def _hand_fits(world: World) -> bool:
 class Carry(PickPlace):
     """Carry the object's centre to the goal past the obstacles on the table, as cheaply as possible for a reward.
 
-    reward: the one that starts put into the state, where the expert reads it.
+    reward: written into the state at every start; the expert reads it from there.
     """
 
     name: str = NAME
@@ -131,7 +131,7 @@ class Carry(PickPlace):
         return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
 
     def with_argument(self, text: str) -> Self:
-        """Return the task with the reward that a text describes, named by its numbers."""
+        """Return the task with the reward that a text describes; the task's name lists its nonzero weights."""
         reward = Reward.parse(text)
         return replace(self, name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}", reward=reward)
 
@@ -168,7 +168,7 @@ class Carry(PickPlace):
         return {**observe_cube(world, OBJECT), **observe_obstacles(world)}
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label (no room for the hand, or no path to the goal), or ""."""
+        """Return why there is no sound label (obstacles overlap, no room for the hand, no path to the goal), or ""."""
         layout, at = layout_of(world, OBJECT), world.pose(OBJECT).position
         if layout.meeting:
             return "two obstacles overlap"

@@ -17,7 +17,7 @@ WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class StockRung(NamedTuple):
-    """A phase: whether it holds in what an expert reads from a state, and its target there."""
+    """A phase of a stock expert. holds, target: functions of a `StockEnv` or an `AlohaScene` in the state to label."""
 
     name: str
     holds: Callable[[Any], bool]
@@ -30,7 +30,7 @@ def always(read: object) -> bool:
 
 
 class StockBase:
-    """An environment of another package, whose reset and step are its own."""
+    """An environment of another package, under this program's interface; reset and step are that package's."""
 
     world: ClassVar[None] = None  # its expert restores states itself
     actions: ActionSpace

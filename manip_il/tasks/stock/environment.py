@@ -56,7 +56,7 @@ class StockEnv(StockBase):
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
         """Apply one action (4,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
         super().advance(action)
-        if self.task.blocked:  # its step has recomputed all poses
+        if self.task.blocked:  # with closed fingers, the environment's step has recomputed all poses
             self._remember()
         return action
 

@@ -46,5 +46,5 @@ def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
 
 @cache
 def described_stock(robot: str, task: str) -> StockEnvironment:
-    """Return an environment for descriptions; no episode runs in it."""
+    """Return a cached environment to read names and sizes from; no episode runs in it."""
     return make_stock(robot, task)

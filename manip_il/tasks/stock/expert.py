@@ -26,10 +26,10 @@ CLEAR = 0.053  # height at which the fingers pass over the cube [m]
 STRADDLE = 0.042  # offset from the cube in y from which the gripper gets over it while descending [m]
 NEAR = np.array([0.082, 0.04, 0.082])  # distance that the gripper still covers while the fingers close [m]
 OPENING = 0.25  # extra opening needed per distance of the cube in x, a ratio
-LEAD = 0.04  # largest lead of the gripper in y towards the goal while they close [m]
+LEAD = 0.04  # largest lead of the gripper in y towards the goal while the fingers close [m]
 CLOSED_ON = 0.03  # distance to the grasp at which that lead begins [m]
 GRASPED = np.array([0.03, 0.026, 0.04])  # largest offset from the cube in x, y, z if the fingers hold it [m]
-HELD = 0.054  # opening below which they hold it [m]
+HELD = 0.054  # opening below which the fingers hold it [m]
 
 # Push
 BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half sides of the area blocked to the gripper's middle by the cube [m]

@@ -60,7 +60,7 @@ ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  #
 
 @dataclass(frozen=True)
 class Held:
-    """How an object is held. open: half the finger gap that passes over it; thin: half one too small to hold it [m].
+    """Half finger gaps for an object. open: the least that passes over it; thin: the least that can hold it [m].
 
     long: whether its own x is its long axis.
     """
@@ -131,7 +131,7 @@ ALOHA_TASKS: dict[str, AlohaTask] = {
 class StockRobot:
     """The environments of one package. fixed: settings of `EnvConfig` that cannot change; horizon: the default.
 
-    cameras: the environment's, the default one first.
+    cameras: the environment's, the default one first. ends_solved: whether an episode ends once it is solved.
     """
 
     tasks: Mapping[str, StockTask | AlohaTask]

@@ -31,7 +31,7 @@ _DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
 _ANEW = 0.6  # chance that an untouched object gets a new place; else a hand that reaches for it is still near it
 _DROPPED, _FALL = 0.1, 30  # chance that a hand drops what it carries; most control steps after it has opened
 _STAYS, _ELSEWHERE = 0.4, 0.08  # chance that an arm stays; largest standard deviation of its joints if not [rad]
-_COARSE = 240  # pictures up to this height are drawn from simpler meshes: 2 % of their pixels change by over 8 of 255
+_COARSE = 240  # height up to which simpler meshes are drawn [pixels]: 2 % of the pixels change by over 8 of 255
 _CELL, _SHADOWS = 0.004, 1024  # least size of such a mesh's cell [m]; size of the shadow map [pixels]
 _BLANK = np.zeros((1, 1, 3), np.uint8)
 
@@ -103,9 +103,9 @@ class AlohaEnv(StockBase):
         return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
 
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
-        """Return a state in which what rests untouched on the table, and the arms, may be elsewhere.
+        """Return a state in which the arms, and untouched objects on the table, may be elsewhere.
 
-        A hand takes along what it carries, or has dropped it. None if anything overlaps.
+        A hand takes along what it carries, or has dropped it. Return None if bodies then overlap.
         """
         self.set_state(state)
         self._env.reset(seed=int(rng.integers(2**32)))
@@ -140,7 +140,7 @@ class AlohaEnv(StockBase):
         return replace(state, physics=self._physics())
 
     def _drop(self, rng: np.random.Generator) -> None:
-        """Let one of the hands open, if it holds something in the air, and go on for some steps."""
+        """Pick a hand; if it holds something in the air, open it and simulate some control steps."""
         scene, number = self.scene(), int(rng.integers(2))
         hand = list(scene.hands)[number]
         if any(all(scene.touches(hand, name)) and not scene.on_table(name) for name in self.task.objects):

@@ -26,14 +26,14 @@ from manip_il.tasks.stock.base import StockRung
 PEG, SOCKET = "peg", "socket"
 OF = {"left": SOCKET, "right": PEG}
 MEETING = np.array([-0.06, 0.5, 0.10])  # position of the socket for the insertion [m]
-WAITING = np.array([0.17, 0.0, 0.0])  # offset of the waiting peg from there [m]
+WAITING = np.array([0.17, 0.0, 0.0])  # offset of the waiting peg from `MEETING` [m]
 AT_MEETING, LEVEL = 0.03, 0.2  # largest errors of the socket's position and rotation when the peg comes [m], [rad]
 BEFORE, DEEP = 0.135, 0.085  # place of the peg along the socket's axis, before and in it; it meets the pin at 0.10 [m]
 SLOPE, TOLERANCE = 8.0, 0.003  # funnel: retreat per sideways error of the peg, and tolerated error [m]
 ADVANCE = 0.05  # largest advance of the peg in a step [m]
 LOW, HIGH = 0.015, 0.055  # heights between which a lifted object begins to move sideways [m]
-INSERTED = 0.03  # longest step of a joint with the peg before the socket [rad]
-CARRIED = 0.04  # longest step of a joint before that [rad]
+INSERTED = 0.03  # longest step of a joint while the peg is aligned and inserted [rad]
+CARRIED = 0.04  # longest step of a joint while an object is carried [rad]
 
 
 class Insertion(AlohaScene):

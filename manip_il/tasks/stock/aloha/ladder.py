@@ -19,7 +19,7 @@ from manip_il.tasks.stock.table import SIDES, AlohaTask, Held
 
 FINGER_AT_TOUCH = 0.0224  # finger joint position at which the two would touch [m]
 GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
-AROUND = (0.010, 0.012, 0.010)  # largest offset from there to begin closing, in the hand's axes [m]
+AROUND = (0.010, 0.012, 0.010)  # largest offset from that place to begin closing, in the hand's axes [m]
 HELD_AROUND = (0.020, 0.022, 0.020)  # the same while closing or holding [m]
 ANGLE, HELD_ANGLE = 0.25, 0.6  # largest angles to the grasp's rotation, to begin and to hold [rad]
 LIFTED = 0.04  # height of an object that has left the table [m]
@@ -33,7 +33,7 @@ STANDOFF = 0.09  # distance from an object at which the hand starts its final ap
 SLOPE, TOLERANCE = 2.0, 0.006  # funnel: retreat per sideways error of the hand, and tolerated error [m]
 ARM = 0.06  # sideways error that a radian counts as [m/rad]
 OPENING_STANDOFF = 0.045  # distance from an object while the fingers are not open [m]
-OPENING_SPAN = 0.004  # range of half the gap over which that falls to 0 [m]
+OPENING_SPAN = 0.004  # range of half the gap over which that distance falls to 0 [m]
 BACK_FIRST = 0.03  # a hand that is this much too near retreats before it moves sideways [m]
 MOST_TURN = 0.3  # largest turn of an object in a step [rad]
 
@@ -160,7 +160,7 @@ def nearest(axes: F64, way: F64) -> F64:
 
 
 def ahead_across(ahead: F64, across: F64) -> F64:
-    """Return the rotation (3, 3) of a hand that points along a direction (3,), its fingers nearest to another (3,)."""
+    """Return the rotation (3, 3) of a hand that points along `ahead` (3,), its fingers opening near `across` (3,)."""
     x = ahead / np.linalg.norm(ahead)
     y = across - x * (x @ across)
     y /= np.linalg.norm(y)
@@ -168,7 +168,7 @@ def ahead_across(ahead: F64, across: F64) -> F64:
 
 
 def pitched(across: F64, pitch: float) -> F64:
-    """Return the rotation (3, 3) of a hand pitched down by `pitch` whose fingers open along a levelled way (3,)."""
+    """Return the rotation (3, 3) of a hand pitched down [rad], its fingers opening along the level part of `across`."""
     level = np.array([across[0], across[1], 0.0])
     y = level / np.linalg.norm(level)
     return ahead_across(math.cos(pitch) * cross(y, Z) - math.sin(pitch) * Z, y)

@@ -28,11 +28,11 @@ from manip_il.tasks.stock.base import StockRung, always
 
 CUBE = "box"
 MEETING = np.array([0.0, 0.5, 0.25])  # position of the cube for the handover [m]
-WAITING = np.array([-0.12, 0.0, 0.0])  # offset of the waiting left hand from there [m]
-NEAR = 0.1  # distance of the cube from there at which the left hand sets out [m]
-KEPT_OFF, ARRIVED = 0.12, 0.02  # largest gap that the left hand keeps; cube's distance left at which it keeps none [m]
-LEFT_CLOSED = 0.025  # half the gap below which the left fingers hold it [m]
-OPENED, OPENING = 0.022, 0.004  # half the gap at which the right hand starts to leave, and the range to full [m]
+WAITING = np.array([-0.12, 0.0, 0.0])  # offset of the waiting left hand from `MEETING` [m]
+NEAR = 0.1  # distance of the cube from `MEETING` at which the left hand sets out [m]
+KEPT_OFF, ARRIVED = 0.12, 0.02  # largest gap of the left hand to the cube; cube's way left at which it is 0 [m]
+LEFT_CLOSED = 0.025  # half the gap below which the left fingers hold the cube [m]
+OPENED, OPENING = 0.022, 0.004  # half the gap at which the right hand leaves; range over which its step grows [m]
 CLEAR = 0.12  # final distance of the right hand from the cube [m]
 CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest joint steps: carrying, handing over, parting [rad]
 
@@ -54,7 +54,7 @@ class Transfer(AlohaScene):
 
     @cached_property
     def left_grasp(self) -> F64:
-        """Rotation of the left hand that takes it from the right one: its fingers cross the other's, (3, 3)."""
+        """Rotation of the left hand that takes the cube from the right one, fingers across the other's, (3, 3)."""
         axes = self.things[CUBE].axes
         between = int(np.abs(self.right.rotation[:, 1] @ axes).argmax())
         free = np.delete(axes, between, axis=1)
