@@ -136,7 +136,7 @@ class Settings:
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
 
 
-# All other values are those for robots. Chosen on training seeds from 100 on.
+# All other values are the defaults for robots. These were chosen on training seeds from 100 on.
 SETTINGS = {
     "Pendulum-v1": Settings(steps=100_000, ppo=PPOConfig(lr=2e-3, minibatches=8)),
     "CartPole-v1": Settings(steps=30_000, ppo=PPOConfig(lr=1e-3, minibatches=8)),
@@ -229,7 +229,7 @@ def main() -> int:
 
 
 def measure(algorithm: str, ends: dict[str, tuple[float, float]], seeds: Sequence[int], *, quick: bool) -> bool:
-    """Print shares per environment and overall; return whether a limit was missed. ends: returned by `references`."""
+    """Print shares per environment and overall; return whether a limit was missed. ends: see `references`."""
     shares: dict[str, list[float]] = {}
     for name, (random, expert) in ends.items():
         begin, settings = time.process_time(), replace(SETTINGS[name], **(_QUICK if quick else {}))

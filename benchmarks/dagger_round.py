@@ -28,7 +28,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
 from manip_il.tasks.envs import scene_of
 
-LIMIT, SHARE = 30.0, 0.15  # [s], and share of it for labelling
+LIMIT, SHARE = 30.0, 0.15  # time of a round [s], and the largest share of it for labelling
 
 
 def main() -> int:

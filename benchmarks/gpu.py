@@ -2,11 +2,11 @@
 
 python benchmarks/gpu.py
 
-Samples/s of ACT (two cameras of 96 and of 240 pixels; aloha's one of 480 x 640, if gym_aloha is installed), diffusion
-and cnn (96), batches of 32, mixed precision if the policy has it: for `manip_il`'s trainer, which decodes pictures
-once, and for LeRobot's DataLoader with one process per core (at most 8), its processors and updates as in
-`lerobot-train`. Both after a warm-up, alternating, on one dataset of videos. Then milliseconds per action for 25
-episodes in lockstep, on GPU and CPU, and pictures/s of the renderer.
+Samples/s of ACT (two cameras of 96 x 96 and of 240 x 240 pixels; one of 480 x 640 for aloha, if gym_aloha is
+installed), diffusion and cnn (96 x 96), batches of 32, mixed precision if the policy supports it: for `manip_il`'s
+trainer, which decodes pictures once, and for LeRobot's DataLoader with one process per core (at most 8), its processors
+and updates as in `lerobot-train`. Both after a warm-up, alternating, on the same dataset of videos. Then milliseconds
+per action for 25 episodes in lockstep, on GPU and CPU, and pictures/s of the renderer.
 At most 8 minutes. Without a GPU it prints a message and exits with 0.
 """
 

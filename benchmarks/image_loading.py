@@ -4,9 +4,10 @@ python benchmarks/image_loading.py [DATASET] [--quick]
 
 DATASET is the root of a dataset with cameras; without it one with two 128 x 128 cameras is recorded. Batches of 64 in
 shuffled order, all columns of the dataset, pictures as float32 in [0, 1]; ours on one thread, LeRobot's in this process
-and in two worker processes, of which the faster counts. All are warm: frames are decoded once, every process has had an
-epoch. LeRobot's pictures are unchanged in both rows: augmentation is extra work of ours. Then the cost of decoding
-once, in LeRobot's epochs. All alternate in the same run; the result is the median ratio of the repeats.
+and in two worker processes, of which the faster counts. All are warm: our frames are decoded, and every process has run
+an epoch. LeRobot's pictures are unchanged in both rows: augmentation is extra work of ours. The last line is the time
+to decode all frames once, in epochs of LeRobot's loader. All alternate in the same run; the result is the median ratio
+of the repeats.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ def record(root: Path, episodes: int) -> Path:
 
 
 def measure(root: Path, repeats: int) -> list[Repeat]:
-    # run its worker processes first: forked after decoding, they would share open files
+    # start LeRobot's worker processes first: if forked after decoding, they would share open files
     peers = [epochs(root, workers) for workers in (2, 0)]
     for peer in peers:
         next(peer)

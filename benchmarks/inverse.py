@@ -38,7 +38,7 @@ from manip_il.tasks.pick_place import OBJECT
 F64 = NDArray[np.float64]
 ABOVE = {"max_margin": 0.10, "bayesian": 0.03, "max_entropy": 0.03}
 SECONDS = {"max_margin": 60.0, "bayesian": 300.0, "max_entropy": 60.0}
-_LEAST = 1e-9  # smallest weight relative to that of length, so that ties are broken
+_LEAST = 1e-9  # weight of other features relative to that of length, to break ties
 
 
 def main() -> int:
@@ -46,7 +46,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--demonstrations", type=int, default=50)
-    parser.add_argument("--layouts", type=int, default=100, help="unseen ones")
+    parser.add_argument("--layouts", type=int, default=100, help="unseen layouts to plan on")
     parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
     options = parser.parse_args()
     demonstrations, layouts = (4, 3) if options.quick else (options.demonstrations, options.layouts)
@@ -66,7 +66,7 @@ def main() -> int:
 
 
 def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int]]:
-    """Yield the grids of layouts that are in no demonstration, and the nodes of their objects."""
+    """Yield the grids of layouts that are in no demonstration, and the node nearest to the object in each."""
     env = env_of(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
@@ -77,7 +77,7 @@ def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int
 
 
 def _learn(robot: str, taste: str, count: int, seed: int) -> dict[str, tuple[F64, float]]:
-    """Return weights and seconds of every method."""
+    """Return the weights (K,) that every method learns, and the time that it takes [s]."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / taste
         words = [f"--robot.type={robot}", f"--task.type={CARRY}:{taste}", f"--dataset.root={root}"]

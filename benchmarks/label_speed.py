@@ -2,8 +2,8 @@
 
 python benchmarks/label_speed.py [--quick]
 
-The states are from real episodes, driven by the expert and by random actions. The limit is daqp on the same problems,
-built beforehand; both alternate in the same run, state by state, and the tasks alternate, too.
+The states are from episodes driven by the expert and by random actions. The limit is daqp on the same problems, built
+beforehand; both alternate in the same run, state by state, and the tasks alternate, too.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
 
 
 def problem_of(expert: Expert, state: State) -> qpsolvers.Problem | None:
-    """Return the quadratic program of a label, intercepted on its way to the solver; None if it needs none."""
+    """Return the quadratic program that a label solves, intercepted at the solver; None if it solves none."""
     caught: list[qpsolvers.Problem] = []
     plain = ik.daqp.solve
 

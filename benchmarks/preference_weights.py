@@ -3,9 +3,9 @@
 python benchmarks/preference_weights.py [--task NAME] [--output DIR] [--quick]
 
 Runs DAgger for policies of varying quality, asks a teacher who errs in a tenth of the answers about 100 pairs of their
-clips, learns a reward, asks about 100 more on which its networks disagree, and relearns the reward from all 200. Takes
-its agreement with true progress on 2,000 pairs without answers, for five draws of pairs and errors. Then records as
-many demonstrations as a clone of a few has episodes, joins both with the executed actions as labels, scores the
+clips, learns a reward, asks about 100 more on which its networks disagree, and relearns the reward from all 200.
+Measures its agreement with true progress on 2,000 pairs without answers, for five draws of pairs and errors. Then joins
+100 demonstrations with 100 episodes of round 0's policy, both with the executed actions as labels, scores the
 episodes with the first draw's reward, and clones the joined data unweighted, weighted, and the demonstrations alone.
 Prints agreement, the area under the ROC curve for failed episodes beside that of true progress, and the clones' success
 on the same unseen seeds.
@@ -46,7 +46,7 @@ _FRESH, _CLIP, _DRAWS = 2_000, 20, 5
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="pick_place")
-    parser.add_argument("--output", type=Path, help="folder of everything that is made; by default one that goes away")
+    parser.add_argument("--output", type=Path, help="folder for all results; by default a temporary one")
     parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
     options = parser.parse_args()
     print(describe_machine())
@@ -109,7 +109,7 @@ def learn_reward(rounds: Path, folder: Path, draw: int, count: int) -> Path:
 
 
 def clone(folder: Path, name: str, source: object, steps: int, seeds: int) -> EvalResult:
-    """Clone a dataset, given with its weights, and evaluate the clone on unseen seeds."""
+    """Clone a dataset and evaluate the clone on unseen seeds. source: the dataset's folder, with `--weights` if any."""
     word = name.replace(" ", "_")
     run(f"train --dataset.root={source} --steps={steps}", folder / word)
     run(f"eval --policy.path={folder / word} --eval.n_episodes={seeds}", folder / f"eval_{word}")

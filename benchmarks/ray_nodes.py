@@ -2,9 +2,9 @@
 
 python benchmarks/ray_nodes.py [--quick]
 
-Journals of the same episodes, alternating, with warm workers; medians over the turns, with their range. Overhead: how
-much longer an episode takes on the four nodes than in two processes of the engine, whose cores they share. Over the
-wire: packed size of what a worker sends back per episode.
+All record journals of the same episodes, alternating, with warm workers; medians over the turns, with their range.
+"four nodes / two processes" is the overhead of Ray, as both share the same cores. "over the wire" is the packed size of
+an episode that a worker sends back.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def recorder(engine: Engine, job: RolloutJob) -> Callable[[int], float]:
 
 def measured(ways: dict[str, Callable[[int], float]], episodes: int, turns: int) -> dict[str, list[float]]:
     for record in ways.values():
-        record(2 * NODES)  # starts the workers, which load and compile
+        record(2 * NODES)  # starts the workers, which import and compile
     times: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(turns):
         for name, record in ways.items():

@@ -4,8 +4,8 @@ python benchmarks/recording_speed.py [--quick]
 
 One core: this process is pinned to one core, including the threads that encode video. The limit is `mj_step` replaying
 the recorded controls from the same starts, plus, with cameras, rendering the same pictures; episodes alternate.
-Beside it: as in `record`, with a second core for video, recordings and their limits alternating.
-Two workers: the same recording with two processes against one, all warm, beside two processes of bare physics against
+"encoding beside it": video is encoded on a second core, as in `record`; recordings and their limits alternate.
+Two workers: the same recording with two processes against one, all warm, and bare physics with two processes against
 one, which is the machine's limit. The result is the median ratio over the repeats.
 """
 

@@ -7,8 +7,8 @@ paramiko's put and get for sftp:// (Debian's sshd, which must be installed); hug
 snapshot_download for hf:// (the tests' server); s3fs' put and get for s3:// (moto, in a process of its own).
 Both alternate in the same run, into new places each time; the result is the median ratio (above 1: ours is faster).
 
-ratio: of the plain commands; our pull ends when all data are on disk, the plain client's when they are in memory.
-on disk: of both until all data are on this machine's disk.
+ratio: of the commands' times; our pull ends when all data are on disk, the plain client's when they are in memory.
+on disk: of the times until all data are on this machine's disk.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ BUCKET = "benchmark"
 
 @dataclass(frozen=True)
 class Store:
-    """A kind of store, and its plain client: put a folder at a place, get it back."""
+    """A kind of store and its plain client. put: copies a folder to a place in the store; get: copies it back."""
 
     name: str
     url: Callable[[str], str]
@@ -87,7 +87,10 @@ def main() -> int:
 
 
 def turn(store: Store, tree: Path, work: Path, *, ours_first: bool = False) -> dict[str, float]:
-    """Return the seconds of each direction, plain and ours. ours_first: alternates, as the first has more memory."""
+    """Return the seconds of each direction, plain and ours.
+
+    ours_first: alternates between turns, because the first one has more free memory.
+    """
     times: dict[str, float] = {}
     place, plain = f"{_made(work)}/ours", f"{work}/plain"
     url = store.url(place)
@@ -122,7 +125,7 @@ def show(row: str, turns: list[dict[str, float]]) -> None:
 
 @contextlib.contextmanager
 def moto_beside() -> Iterator[str]:
-    """Yield the endpoint of a server in another process, as in this one it would compete for Python's lock."""
+    """Yield the endpoint of a server in another process; in this one it would compete for Python's global lock."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     server = context.Process(target=_serve_s3, args=(there,))
@@ -197,7 +200,7 @@ def connected(server: Sshd) -> Iterator[paramiko.SFTPClient]:
 
 
 def make_tree(folder: Path, files: int, size: int, suffix: str) -> Path:
-    """Create and return a folder that counts as a run."""
+    """Create and return a folder that `push` takes for a run. size: of each file [bytes]."""
     _made(folder)
     (folder / "config.yaml").write_text("# manip-il\n")
     (folder / "README.md").write_text("---\nlicense: mit\n---\n")  # its own card, so that none is generated

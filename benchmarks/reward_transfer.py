@@ -61,7 +61,7 @@ def main() -> int:
     parser.add_argument("--taste", default="careful", choices=list(TASTES))
     parser.add_argument("--demonstrations", type=int, default=50)
     parser.add_argument("--layouts", type=int, default=100)
-    parser.add_argument("--steps", type=int, default=10_000, help="of the clone's fit")
+    parser.add_argument("--steps", type=int, default=10_000, help="gradient steps of the clone")
     parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
     options = parser.parse_args()
     count, layouts, steps = (3, 2, 20) if options.quick else (options.demonstrations, options.layouts, options.steps)
@@ -170,7 +170,7 @@ def _print(arm: str, name: str, found: list[Driven], own: list[Driven]) -> bool:
 
 
 def _compare(found: list[Driven], cloned: list[Driven]) -> bool:
-    """Print how often the first is cheaper on the same layouts; return whether that is not significant."""
+    """Print on how many layouts `found` is cheaper than the clone; return whether that is not significant."""
     pairs = [(a.cost, b.cost) for a, b in zip(found, cloned, strict=True)]
     cheaper, dearer = sum(a < b for a, b in pairs), sum(a > b for a, b in pairs)
     p_value = float(binomtest(cheaper, max(1, cheaper + dearer), alternative="greater").pvalue)

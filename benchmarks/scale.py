@@ -3,11 +3,11 @@
 python benchmarks/scale.py [--quick] [--episodes=10000] [--folder=FOLDER] [--plot=FILE]
 
 Fetch's reach, the cheapest task to simulate, on one worker. A recording grows tenfold repeatedly with
-`record --resume=true`; at every size each command runs whole, in a new process. Measures CPU time, as it does not
-depend on the machine's other load. A new episode: the time of recording minus that of adding one episode, which reads
-all others back and writes the same dataset. Memory: the process's peak. Resuming: wall time until a new episode is on
-disk. At the largest size: the wall time of a new episode relative to that of the same one in an empty folder,
-alternating.
+`record --resume=true`; at every size each command runs whole, in a new process. Measures CPU time, which depends little
+on the machine's other load. A new episode: the time of recording minus that of adding one episode, which reads all
+others back and writes the same dataset, divided by the number of new episodes. Memory: the process's peak. Resuming:
+wall time until a new episode is on disk. At the largest size: the wall time of a new episode relative to that of the
+same one in an empty folder, alternating.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Row:
-    """All commands on a dataset of a given size. new: time for one more episode [s of CPU time]."""
+    """All commands on a dataset of a given size. new: CPU time for one more episode [s]; resumed: wall time [s]."""
 
     episodes: int
     new: float
@@ -74,9 +74,9 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="ten episodes: shows that it runs, measures little")
     parser.add_argument("--episodes", type=int, default=10_000)
     parser.add_argument(
-        "--folder", type=Path, help="where it works, leaves what it made, and goes on with what is there"
+        "--folder", type=Path, help="folder that keeps the results and is continued from; by default a temporary one"
     )
-    parser.add_argument("--plot", type=Path, help="a picture of all that was measured in the folder")
+    parser.add_argument("--plot", type=Path, help="file for a plot of all measurements in the folder")
     options = parser.parse_args()
     most, first = (10, 10) if options.quick else (options.episodes, FIRST)
     print(describe_machine())

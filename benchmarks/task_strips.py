@@ -1,4 +1,4 @@
-"""Film strips of all tasks, solved by the expert, and the table beside them, for `docs/tasks.md`.
+"""Film strips of all tasks, solved by the expert, for `docs/tasks.md`.
 
 Usage: MUJOCO_GL=egl python benchmarks/task_strips.py [TASK ...]; writes docs/tasks/TASK.jpg.
 """

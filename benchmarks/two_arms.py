@@ -17,14 +17,14 @@ from manip_il.tasks.stock.aloha.expert import AlohaExpert
 
 OUTPUT = Path(__file__).parent.parent / "docs" / "two_arms.gif"
 HEIGHT, WIDTH, CAMERA = 200, 320, "angle"
-EVERY, HOLD = 3, 8  # control steps per frame; frames that the last one stays
+EVERY, HOLD = 3, 8  # control steps per frame; frames for which the last picture stays
 HORIZON = 400
 COLOURS = 48
-SAID = 18  # control steps after a knock that the film says so
+SAID = 18  # control steps after a knock during which the caption names it
 
 
 class Knock(NamedTuple):
-    """An external force on an object from the first step in `phase` on. steps: how long it lasts."""
+    """An external force on an object, from the first control step in `phase` on. steps: control steps that it lasts."""
 
     task: str
     thing: str

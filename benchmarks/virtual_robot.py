@@ -1,4 +1,4 @@
-"""The virtual robot in use, for `README.md`: what a session prints, and what LeRobot's program recorded in it.
+"""The virtual robot in use, for `README.md`: the output of `manip-il serve`, and what LeRobot's recorder recorded.
 
 Usage: MUJOCO_GL=egl python benchmarks/virtual_robot.py; writes docs/virtual_robot.png, in about a minute.
 """
@@ -31,7 +31,7 @@ COMMANDS = [
 
 
 def record(folder: Path) -> tuple[list[str], LeRobotDataset]:
-    """Return a session's shortened output while LeRobot recorded two episodes, and the dataset of these."""
+    """Record two episodes with LeRobot's recorder; return the shortened output and the dataset."""
     tools, arm = Path(sys.executable).parent, folder / "arm"
     shared = f"type: zmq, server_address: 127.0.0.1, port: 5598, width: {WIDTH}, height: {HEIGHT}, fps: 30"
     cameras = ", ".join(f"{name}: {{{shared}, camera_name: {name}}}" for name in ("front", "wrist"))

@@ -48,8 +48,9 @@ def record(
 ) -> Dataset:
     """Record a dataset: the expert's successful demonstrations, or all rollouts of a policy with the expert's labels.
 
-    beta: share of a policy's steps that the expert drives. query: when the expert is queried, as `--query` of `dagger`.
-    options: other fields of `RolloutJob`, such as `label` and `cameras`; a policy's `round` is 1 by default.
+    beta: share of the steps that the expert drives instead of the policy. query: when the expert is queried, as for
+    `manip-il dagger --query`. options: other fields of `RolloutJob`, such as `label` and `cameras`; `round` is by
+    default 1 with a policy, else 0.
     Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder exists.
     """
     driver = RolloutJob.driver if policy is None else PolicyDriver((_folder(policy),), beta)
@@ -102,8 +103,8 @@ def dagger(
 ) -> list[Result]:
     """Run DAgger, or another `method`, in a folder; return the results of all rounds, starting with 0 (cloning).
 
-    beta, query: as on the command line, `"linear:5"` and `"probability:0.1"`. options: other fields of `RunConfig`.
-    A folder with finished rounds is continued. Raises `UsageError` for options that contradict each other.
+    beta, query: as on the command line, such as `"linear:5"` and `"probability:0.1"`. options: other fields of
+    `RunConfig`. A folder with finished rounds is continued. Raises `UsageError` for options that contradict each other.
     """
     options |= {} if beta is None else {"beta": BetaSchedule.parse(beta)}
     options |= {} if query is None else {"query_rule": parse_query(query)}
@@ -123,10 +124,11 @@ def evaluate(
     workers: int | None = 1,
     **options: Any,
 ) -> EvalResult:
-    """Evaluate a policy, or the expert, on unseen seeds; return the outcome of every episode.
+    """Evaluate a policy, by default the expert, on unseen seeds; return the outcome of every episode.
 
     env: by default the policy's training environment. options: fields of `RolloutJob`, such as `conditions`.
-    Raises `UsageError` without a policy or an environment, `MismatchError` if they do not fit.
+    Raises `UsageError` if neither `env` nor the policy names an environment, `MismatchError` if the policy does not fit
+    `env`.
     """
     path = None if policy is None else _folder(policy)
     if env is None:

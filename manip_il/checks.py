@@ -29,7 +29,7 @@ SECONDS_IN_CHILD = 120.0
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
 _NUMBERS = re.compile(r"\w+=[0-9.e+-]+(,\w+=[0-9.e+-]+)*", re.ASCII)
 _LONGEST_MESSAGE = 1_000  # [characters]
-_REFUSED = 3  # exit code of the child process
+_REFUSED = 3  # exit code of the child process if its function raises `ManipError`
 
 
 def one_line(error: BaseException) -> str:
@@ -51,7 +51,7 @@ def name(what: str, value: object) -> str:
 
 
 def task_name(value: object) -> str:
-    """Return a task's name, checked as by `name`; a colon may precede numbers, `NAME:A=NUMBER,B=NUMBER`."""
+    """Return a task's name, checked as by `name`; numbers may follow a colon: `NAME:A=NUMBER,B=NUMBER`."""
     base, colon, numbers = text("task", value).partition(":")
     if colon and not _NUMBERS.fullmatch(numbers):
         raise ManipError(f"task is {shorten(value)}; expected NAME=NUMBER,... after the colon")
@@ -104,7 +104,7 @@ def parse_json(what: str, data: str | bytes) -> Any:
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file. what: what is expected, for the message."""
+    """Return the object in a JSON file. what: what the file should be, for the error message."""
     return mapping(str(path), parse_json(str(path), read_bytes(path, what)))
 
 
@@ -119,7 +119,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """Return the value of a YAML file; `UsageError` if it cannot be read. what: what is expected, for the message."""
+    """Return the value of a YAML file; `UsageError` if it cannot be read. what: what it should be, for the message."""
     try:
         return parse_yaml(read_bytes(path, what, UsageError).decode())
     except ValueError as error:  # UnicodeDecodeError is a ValueError
@@ -127,7 +127,7 @@ def read_yaml(path: Path, what: str) -> Any:
 
 
 def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a file's content; raises `refusal` if it cannot be read. what: what is expected, for the message."""
+    """Return a file's content; raises `refusal` if it cannot be read. what: what it should be, for the message."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -135,7 +135,7 @@ def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError) ->
 
 
 def without_link(path: str, flags: int) -> int:
-    """Open a file for writing, as the `opener` of `open`; `OSError` for a link, which could lead to any file."""
+    """Open a file for writing, as an `opener` for `open`; raises `OSError` for a link, which could lead to any file."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
@@ -143,8 +143,8 @@ def in_child(what: str, function: Callable[..., object], *arguments: object, sec
     """Call `function(*arguments)` in a child process with at most 4 GB of memory and 120 s, or `seconds`.
 
     Only the text of its `ManipError` comes back, because the file is untrusted. Raises that error, and `ManipError` if
-    the child exceeds its limits or dies. what: the thing that is opened, for these messages; a function that opens
-    several files calls `opening`.
+    the child exceeds its limits or dies. what: name of the file or folder, for these messages; a function that opens
+    several files calls `opening` before each.
     """
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
     done = subprocess.run(command, input=pickle.dumps((seconds, function, arguments)), capture_output=True, check=False)

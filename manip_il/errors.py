@@ -9,7 +9,7 @@ import difflib
 import traceback
 from collections.abc import Iterable
 
-OWN = "manip_il_own_"  # prefix of the modules of users' own files
+OWN = "manip_il_own_"  # prefix of the names of modules that are loaded from users' own files
 _LONGEST_PRINTED = 200  # [characters]
 
 
@@ -35,11 +35,9 @@ class UsageError(ManipError):
 class UnknownName(UsageError):
     """A name is unknown; the message lists the known names and the nearest."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str], where: str = ""):
-        """Take the known names. where: what the message says in place of these."""
+    def __init__(self, kind: str, name: str, known: Iterable[str]):
         known = sorted(known)
-        listed = where or f"known: {', '.join(known)}"
-        super().__init__(f"unknown {kind} {shorten(name)}{nearest(name, known)}; {listed}")
+        super().__init__(f"unknown {kind} {shorten(name)}{nearest(name, known)}; known: {', '.join(known)}")
 
 
 class MismatchError(ManipError):
@@ -98,6 +96,6 @@ def shorten(value: object) -> str:
 
 def silence_ffmpeg_warning() -> None:
     """Hide LeRobot's long warning about missing FFmpeg libraries: we read video with PyAV, which has its own."""
-    import logging  # imported here because help needs none
+    import logging  # imported here because help does not need it
 
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

@@ -6,7 +6,6 @@ over joints have length `n` = arm joints + 1: arm [rad], gripper opening [m].
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -20,7 +19,7 @@ from manip_il.errors import ManipError, NotFiniteError
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
-KEYPOINTS = "privileged.keypoints."  # prefix of a camera's keypoint column, which is present if its pictures are
+KEYPOINTS = "privileged.keypoints."  # prefix of a camera's keypoint column; stored only with its pictures
 STATE_EXTRAS = 4  # numbers in a `sim_state` besides physics and variation
 LONGEST_EPISODE = 10_000  # [control steps]; eight minutes at 20 Hz
 
@@ -109,7 +108,7 @@ class Transition:
     """One control step of one episode: all content of a dataset's frame.
 
     `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from after it.
-    `success`: within the tolerance for the required number of consecutive steps, now. `done` marks the last frame.
+    `success`: whether the last steps, as many as required, were all within the tolerance. `done` marks the last frame.
     """
 
     seed: int
@@ -130,9 +129,9 @@ class Episode:
     """A finished episode as columns, with the dataset's names (without LeRobot's own index columns).
 
     columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required number of
-    consecutive steps at some time. success_at_end: the same at the last frame. instruction: its text for policies that
-    read language; empty for the task's own. drawn: how its world differed from the nominal one: range name -> plain
-    JSON value.
+    consecutive steps at some time. success_at_end: the same at the last frame. instruction: the task in words, for
+    policies that read language; empty for the task's own text. drawn: how the episode's world differed from the nominal
+    one: range name -> plain JSON value.
     """
 
     seed: int
@@ -165,8 +164,6 @@ class Episode:
 def require_finite(what: str, values: NDArray[np.generic]) -> None:
     """Raise `NotFiniteError` naming `what` and the first bad row of (T, ...), unless every value is finite."""
     if values.dtype.kind != "f":
-        return
-    if values.ndim == 1 and math.isfinite(values.dot(values)):  # four times as fast; an overflow costs only time
         return
     if np.isfinite(values).all():
         return

@@ -8,6 +8,7 @@ from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 from manip_il.errors import UsageError
+from manip_il.seeding import MAX_SEED
 
 
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
@@ -22,7 +23,7 @@ def option(default: Any, help_text: str, **metadata: Any) -> Any:
 
 
 def option_of(cls: type, name: str) -> Any:
-    """Return a field with the default and the help of `name` of another dataclass."""
+    """Return a field with the default and help of the field `name` of another dataclass."""
     [theirs] = [one for one in fields(cls) if one.name == name]
     own = theirs.default if theirs.default_factory is MISSING else theirs.default_factory
     return option(own, theirs.metadata["help"])
@@ -48,4 +49,4 @@ def check_bounds(options: Any, prefix: str = "") -> None:
 class Seeded:
     """Options of everything that draws random numbers."""
 
-    seed: int = option(0, "random seed, 0 to 1000; it shifts every random stream", at_least=0, at_most=1000)
+    seed: int = option(0, "random seed, 0 to 1000; it shifts every random stream", at_least=0, at_most=MAX_SEED)

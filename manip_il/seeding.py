@@ -2,7 +2,7 @@
 
 An episode's seed is `stream_base(stream) + index`. Each stream has a block of `BLOCK` seeds, and each value of the
 user's `--seed` shifts all streams to other blocks, so that demonstrations, every DAgger round, training, validation
-and the final test never share a seed, and none of them is LeRobot's 1000.
+and the final test never share a seed, and no stream holds 1000, LeRobot's default seed.
 """
 
 from __future__ import annotations

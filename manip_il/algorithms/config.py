@@ -78,9 +78,10 @@ class RunConfig(Seeded):
     that replaces cloning in round 0; without datasets, round 0 then has no demonstrations. Later rounds start from its
     weights and keep its architecture.
 
-    query_rule: None for the label mode's default, see `query`. hold: also applies to validation. patience: without
-    progress a rollout only repeats its states. disturbed_share: conditions are `manip_il.sim.events.STANDARD`. cameras:
-    the rendered ones; with redraw, no pictures are recorded. conditions: variations of the world, also in validation.
+    query_rule: None for the label mode's default, see `query`. hold: also applies to validation. patience: a rollout
+    without progress only repeats its states. disturbed_share: the disturbances are `manip_il.sim.events.STANDARD`.
+    cameras: those to render; with redraw, pictures are rendered after the rollouts, not recorded in them. conditions:
+    variations of the world, also in validation.
     """
 
     env: EnvConfig = field(default_factory=make_config)
@@ -155,7 +156,7 @@ class RunConfig(Seeded):
 
     @property
     def steps_of_branch(self) -> int:
-        """Control steps of a branch; by default just enough to learn one whole plan."""
+        """Control steps of a branch; by default just enough for the policy to learn one whole plan."""
         return self.branch_steps or sum(plan_of(self.fit))
 
     @property
@@ -172,7 +173,7 @@ class RunConfig(Seeded):
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
-    """Return how many actions a policy plans at once, and how many final frames of an episode it does not learn."""
+    """Return how many actions a policy plans at once, and how many frames of an episode's end it does not learn."""
     if fit.kind == MLP:  # avoids importing LeRobot, which takes seconds
         return 1, 0
     from manip_il.learn.lerobot_config import policy_config

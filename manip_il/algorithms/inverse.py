@@ -53,7 +53,7 @@ class Carried:
 def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Carried]:
     """Return the paths of a dataset's successful episodes, in order.
 
-    Raises `ManipError` for a dataset of another task, without a successful episode, or with a path through things.
+    Raises `ManipError` for a dataset of another task, without a successful episode, or with a path through an obstacle.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -125,7 +125,7 @@ class Inverse:
 
     @property
     def excess(self) -> float:
-        """Excess cost of the demonstrations over the re-planned paths, by these weights, as a share."""
+        """Excess cost of the demonstrations relative to that of the re-planned paths, both by these weights."""
         shown, planned = self.means
         return float(shown @ self.weights / (planned @ self.weights) - 1)
 
@@ -215,7 +215,7 @@ def _cost_figure(found: Inverse) -> Figure:
 
 
 def _draw_cost(axis: Any, one: Carried, weights: F64) -> Any:
-    """Draw the cost of a metre, seen from above, at the path's median height, and the things."""
+    """Draw the cost of a metre and the obstacles, seen from above, at the path's median height."""
     layout, points = one.grid.layout, one.grid.points
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     x, y = (np.linspace(low[k], high[k], _SIDE) for k in (0, 1))

@@ -37,7 +37,7 @@ class LearningConfig(Seeded):
     )
     log_std: float | None = option(
         None,
-        "log of the initial action noise over the demonstrations' deviation; by default -0.5, or -1 with --init",
+        "log of the initial action noise in deviations of the demonstrations; by default -0.5, or -1 with --init",
         at_least=-4,
         at_most=2,
     )

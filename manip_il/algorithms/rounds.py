@@ -103,7 +103,7 @@ def record_round(
 
 
 def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere: bool) -> Rollouts:
-    """Return a round's rollouts as found on disk."""
+    """Return a round's rollouts as found on disk. queried_everywhere: whether the expert was queried in every state."""
     episodes = (read_journal(path)[1] for path in list_episodes(folder / JOURNALS))
     ends = [(len(episode), episode.success) for episode in episodes]
     dataset = folder / DATASET if (folder / DATASET).is_dir() else None

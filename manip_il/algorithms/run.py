@@ -93,7 +93,7 @@ class Run:
         rounds, path = list[Result](), self.folder / METRICS_FILE
         written = {record.get("round", record.get("iteration")) for record in read_lines(path)}
         for result in results:
-            if result.number not in written:  # else an interrupted run wrote it, with the seconds measured then
+            if result.number not in written:  # otherwise an interrupted run has written the line already
                 append_line(path, result.to_json())
             yield result
             if result.unit == "round":
@@ -141,8 +141,8 @@ class Run:
     def rollouts(self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0) -> Rollouts:
         """Record a round's episodes, successful or not, with the expert's labels in the mode `config.label`.
 
-        query: when the expert is queried; None: in every state. disturbed: share of episodes with the disturbances
-        `STANDARD`.
+        query: when the expert is queried; None: in every state. disturbed: share of the episodes that have the
+        disturbances `manip_il.sim.events.STANDARD`.
         """
         here, config, rule = self._folder(round_), self.config, query or Query()
         count = config.episodes_per_round
@@ -217,7 +217,7 @@ class Run:
     def begin(self, agent: Agent) -> Iterator[Result]:
         """Load the agent's last finished iteration and yield it; without one, yield the initial clone, if any.
 
-        So an iteration that was killed before its metrics were written still gets its line.
+        So an iteration still gets its line if the run was killed before its metrics were written.
         """
         checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
         if checkpoint is not None:

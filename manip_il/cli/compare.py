@@ -57,8 +57,8 @@ class ComparisonOptions:
 class StudyFile(ComparisonOptions):
     """Content of a study's YAML file.
 
-    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. If tasks
-    differ, nothing is compared.
+    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. Arms of
+    different tasks are not compared.
     """
 
     common: Open = field(default_factory=dict[str, Any])
@@ -134,7 +134,7 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
         first, *others = [member for arm in both for member in arm.members]
         trial = None if first.result else self._trial(self._env(both), both, self.eval.n_episodes)
         if trial is None:
-            assert Study(both, both[0].name, rule).comparisons  # raises unless they can be compared
+            _ = Study(both, both[0].name, rule).comparisons  # raises unless they can be compared
             for other in others:
                 warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
         with self.output.open(self) as folder:
@@ -154,7 +154,7 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
         return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 
     def _trial(self, env: EnvConfig, arms: Sequence[Arm], n_episodes: int) -> Trial:
-        """Return the test of these arms; raises, before any episode runs, if a policy does not fit it."""
+        """Return the test of these arms; raises, before any episode runs, if a policy does not fit the environment."""
         from manip_il.cli.inputs import check_policy
         from manip_il.evaluation.runner import Trial
 
@@ -187,7 +187,7 @@ class StudyPlan(NamedTuple):
     baseline: str | None
 
     def run(self, root: Path, engine: EngineOptions) -> None:
-        """Run missing runs, seed by seed, so that a study that is stopped early has all arms."""
+        """Run the missing runs, seed by seed, so that a study that is stopped early has runs of every arm."""
         runs = [(name, seed) for seed in range(self.file.training_seeds) for name in self.arms]
         for number, (name, seed) in enumerate(runs, start=1):
             output = ResumableOutput(root / name / f"seed_{seed}", resume=True)
@@ -200,7 +200,7 @@ class StudyPlan(NamedTuple):
 def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:
     """Return the study in `path`; raises a one-line `UsageError` if something is invalid.
 
-    training_seeds: replaces the file's. trust: option of its runs.
+    training_seeds: replaces the number in the file. trust: as `--trust` of every run.
     """
     from manip_il.evaluation.arm import require_same_env
 
@@ -223,5 +223,5 @@ def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False
         return StudyPlan(file, arms, envs, None)
     require_same_env(envs)
     if file.baseline is not None and file.baseline not in envs:
-        raise UnknownName("arm as a baseline", file.baseline, envs)
+        raise UnknownName("baseline", file.baseline, envs)
     return StudyPlan(file, arms, envs, file.baseline or next(iter(envs)))

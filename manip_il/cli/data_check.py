@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from manip_il.data.dataset import Dataset
     from manip_il.doctor.finding import Finding
 
-PROGRESS = "progress"  # scores by true progress instead of a reward
+PROGRESS = "progress"  # value of --reward: score by true progress
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class RepairOptions(CheckOptions):
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
-    """Compare joints, observations and compiled model with those of the robot and task of this version."""
+    """Compare a dataset's joints, observations and model with those of its robot and task in this version."""
     from manip_il.cli.inputs import differences
     from manip_il.data.lerobot_layout import OURS
     from manip_il.doctor.finding import Finding, warning
@@ -109,7 +109,7 @@ class ScoreOptions(OfDataset):
 
         data = read_frames(self.dataset)
         if self.reward != PROGRESS:
-            reward = LearnedReward.load(find_policy(Path(self.reward)))
+            reward = LearnedReward.load(find_policy(Path(self.reward).expanduser()))
             reward.check_fits(str(self.dataset), data.spec)
             found = reward.of_inputs(data.inputs).astype("float64").clip(0.0, 1.0)
         elif data.progress is not None:

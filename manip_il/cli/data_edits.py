@@ -85,9 +85,9 @@ class Edit(Replacing):
     def open(
         self, what: str, root: Path | None = None, pieces: int | None = None
     ) -> Generator[tuple[EditSource, EditTarget]]:
-        """Yield the dataset to read and the new dataset's locked folder, and show progress by pieces.
+        """Yield the dataset to read and the new dataset's locked folder, and show progress.
 
-        root: the dataset, by default `source`. pieces: their number, by default one per episode.
+        root: the dataset, by default `source`. pieces: number of steps of the progress, by default one per episode.
         """
         from manip_il.collect.edits import EditTarget, open_source
         from manip_il.collect.workers import default_workers

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.cli.common_options import EngineOptions
+from manip_il.cli.common_options import EngineOptions, own_files
 from manip_il.cli.dagger import DaggerOptions, run_rounds, write_page
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
@@ -41,7 +41,7 @@ class DemoOptions:
     settings: Given = given(RunConfig, prefix="", only=(*RUN, "episodes_per_round", "disturbed_share", "seed"), **RUN)
     fit: Given = given(FitConfig, prefix="", only=("policy", *FIT), **FIT)
     test_episodes: int = option(200, "unseen test episodes, which never select a policy", at_least=1)
-    disturbed_episodes: int = option(100, "test episodes that are also run disturbed", at_least=1)
+    disturbed_episodes: int = option(100, "test episodes that are also run with disturbances", at_least=1)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/demo")), prefix="")
 
@@ -69,7 +69,8 @@ class DemoOptions:
         print_table(policy_table(rows))
         say(verdict, *facts)
         say(f"report: {folder / REPORT_FILE}")
-        say(f"next: manip-il eval --policy.path={policies[-1]} --eval.films=3 --output_dir={folder}_eval")
+        policy = f"{policies[-1]}{own_files(config.env)}"
+        say(f"next: manip-il eval --policy.path={policy} --eval.films=3 --output_dir={folder}_eval")
 
     def _measure(
         self, config: RunConfig, folder: Path, engine: Engine, stages: Stages

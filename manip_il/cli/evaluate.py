@@ -176,7 +176,7 @@ class EvalOptions(Tested, Seeded, Trusting):
     def _job_of(self, result: EvalResult, file: Path) -> RolloutJob:
         """Return the rollout job of an evaluation; warn if the policy or this program has changed since.
 
-        A user's own task and mesh are given again by `--task.type` and `--task.object`.
+        A user's own task and mesh must be given again with `--task.type` and `--task.object`.
         """
         from manip_il.cli.inputs import open_driver
         from manip_il.collect.environments import env_fingerprint, env_spec
@@ -212,7 +212,7 @@ def machine() -> str:
     env = make_env()
     env.start(0)
     render.pictures(env.scene, env.data, CameraConfig(CAMERAS))
-    from OpenGL import GL  # after mujoco has chosen its platform
+    from OpenGL import GL  # imported after mujoco has set PYOPENGL_PLATFORM
 
     renderer = GL.glGetString(GL.GL_RENDERER) or b"unknown renderer"
     return f"{renderer.decode()}; cores {default_workers()}"

@@ -61,7 +61,7 @@ def check_given(config: RunConfig) -> None:
 def open_datasets(roots: Sequence[Path], *, pictures: bool, language: bool = False) -> list[Dataset]:
     """Return the datasets; raise `MismatchError` unless they agree with each other and with this program.
 
-    pictures, language: see `check_same_sources`. Warns of datasets from other versions or models than this machine's.
+    pictures, language: see `check_same_sources`. Warns if a dataset was made with other versions or another model.
     """
     datasets = [*map(Dataset.open, roots)]
     check_same_sources(roots, [one.spec for one in datasets], pictures=pictures, language=language)
@@ -71,7 +71,7 @@ def open_datasets(roots: Sequence[Path], *, pictures: bool, language: bool = Fal
 
 
 def differences(dataset: Dataset) -> list[str]:
-    """Return a line for each difference between the versions and model that made a dataset and this machine's.
+    """Return a line for each difference in versions or model between a dataset and this machine.
 
     Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm or task holds only its name,
     and is not compared.

@@ -13,7 +13,7 @@ import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 from manip_il import __version__
 from manip_il.cli import progress
@@ -97,7 +97,7 @@ _GLOBAL_HELP = """\
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return 0 (done), 1 (the work failed), 2 (invalid command line) or 130 (interrupted)."""
     given = list(sys.argv[1:] if argv is None else argv)
-    end = given.index("--") if "--" in given else len(given)  # the words after it are another program's
+    end = given.index("--") if "--" in given else len(given)  # the words after `--` are another program's
     own = [word for word in given[:end] if word not in ("--debug", "--quiet")]
     progress.set_quiet("--quiet" in given[:end])
     try:
@@ -107,11 +107,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(_clean(traceback.format_exc(), given), file=sys.stderr, end="")
         return _report(error, given)
     return 0
-
-
-def script() -> NoReturn:
-    """Run `main` and exit."""
-    sys.exit(main())
 
 
 def load(name: str) -> type:
@@ -158,7 +153,7 @@ def _report(error: BaseException, words: list[str]) -> int:
 
 
 def _is_reader_gone() -> bool:
-    """Return whether the reader of standard output, such as `head`, has ended; then let nothing be written to it."""
+    """Return whether the reader of standard output, such as `head`, has ended; if so, discard further output."""
     pipe = select.poll()
     pipe.register(sys.stdout.fileno(), 0)
     if gone := any(event & select.POLLERR for _, event in pipe.poll(0)):
@@ -167,7 +162,7 @@ def _is_reader_gone() -> bool:
 
 
 def _clean(text: str, words: list[str]) -> str:
-    """Remove control characters, and tokens, keys and passwords, which words or a library's errors may contain."""
+    """Remove control characters, and tokens, keys and passwords from the command line or a library's errors."""
     from manip_il.store.errors import redact
 
     return printable(redact(text, words))
@@ -193,7 +188,7 @@ def _group_help(group: str) -> str:
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
     """Return the help of one command: its most used options (`first`), or all with `--help=all`.
 
-    words: the command line: `--policy.type=act` also lists the options of that policy.
+    words: the command line; with `--policy.type=act` the options of that policy are listed, too.
     """
     options = options_of(cls)
     first = () if "--help=all" in words else getattr(cls, "first", "").split()
@@ -235,4 +230,4 @@ def _row(option: Option) -> tuple[str, str]:
 
 
 if __name__ == "__main__":
-    script()
+    sys.exit(main())

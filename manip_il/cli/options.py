@@ -49,7 +49,8 @@ class Option:
 
     path: attributes and keys from the command's options to its value. metadata: `help`, one line; `positional` for a
     value without a name; `command_line_only` for an option that no file may set; `exists` for a path to read: its
-    prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`.
+    prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free` and `grows` for an option
+    that a resumed run may change (see `check_same_options`).
     """
 
     name: str  # dotted: `dataset.root`
@@ -84,11 +85,11 @@ class Option:
         """Return the option's value in a command's options."""
         for key in self.path:
             options = options.get(key, self.default) if isinstance(options, dict) else getattr(options, key)
-        return {} if self.is_open and options in (None, MISSING) else options
+        return options
 
 
 def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()) -> list[Option]:
-    """Return all options of a dataclass, groups expanded, shared options last. base: instance with the defaults."""
+    """Return all options of a dataclass, groups expanded, shared options last. base: an instance with the defaults."""
     found: list[Option] = []
     for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
         inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
@@ -114,7 +115,7 @@ def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
 
 
 def type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
-    """Return the type of a dataclass's field; other fields may have types that are only imported for type checks."""
+    """Return the type of one field of a dataclass. Other fields' types may be imported only for type checking."""
     home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
     return eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
 
@@ -176,7 +177,7 @@ def decode(option_type: Any, value: Any) -> Any:
 
     Unlike draccus, refuses a boolean as a number or text, NaN as a number, and "" as a path (the current folder).
     """
-    import draccus  # imported here because help needs no YAML
+    import draccus  # imported here because help does not need it
 
     some = without_none(option_type)
     if option_type is Any:

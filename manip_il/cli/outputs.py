@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.tables import Table
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
-# Files that identify a folder of ours. Any LeRobot dataset has meta/info.json; only ours has both actions.
+# File -> text in it that identifies this program's output: only our datasets have an `executed_action`.
 _MARKS = {CONFIG_FILE: CONFIG_HEADER, "meta/info.json": '"executed_action"', "eval.json": '"fingerprint"'}
 
 
@@ -86,7 +86,7 @@ def prepare_output(
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
     if resume:
-        for left in folder.rglob(f".*{PARTIAL}"):  # partial files of a killed writer; folders have locks
+        for left in folder.rglob(f".*{PARTIAL}"):  # files of a killed writer; `new_folder` clears partial folders
             if left.is_file():
                 left.unlink()
     elif folder.exists():

@@ -33,7 +33,7 @@ from manip_il.option import check_bound
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
 _MOST_OFFERED = 3  # names that an error suggests
-_FORMER = {  # options of older files, ignored with these values
+_FORMER = {  # former options, ignored in a file if they have these values
     "task.reward": "",
     "ppo.gae_lambda": 0.95,
     "ppo.clip_range": 0.2,
@@ -54,7 +54,7 @@ class _Value(NamedTuple):
 def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
     """Read options from the command line; `UsageError` for an unknown name, or an invalid or missing value.
 
-    command: its name, for error messages.
+    command: the command's name, for error messages.
     """
     known = {option.name: option for option in options_of(cls)}
     file = Option(CONFIG_PATH, (), Path, None, {})
@@ -70,7 +70,7 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
 
 
 def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: dict[str, _Value] | None = None) -> T:
-    """Read options from trees that YAML gave; later trees override earlier ones, and `words` override all.
+    """Read options from trees read from YAML; later trees override earlier ones, and `words` override all.
 
     layers: pairs of a tree's origin, for error messages, and the tree. Raises `UsageError` as `parse` does.
     """
@@ -83,7 +83,7 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: dict[
         if option.is_open:
             held = values.setdefault(option.path, dict(option.default))
             held[name.removeprefix(f"{option.name}.")] = _decode(one)
-        elif one.value is not None or without_none(option.type) is not option.type:  # else null: the default is used
+        elif one.value is not None or without_none(option.type) is not option.type:  # other nulls mean the default
             values[option.path] = _decode(one)
     for option in known.values():
         if option.default is MISSING and option.path not in values:
@@ -172,7 +172,7 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
 
 
 def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, path: tuple[str, ...] = ()) -> Any:
-    """Return an instance of `cls`. values: by path; others are those of `base`, else the defaults."""
+    """Return an instance of `cls`. values: those given, by path; other fields are as in `base`, else the defaults."""
     arguments: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
         here, kind, default = (*path, field.name), type_of(cls, field), default_of(field, base)
@@ -182,7 +182,7 @@ def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, pa
         elif dataclasses.is_dataclass(kind):
             arguments[field.name] = _build(kind, values, None if default is MISSING else default, here)
         else:
-            arguments[field.name] = values.get(here, {} if default is MISSING else default)
+            arguments[field.name] = values.get(here, default)
     return cls(**arguments)
 
 
@@ -203,7 +203,7 @@ def _decode(one: _Value) -> Any:
 def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
     """Return the error for an unknown option or key, with the nearest names and the command that lists all.
 
-    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or the file's key. dashes: prefix of the names.
+    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`. dashes: prefix of the names.
     """
     named = [one.label.replace("--", dashes) for one in known.values() if not one.positional]
     near = nearest(dashes + name, named, _MOST_OFFERED)

@@ -7,7 +7,6 @@ import signal
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from manip_il.errors import ManipError, UsageError, printable
@@ -46,7 +45,7 @@ def warn(*lines: str) -> None:
 
 
 def _print(line: str, file: TextIO) -> None:
-    from tqdm import tqdm  # imported here because help needs none
+    from tqdm import tqdm  # imported here because help does not need it
 
     tqdm.write(line, file)  # above a bar, if there is one
     file.flush()
@@ -90,9 +89,7 @@ class Stages:
         self._handlers = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.close()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
@@ -114,7 +111,7 @@ class Stages:
         self.check()
         how: dict[str, Any] = {"dynamic_ncols": True} if sys.stderr.isatty() else _PLAIN
         self._bar = tqdm(total=total, desc=description, disable=_quiet or total == 0, **how)
-        self._bar.delay = 0.0  # it only kept `tqdm` from writing a line at once
+        self._bar.delay = 0.0  # only its constructor must not write a line
         self._solved = 0
 
     def close(self) -> None:
@@ -125,7 +122,7 @@ class Stages:
             self._bar = None
 
     def step(self, n: int = 1, **fields: float) -> None:
-        """Count `n` finished steps. fields: shown beside the bar (loss=0.12, success=0.9) until others are."""
+        """Count `n` finished steps. fields: shown beside the bar (loss=0.12, success=0.9) until replaced."""
         if self._bar is not None:
             if fields:
                 self._bar.set_postfix(fields, refresh=False)
@@ -138,7 +135,7 @@ class Stages:
         self.step(success=self._solved / (self._bar.n + 1) if self._bar is not None else 0.0)
 
     def log(self, record: dict[str, Any]) -> None:
-        """Show that a fit or a run has reached a step, with its metrics. record: {} if there are none."""
+        """Show that a fit or run has reached a step. record: `step` and metrics, or {} if there are none."""
         if record and self._bar is not None:
             shown = {name: record[name] for name in ("loss", "success", "kl") if name in record}
             self.step(record["step"] - self._bar.n, **shown)

@@ -110,7 +110,7 @@ class CertifyOptions(Seeded):
     example: ClassVar[str] = "manip-il robot certify --task.type=stack --output_dir=runs/certificate"
     first: ClassVar[str] = "robot.type task.type cases output_dir"
     env: Given = given(EnvConfig)
-    cases: int = option(500, "episodes of each kind", at_least=1, at_most=1_000_000)
+    cases: int = option(500, "episodes for each kind of perturbation", at_least=1, at_most=1_000_000)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: Output = group(Output(Path("runs/certificate")), prefix="")
 

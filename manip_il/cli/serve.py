@@ -44,9 +44,9 @@ class ServeOptions(Varied, Trusting):
 
         leader, policy = self.session.get("leader", LEADERS[0]), None
         if leader not in LEADERS:
-            if not Path(leader).exists():
+            if not (path := Path(leader).expanduser()).exists():
                 raise UnknownName("leader", leader, (*LEADERS, "the folder of a policy"))
-            policy = find_policy(Path(leader))
+            policy = find_policy(path)
         if leader == "sliders" and not has_display():
             raise UsageError("--leader=sliders needs a window: a DISPLAY")
         env, _, seen = open_driver(policy, "expert", self.env, trust=self.trust)

@@ -31,7 +31,7 @@ class WatchedPolicyGroup:
 
     path: Path | None = option(None, "a checkpoint or a run")
     type: Literal["expert", "random", "sliders"] | None = option(
-        None, "instead of a checkpoint, by default expert; sliders: those of the window"
+        None, "instead of a checkpoint, by default expert; sliders: you, with the sliders of the window"
     )
 
 
@@ -39,9 +39,9 @@ class WatchedPolicyGroup:
 class ViewOptions(Tested, Seeded, Trusting):
     """Watch a robot at its task in MuJoCo's viewer; without a display, in a browser (Rerun) or from a file.
 
-    Episodes run in real time until there are --n_episodes, the window is closed or Ctrl-C is pressed. The browser shows
-    pictures, joints, actions, phase and progress. --output writes these as fast as possible to a file, which `rerun
-    FILE.rrd` opens on any machine.
+    Episodes run in real time until --n_episodes have ended, the window is closed or Ctrl-C is pressed. The browser
+    shows pictures, joints, actions, phase and progress. --output writes these as fast as possible to a file, which
+    `rerun FILE.rrd` opens on any machine.
     """
 
     example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
@@ -64,10 +64,12 @@ class ViewOptions(Tested, Seeded, Trusting):
         from manip_il.tasks.stock.table import ROBOTS as STOCK
 
         in_window, sliders = self.output is None and has_display(), self.policy.type == "sliders"
-        if sliders and not in_window:
-            raise UsageError("--policy.type=sliders needs a window: a DISPLAY, and no --output")
         env, driver, cameras = open_driver(self.policy.path, self.policy.type or "expert", self.env, trust=self.trust)
         in_window = in_window and env.robot not in STOCK
+        if sliders and not in_window:
+            raise UsageError(
+                "--policy.type=sliders needs a window: a DISPLAY, no --output, and a robot that is not stock"
+            )
         if cameras is None and not in_window:  # for people to watch; shadows only in files, which may take longer
             cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if self.output else Look())
         if sliders and not self.env.get("horizon"):

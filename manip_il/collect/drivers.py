@@ -1,7 +1,7 @@
 """Drivers of rollouts: the expert, the expert with noise, a policy, a mixture of policy and expert, random actions.
 
-A driver is a small picklable object that a job sends to its worker. There `start` returns a function from the turns of
-a step to each turn's action (n,) and actor.
+A driver is a small picklable object that a job sends to its worker. There `start` returns a function that maps the
+turns of a step to an action (n,) and an actor for each turn.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class PolicyDriver(Driver):
 
 
 def driver_of(name: str | None) -> Driver:
-    """Return the driver named `expert` or `random`; the expert for None."""
+    """Return the random driver for `random`, else the expert."""
     return RandomDriver() if name == "random" else ExpertDriver()
 
 

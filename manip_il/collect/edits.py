@@ -1,6 +1,7 @@
 """Make a new dataset from the stored states of another, with new labels, pictures or scenes.
 
-All three edits process the source in pieces, in local processes, and write a dataset that appears when it is complete.
+The edits `relabel`, `render` and `redraw` process the source in pieces, in local processes, and write a dataset that
+appears when it is complete.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
 
     robot, task: files of the user's own robot and task. shape: the object's, if it is a mesh. Raises `ManipError` if
     the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or object, and what
-    `make_config` raises for one that is not built in.
+    `make_config` raises for a robot, task or object that is not built in.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -70,7 +71,7 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
     for what in ("robot", "task", "object"):
         if getattr(given, what) != getattr(spec, what):
             raise MismatchError(what, str(root), getattr(spec, what), "the given one", getattr(given, what))
-    lacks = given.sim_state_size - spec.sim_state_size  # older states do not hold all draws
+    lacks = given.sim_state_size - spec.sim_state_size  # states of older versions lack the last draws
     if lacks not in (0, *OLDER):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", given.sim_state_size)
     here, there = env_fingerprint(env), dataset.fingerprint
@@ -138,9 +139,9 @@ def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget
 
 
 def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> Info:
-    """Write a dataset of new scenes of a dataset's states, in which each frame or branch is an episode.
+    """Write a dataset of new scenes made from the states of `source`; each frame or branch is an episode.
 
-    The same seed gives the same scenes, and a larger number of frames begins with the same ones. Raises
+    The same seed gives the same scenes; with more frames, the first scenes are the same. Raises
     `NothingToLearnError` if no scene has a valid label.
     """
     columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
@@ -168,7 +169,7 @@ def _write[T](
     work: Callable[[T], list[Episode]],
     pieces: Iterable[T],
 ) -> Info:
-    """Write the episodes that workers make of each piece, in order."""
+    """Write the episodes that workers make from each piece, in order."""
 
     def episodes() -> Iterator[Episode]:
         empty = True
@@ -230,7 +231,7 @@ def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> 
 
 
 def _leads(source: EditSource, columns: Columns) -> NDArray[np.float64]:
-    """Return labels minus the expert's actions, (T, n): their lead for sagging servos (`serve --log=`), else 0."""
+    """Return recorded labels minus the expert's, (T, n): the servos' sag if `serve --log=` recorded them, else 0."""
     action = columns[schema.ACTION].astype(np.float64)
     if source.dataset.provenance.get("driver") != SERVED:
         return np.zeros_like(action)

@@ -32,7 +32,6 @@ from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
 from manip_il.tasks.stock.envs import check_cameras, described_stock, make_stock, make_stock_expert
 from manip_il.tasks.stock.table import ROBOTS as STOCK
-from manip_il.tasks.stock.table import get_stock
 from manip_il.tasks.table import TASKS, get_task, is_task, source_hash
 
 
@@ -64,7 +63,8 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
     check_cameras(config.robot, cameras)
     pictures: dict[str, Any] = {"cameras": cameras.names, "image_size": cameras.size} if cameras else {}
     if config.robot in STOCK:
-        stock, robot = get_stock(config.task, config.robot), STOCK[config.robot]
+        robot = STOCK[config.robot]
+        stock = robot.tasks[config.task]
         return RobotTaskSpec(
             robot=config.robot,
             task=stock.name,
@@ -115,7 +115,7 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
     if config.robot not in STOCK:
         task = get_task(config.task, config.object)
         settings["task"], _, argument = task.name.partition(":")
-        settings |= {"reward": argument} if argument else {}  # its name when only carry had an argument
+        settings |= {"reward": argument} if argument else {}  # the key in older fingerprints, which only carry had
         own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
         mesh = Shape.parse(config.object).mesh if config.object else None
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})

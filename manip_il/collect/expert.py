@@ -18,7 +18,7 @@ F64 = NDArray[np.float64]
 
 FALLEN = -0.05  # an object below this height has left the table [m]
 NO_PROGRESS = 0.995  # a step that leaves more than this share of the error makes no progress
-NEAR = 0.03  # distance of the hand below which lack of progress is accepted [m]
+NEAR = 0.03  # distance of the hand from its target below which lack of progress is accepted [m]
 
 
 class Expert:
@@ -85,7 +85,7 @@ class Expert:
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
     def _step(self, q: F64, position: F64, rotation: F64, target: Target) -> tuple[F64, float] | None:
-        """Return a joint step [rad] and the remaining share of the error; `exact` corrects the target by the miss."""
+        """Return a joint step [rad], for an `exact` target corrected by its miss, and the error's remaining share."""
         ik, most = self._ik, self._scene.robot.max_joint_step
         first = ik.step(position, rotation, most, target.lean)
         if first is None or not target.exact:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # torch is imported only if a learner drives
     from manip_il.learn.policy import LearnedPolicy
 
 LOCKSTEP = 25  # environments that share one call of the policy
-OWN_MODELS = 8  # largest number if each needs its own model, which is 26 MB for the Panda
+OWN_MODELS = 8  # the same if each environment needs its own model, which is 26 MB for the Panda
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class RolloutJob:
         return min(self.batch, OWN_MODELS) if varies or self.env.robot in STOCK else self.batch
 
     def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:
-        """Return an episode's frames as columns, with the labels, takeover or branches of `label`."""
+        """Return an episode from its frames, with the labels, takeover or branches that `label` asks for."""
         beta, expert = self.driver.beta, make_expert(self.env)
         if self.label == "last":
             return to_episode(frames, self.round, beta, labelled=False)
@@ -104,7 +104,7 @@ def run_steps(
     policies = tuple(_load(job, path, envs[0]) for path in job.driver.policies)
     setting = Setting(env_actions(job.env), job.env.horizon, policies)
     takeover = job.label == "takeover"
-    horizon = (2 if takeover else 1) * job.env.horizon  # one horizon each for learner and expert
+    horizon = (2 if takeover else 1) * job.env.horizon  # a takeover gives the expert a horizon of its own
     rules = Rules(horizon, job.hold, job.patience, takeover)
     gate = gate_of(job.label, job.query, setting)
     return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)

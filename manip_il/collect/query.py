@@ -2,7 +2,7 @@
 
 A rule is written `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`. `rollout` applies it in every
 step to the learner's actions; the expert is queried for labels nowhere else. Differences between actions are measured
-in longest steps (in the largest dimension), so that a bound has the same meaning for every robot.
+as multiples of each dimension's longest step, and the largest counts, so that a bound means the same for every robot.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _every(bound: float, setting: Setting) -> Gate:
 def _one(bound: float, setting: Setting) -> Gate:
     """Query once per episode, at a uniformly drawn step (with one episode per round: Stagger, Li & Zhang 2025).
 
-    For a takeover it is drawn from the horizon, so there is none if the episode ends earlier.
+    For a takeover the step is drawn from the horizon, so an episode that ends earlier has no query.
     """
     return lambda turns, actions: [turn.step == drawn_step(turn.seed, setting.horizon) for turn in turns]
 
@@ -130,7 +130,7 @@ def parse_query(text: str) -> Query:
 
 
 def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
-    """Return when a rollout queries the expert; for `one` that is after it (`labelled`), unless it takes over."""
+    """Return when a rollout queries the expert; for `one` without takeover never, as `labelled` does so afterwards."""
     if label == "last":
         return lambda turns, actions: [turn.step == setting.horizon - 1 for turn in turns]
     if query.kind == "one" and label != "takeover":

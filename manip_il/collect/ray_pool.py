@@ -44,7 +44,7 @@ _DEATHS = (
 
 
 class RayPool:
-    """Runs up to `workers` tasks at once, one core each; by default one per core of the cluster.
+    """Runs up to `workers` tasks at once, one core each; None for one task per core of the cluster.
 
     Raises `ManipError` if no cluster can be reached or started.
     """
@@ -116,7 +116,7 @@ def run_there(
     mesh: Files | None,
     *policies: Files,
 ) -> bytes:
-    """Return the packed result of a task on a node. Raises `ManipError` if the node has another version."""
+    """Run seeds on a node; return episodes and journal contents, packed. Raises `ManipError` for another version."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")

@@ -1,4 +1,4 @@
-"""Record episodes: run the seeds without a journal, and write each journal as soon as its episode ends."""
+"""Record episodes: run the seeds that have no journal yet, and write each journal as soon as its episode ends."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_TRIES = 3  # most tries, as a multiple of the requested successes
 
 
 def journal_of(journals: Path, job: RolloutJob) -> Journal:
-    """Return the journals' folder for a job's episodes."""
+    """Return the journal folder of a job, with its spec and fingerprint."""
     return Journal(journals, env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras))
 
 

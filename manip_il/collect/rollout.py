@@ -1,7 +1,7 @@
 """The only loop that steps environments, as a generator of transitions.
 
 Environments run in lockstep, so that a learner acts in all of them in one batch. Recording, labelling and evaluation
-consume its transitions instead of being branches inside it. Only `_choose` queries the expert.
+consume its transitions and are not branches inside it. Only `_choose` queries the expert.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from manip_il.tasks.stock.aloha.environment import AlohaEnv
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time
-GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares of new goals, of moved objects, and of these near the hand
+GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares: new goals, moved objects, moved objects placed near the hand
 _UNTOUCHED = 0.04  # least distance of an untouched object's centre from the hand [m]
 _AROUND = 0.04  # standard deviation of an object's place near the hand, in x and y [m]
 _DEEP = 1e-3  # largest overlap of a moved object with another [m]
@@ -40,7 +40,7 @@ _TRIES = 5  # scenes drawn for a state, before it is kept as visited
 class Scenes:
     """How scenes are drawn from a dataset's states, and their cameras, None for scenes without pictures.
 
-    anew: also draw goals and objects, not only looks. conditions: those that the looks are drawn from.
+    anew: whether to also draw goals and objects, not only looks. conditions: what the looks are drawn from.
     branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
     of the first scene in the random stream, so that several datasets of one seed have different scenes.
     """
@@ -61,8 +61,8 @@ class Scenes:
     def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
         """Yield the first number, the visited states and their leads of each `CHUNK` of scenes.
 
-        states: rows of `sim_state` (S, m), used in turn, in an order drawn from the seed. leads: added to the labels of
-        each, (S, n).
+        states: rows of `sim_state` (S, m), used in turn, in an order drawn from the seed. leads: added to the label of
+        each state, (S, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
         for at in range(0, self.frames, CHUNK):
@@ -81,7 +81,8 @@ class SceneDrawer:
     def frames(self, visited: State, number: int, seed: int, lead: F64 | float = 0.0) -> list[Transition]:
         """Return the scene of one visited state: one labelled frame, or those of a branch; [] without a valid label.
 
-        number: scene number in the random stream. seed: value of the column. lead: added to a lone frame's label, (n,).
+        number: scene number in the random stream. seed: value of the `seed` column. lead: added to a lone frame's
+        label, (n,).
         """
         rng = rng_for(number, "redraw")
         visited = self._with_look(replace(visited, streak=0, ever=False), number)

@@ -28,7 +28,7 @@ from manip_il.mdp import Episode
 if TYPE_CHECKING:
     from manip_il.collect.ray_pool import RayPool
 
-MOST_DEATHS = 3  # consecutive left-out seeds that end the work
+MOST_DEATHS = 3  # the run fails if so many seeds in a row kill their worker
 Backend = Literal["local", "ray"]
 Seeds = tuple[int, ...]
 Pool = Union["LocalPool", "RayPool"]
@@ -96,14 +96,14 @@ class Engine:
     ) -> Iterator[list[Episode]]:
         """Yield the tasks' results; seeds of a worker that died run again, one by one."""
         tasks, running = split(job, seeds, pool.count), dict[Future[list[Episode]], Seeds]()
-        failed = 0  # consecutive seeds given up
+        failed = 0  # seeds given up in a row
         while tasks or running:
             while tasks and len(running) < pool.count:
                 task = tasks.popleft()
                 running[pool.submit(job, task, journal)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             if any(isinstance(future.exception(), BrokenExecutor) for future in done):
-                done, _ = wait(running)  # so that each lost seed runs alone
+                done, _ = wait(running)  # all others end first, so that each lost seed runs alone
             lost: list[int] = []
             for future in done:
                 task = running.pop(future)
@@ -152,7 +152,8 @@ class LocalPool:
 def map_in_order[T, R](function: Callable[[T], R], items: Iterable[T], workers: int) -> Generator[tuple[T, R]]:
     """Yield each item with its result, in order; at most `workers` + 1 of them are in memory.
 
-    With one worker this process does the work, else both are pickled. Raises `ManipError` if a worker dies.
+    With one worker this process does the work, else items and results are pickled. Raises `ManipError` if a worker
+    dies.
     """
     if workers == 1:
         yield from ((item, function(item)) for item in items)

@@ -21,7 +21,7 @@ _WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # never 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Generator[None]:
-    """Raise `ManipError` naming the file, or else `path`, if the disk is full or read-only."""
+    """Raise `ManipError` if the disk is full or read-only, naming the error's file, or `path` if it names none."""
     try:
         yield
     except OSError as error:  # errors of Arrow and FFmpeg are OSErrors, too
@@ -34,8 +34,8 @@ def writing(path: Path) -> Generator[None]:
 def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     """Yield an empty sibling of `root` to write into; at the end, sync it to disk and rename it to `root`.
 
-    An exception removes the sibling; the next writer removes what a killed one left. Raises `FolderExistsError` if
-    `root` is not empty, at the beginning or end; with `replace` the old folder is removed once the new one is complete.
+    An exception removes the sibling; the next writer removes one left by a killed process. Raises `FolderExistsError`
+    if `root` is not empty (checked at the beginning and end), unless `replace`: then the new folder takes its place.
     Raises `ManipError` if the disk is full or read-only, or if another process writes the same folder.
     """
     root = root.absolute()
@@ -62,7 +62,7 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
 
 @contextlib.contextmanager
 def exclusive(folder: Path) -> Generator[int]:
-    """Lock `folder`, which need not exist, for this process; yield it, opened.
+    """Lock `folder` for this process, creating it if it does not exist; yield its file descriptor.
 
     The kernel releases the locks of a killed process. Raises `ManipError` if another process holds the lock.
     """
@@ -90,12 +90,12 @@ def clear(folder: Path) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write `content` as `write_file` does."""
+    """Write `content` to `path` as JSON, atomically as `write_file` does."""
     write_file(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write `data` to `path` atomically, and make its folder.
+    """Write `data` to `path` atomically, creating its folder.
 
     Raises `ManipError` if the disk is full or read-only.
     """

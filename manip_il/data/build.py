@@ -36,7 +36,7 @@ Rollouts = Iterable[tuple[Journal, Episode]]
 
 @dataclass(frozen=True)
 class Recording:
-    """How rollouts become a dataset: `recording.json` in the folder of their journals.
+    """Settings for making a dataset from rollouts, stored as `recording.json` in the folder of their journals.
 
     A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes. only_labelled:
     leave out episodes without a valid label. episodes: number of episodes to keep, in seed order; None: all. labels:
@@ -58,7 +58,7 @@ class Recording:
 
     @classmethod
     def read(cls, journals: Path) -> Recording:
-        """Return the folder's recording, or one that keeps every episode."""
+        """Return the settings in `recording.json`; if it is missing, settings that keep every episode."""
         path = journals / RECORDING
         if not path.is_file():
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
@@ -70,10 +70,10 @@ class Recording:
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
         """Write rollouts in seed order as a dataset; return its info and the number of failed episodes left out.
 
-        Every rollout is consumed, even if the dataset is full. The dataset's environment is that of the first; another
-        fingerprint is logged as a warning. The selection depends on the rollouts alone, so that recording directly and
-        building later give the same bytes. Raises what `write_dataset` raises, `MismatchError` for a rollout of another
-        robot, task or cameras, `NothingToLearnError` if there is no episode.
+        Every rollout is consumed, even after a limit is reached. Spec and fingerprint are the first rollout's; if
+        another fingerprint differs, a warning is logged. The selection depends on the rollouts alone, so that recording
+        directly and building later give the same bytes. Raises what `write_dataset` raises, `MismatchError` for a
+        rollout of another robot, task or cameras, `NothingToLearnError` if there is no episode.
         """
         rollouts = iter(rollouts)
         if (first := next(rollouts, None)) is None:
@@ -116,7 +116,6 @@ class Recording:
         return write_dataset(selected(), root, about.spec, provenance, replace=replace, **options), failed
 
     def _is_full(self, episodes: int, labels: int) -> bool:
-        """Whether a limit on episodes or labels is reached."""
         limits = (self.episodes, episodes), (self.labels, labels)
         return any(most is not None and found >= most for most, found in limits)
 
@@ -155,8 +154,8 @@ def merge_datasets(
 ) -> Info:
     """Merge several datasets, in order, into one; equal to `write_dataset` of all their episodes.
 
-    The fingerprint is the first dataset's; if they differ, a warning is logged. The new provenance is the given one
-    with the sources and their provenance. Films are copied. Raises `MismatchError` naming both sides if the specs
+    The fingerprint is the first dataset's; if another differs, a warning is logged. The names and provenance of the
+    sources are added to `provenance`. Video files are copied. Raises `MismatchError` naming both sides if the specs
     differ.
     """
     opened = [Dataset.open(source) for source in roots]
@@ -176,10 +175,10 @@ def merge_datasets(
 def rewrite_columns(
     dataset: Dataset, target: Path, columns: Iterable[Columns], provenance: Mapping[str, Any], **options: Any
 ) -> Info:
-    """Write a dataset to `target` with some columns replaced; films are copied.
+    """Write a dataset to `target` with some columns replaced; video files are copied.
 
     columns: for every episode in stored order, name -> (T,) or (T, d). options: those of `write_dataset`. Raises what
-    it raises, `ManipError` if columns and episodes differ in length.
+    `write_dataset` raises, `ManipError` if a column and its episode differ in length.
     """
 
     def changed() -> Iterator[tuple[Episode, Films | None]]:
@@ -191,7 +190,7 @@ def rewrite_columns(
 
 
 def _with_films(dataset: Dataset) -> Iterator[tuple[Episode, Films | None]]:
-    """Yield the episodes of a dataset; pictures in films are not decoded but passed on as `Films`."""
+    """Yield the episodes of a dataset; pictures in video files are not decoded but passed on as `Films`."""
     films = bool(dataset.spec.cameras and dataset.spec.video)
     for number, episode in enumerate(dataset.read_episodes(pictures=not films)):
         yield episode, (dataset, number) if films else None

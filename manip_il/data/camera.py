@@ -1,4 +1,4 @@
-"""The pictures of one camera of a LeRobot v3.0 dataset, in films or data files, decoded on reading.
+"""The pictures of one camera of a LeRobot v3.0 dataset, in video or data files, decoded on reading.
 
 All pictures of datasets are opened here, and only as MP4, PNG or JPEG. By default FFmpeg detects the format from the
 content: a playlist named `.mp4` would make it open other files and URLs. Pillow passes some formats to other programs
@@ -36,17 +36,17 @@ I64 = NDArray[np.int64]
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
 _PIECE_BYTES = 32 * 1024 * 1024  # size of the pictures that a thread decodes at once
-_PIECE = 32  # least number of these, because decoding starts at the key frame before them
+_PIECE = 32  # least number of pictures decoded at once, because decoding starts at the key frame before them
 _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # no tracks in other files
 }
-_OPEN_FILMS, _OPEN_TABLES = 32, 4  # files that one process keeps open
+_OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps open
 
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Frames `first` to `first + count - 1` of a file, which are rows `row` and following of the dataset."""
+    """Frames `first` to `first + count - 1` of a file: the dataset's rows `row` to `row + count - 1`."""
 
     path: str
     first: int
@@ -56,9 +56,9 @@ class FrameRange:
 
 @dataclass(frozen=True)
 class Camera:
-    """Pictures of one camera. size: height and width; parts: in row order, together every frame once.
+    """Pictures of one camera. size: height and width [pixels]. parts: ranges that hold every row once, in order.
 
-    films: whether pictures are in video files; else they are cells of the data files.
+    films: whether pictures are in video files; otherwise they are cells of the data files.
     """
 
     root: Path
@@ -90,7 +90,7 @@ class Camera:
         return cls(root, key, info.fps, info.frames, feature.picture_size, films, tuple(parts))
 
     def rows(self, rows: I64) -> Pictures:
-        """Return the decoded pictures of these rows (B,), (B, height, width, 3).
+        """Return the decoded pictures, (B, height, width, 3), of these rows, (B,).
 
         Raises `ManipError` if one is missing, `MismatchError` if one has another size.
         """
@@ -183,18 +183,17 @@ def read_frames(container: InputContainer, first: int, count: int, fps: float) -
 
 @lru_cache(_OPEN_FILMS)
 def _film(path: Path, changed: int, thread: int) -> InputContainer:
-    """Open a file for one thread, cached because opening takes longer than decoding an episode."""
+    """Open a video, cached by file, its time of change and thread: opening takes longer than decoding an episode."""
     return open_video(path)
 
 
 @lru_cache(_OPEN_TABLES)
 def _table(path: Path, changed: int, key: str) -> Any:
-    """Return a file's pictures as stored."""
+    """Return the column of pictures of a data file, not decoded."""
     return read_file(path, [key]).column(key)
 
 
 def _film_parts(episodes: EpisodeTable, info: Info, key: str) -> list[FrameRange]:
-    """Return the frames of every episode."""
     clips = episodes.clips[key]
     firsts = np.round(clips.starts * info.fps).astype(np.int64)
     rows = zip(clips.files, firsts.tolist(), episodes.length.tolist(), episodes.start.tolist(), strict=True)

@@ -104,8 +104,8 @@ class Dataset:
         """The dataset's spec.
 
         For datasets of other programs, and after LeRobot's tools have dropped our file, it is derived from LeRobot's
-        files, with task `unknown` and without missing columns and cameras. Raises `ManipError` for a dataset without
-        actions.
+        files: the task is `unknown`, and there are no cameras if their sizes differ. Raises `ManipError` for a dataset
+        without actions.
         """
         if self.own is not None:
             one = len(self.tasks) == 1  # otherwise episodes have different instructions
@@ -197,11 +197,11 @@ class Dataset:
         return Camera.of(self.root, self.info, self.episodes, self.data_files, key)
 
     def frames(self, key: str, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a camera's decoded pictures of these rows (B,), (B, height, width, 3)."""
+        """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
         return self.camera(key).rows(rows)
 
     def clip(self, key: str, episode: int) -> tuple[Path, int, int]:
-        """Return the location of a camera's pictures of an episode: film, first frame, and number of frames."""
+        """Return where a camera's pictures of an episode are: video file, first frame in it, number of frames."""
         clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)
         first = round(float(clips.starts[place]) * self.fps)
         return self.root / clips.files[place], first, int(self.episodes.length[place])

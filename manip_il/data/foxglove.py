@@ -1,4 +1,4 @@
-"""Channels of messages that Foxglove shows without settings, one message per frame, and decoding of their pictures.
+"""Messages that Foxglove shows without settings, one per frame and topic; decoding of their pictures.
 
 Schemas: Foxglove's own in protobuf (`JointStates`, `RawImage`, `Log`), LeRobot's scalars in JSON.
 Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd, which exploits the
@@ -34,7 +34,7 @@ Times = Sequence[int]  # [ns], one per frame
 Messages = Iterator[Message | str]  # one per frame, of one class; JSON texts are scalars
 
 NANOSECONDS = 1_000_000_000
-IMAGE_TOPICS = "/observation/images/"  # prefix of a camera's name, as in LeRobot
+IMAGE_TOPICS = "/observation/images/"  # precedes a camera's name, as in LeRobot
 _JOINT_TOPICS = {"/joint_states": s.STATE, "/action": s.ACTION, "/executed_action": s.EXECUTED_ACTION}
 _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 
@@ -127,7 +127,7 @@ def _register_scalars(writer: Writer) -> int:
 def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8]:
     """Return the pictures that `images` wrote, by camera; a camera without pictures is left out.
 
-    chunks: a file's, in order. shape: shape of each camera's pictures, (T, height, width, 3).
+    chunks: those of one file, in order. shape: shape of each camera's pictures, (T, height, width, 3).
     """
     pictures: dict[str, U8] = {}
     cameras: dict[int, str] = {}  # by the id of their channel

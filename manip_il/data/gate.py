@@ -1,8 +1,7 @@
 """The gate for untrusted datasets: every file is opened once in a child process with limited memory and time.
 
-Other readers take a column's type from the parquet file's metadata, decode its content accordingly (audio, PDF, any
-format that Pillow knows), and follow the `path`, even a URL, of a picture's cell without bytes. Such files are
-refused.
+Other readers decode a column as the parquet file's metadata says (audio, PDF, any format that Pillow knows), and open
+the `path`, even a URL, of a picture's cell that has no bytes. Files that would make a reader do this are refused.
 """
 
 from __future__ import annotations
@@ -82,7 +81,7 @@ def _is_picture(column: pa.Field, pictures: Collection[str]) -> bool:
 
 
 def _check_types(schema: pa.Schema, pictures: int) -> None:
-    """Raise `ValueError` if readers would decode a column other than `pictures` columns of images."""
+    """Raise `ValueError` if readers would decode more than `pictures` columns, or one that is not of images."""
     about = (schema.metadata or {}).get(b"huggingface", b"").decode(errors="replace")
     decoded = [name for name in re.findall(r'"_type"\s*:\s*"(.*?)"', about) if name not in _PLAIN]
     if decoded != ["Image"] * len(decoded) or len(decoded) > pictures:

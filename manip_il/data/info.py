@@ -23,7 +23,7 @@ INDEX_FEATURES = (*layout.INDEX_DTYPES,)
 
 # allows only LeRobot's placeholders (`str.format` would also read attributes) and paths inside the dataset
 _TEMPLATE = re.compile(r"(?!/)(?!.*\.\.)(?:[^{}]|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
-_MOST = 2**53  # frames or episodes
+_MOST = 2**53  # highest accepted number of frames or episodes
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Feature:
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """Height and width [pixels], located by the names; without names they come first."""
+        """Height and width [pixels], found by `names`; without names, the first two sizes of `shape`."""
         names = cast(list[Any], self.names) if isinstance(self.names, list) else []
         if "height" in names and "width" in names and len(names) == len(self.shape):
             return self.shape[names.index("height")], self.shape[names.index("width")]
@@ -66,7 +66,7 @@ class Feature:
 
 @dataclass(frozen=True)
 class Info:
-    """Content of `meta/info.json`."""
+    """Content of `meta/info.json`. fps: [Hz]. episodes, frames, tasks: how many there are."""
 
     fps: float
     features: dict[str, Feature]
@@ -83,7 +83,7 @@ class Info:
 
 @contextmanager
 def reading(path: Path) -> Generator[None]:
-    """Turn every error raised while a file is read into a one-line `ManipError` that names it."""
+    """Turn every error raised while a file is read into a one-line `ManipError` that names the file."""
     try:
         yield
     except Exception as error:  # libraries raise anything, depending on the file

@@ -21,8 +21,8 @@ _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # fro
 class JoinedDatasets:
     """Several datasets; frames are numbered in the given order.
 
-    features: LeRobot's table of the columns and cameras that all have with the same shape, without depth. stats: over
-    all frames; for cameras those of ImageNet, as in `lerobot-train`. tasks: each text once.
+    features: LeRobot's table of the columns and cameras that every dataset has, with equal shapes and without depth.
+    stats: over all frames; cameras have ImageNet's mean and std, as in `lerobot-train`. tasks: each text once.
     """
 
     def __init__(self, datasets: Sequence[Dataset]):
@@ -41,7 +41,7 @@ class JoinedDatasets:
         self.tasks = list(dict.fromkeys(text for one in self.datasets for text in one.tasks.values()))
 
     def joint_tasks(self, own: I64) -> I64:
-        """Return the index in `tasks` of every frame, (N,), given the `task_index` in its own dataset, (N,).
+        """Return every frame's index in `tasks`, (N,), given its `task_index` in its own dataset, (N,).
 
         Raises `ManipError` for an index without a text.
         """

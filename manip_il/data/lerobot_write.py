@@ -34,7 +34,7 @@ _GROUP_ROWS = 1_000  # frames per row group
 _GROUP_EPISODES = 100  # episodes per row group of meta/episodes
 _FORMAT = 1  # version of meta/manip_il.json
 Columns = Mapping[str, NDArray[Any]]
-Films = tuple[Dataset, int]  # a dataset, and the number of its episode with the same pictures, in films
+Films = tuple[Dataset, int]  # a dataset whose video files have the pictures, and the index of the episode in it
 
 
 def write_dataset(
@@ -51,9 +51,10 @@ def write_dataset(
     """Write the episodes, in order, as a dataset with our columns; return its `info.json`.
 
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
-    give the same bytes, videos included. Films of an episode are copied. provenance: the episodes' origin, read after
-    the last one. replace: as in `new_folder`. Before taking an episode, raises `FolderExistsError` if `root` is not
-    empty; then what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
+    give the same bytes, videos included. An episode with `Films` has no pictures: the video files are copied.
+    provenance: the episodes' origin, read after the last one. replace: as in `new_folder`. Before taking an episode,
+    raises `FolderExistsError` if `root` is not empty; then what `ordered_columns` raises, and `ManipError` if there are
+    no episodes or the disk is full.
     """
     about = features(spec), spec.fps, spec.lerobot_type, video
     with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about)) as writer:
@@ -71,7 +72,7 @@ def write_dataset(
 class TableWriter:
     """Writes a LeRobot dataset with any features into a folder, episode by episode.
 
-    features: the dataset's own columns and cameras.
+    features: columns and cameras, without LeRobot's index columns, which are added.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class TableWriter:
         self._data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)
         self._meta = ParquetFiles(folder, layout.EPISODES_PATH)
         self._rows: list[dict[str, Any]] = []
-        self._row_schema: pa.Schema | None = None  # that of the first rows
+        self._row_schema: pa.Schema | None = None  # schema of the first rows written
         films = [key for key, feature in features.items() if feature["dtype"] == "video"]
         self.films = {key: CameraFiles(folder, key, video, int(fps)) for key in films}
         self._pooled: Statistics = {}
@@ -103,7 +104,7 @@ class TableWriter:
     ) -> None:
         """Append an episode. columns: (T,) or (T, ...), pictures (T, height, width, 3). tasks: text of every frame.
 
-        drawn: random draws, as JSON. films: the source of copied pictures. Raises what writing raises.
+        drawn: random draws, as JSON. films: videos to copy if `columns` has no pictures. Raises what writing raises.
         """
         numbers = np.array([self._tasks.setdefault(text, len(self._tasks)) for text in tasks], np.int64)
         columns = {**columns, **self._index_columns(numbers)}
@@ -145,7 +146,7 @@ class TableWriter:
         self.frames += len(numbers)
 
     def close_files(self) -> None:
-        """Write `info.json`, tasks and statistics, and close all files. Raises `ManipError` without episodes."""
+        """Write `info.json`, tasks and statistics, and close all files. Raises `ManipError` if no episode was added."""
         if not self.episodes:
             raise ManipError("there are no episodes to write")
         self._write_rows()

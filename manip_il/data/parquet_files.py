@@ -141,7 +141,7 @@ def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
         return values.reshape(len(column), *feature.shape if is_vector else ())
     except (TypeError, ValueError) as error:
         what = f"{feature.dtype} of shape {list(feature.shape)}"
-        raise ValueError(f"{feature.key!r} has no {what} in each of {len(column):,} rows: {error}") from error
+        raise ValueError(f"{feature.key!r} does not hold {what} in each of {len(column):,} rows: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class VideoSpans:
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """Columns with one entry per episode. drawn: random draws by episode index."""
+    """Columns with one entry per episode. start, stop: rows, stop excluded. drawn: random draws by episode index."""
 
     index: I64
     length: I64

@@ -35,7 +35,7 @@ OWN_OBJECT = "the task's own"  # meaning of an empty object name
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
 SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as in LeRobot's recorder
 JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
-GRIPPERS = {TWO_ARMS: (6, 13)}  # meaning -> indices of the grippers in state and action; otherwise the last
+GRIPPERS = {TWO_ARMS: (6, 13)}  # action meaning -> indices of the grippers in state and action; by default the last
 LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, if it differs
 VERSION = 2  # version of the columns and their meaning: 2 has progress, complete states and named phases
 MOST_FPS = 10_000  # highest control rate [Hz]
@@ -65,7 +65,7 @@ class RobotTaskSpec:
     object: str = ""  # shape and size of the object that the task moves; empty for the task's own
     robot_type: str = ""  # LeRobot's name of the robot; empty if it is `robot`
     video: bool = True  # whether pictures are in video files; otherwise they are PNGs in the data files
-    keypoints: tuple[str, ...] = ()  # points of the scene with columns of their image coordinates, for every camera
+    keypoints: tuple[str, ...] = ()  # points of the scene whose image coordinates are columns, for every camera
     schema: int = VERSION
 
     def __post_init__(self) -> None:

@@ -25,7 +25,7 @@ _LEVELS = np.arange(256)  # pixel values
 
 
 def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
-    """Return {column: {min, max, mean, std, count, q01, ...}} of numbers or booleans (T,) or (T, d), (d,) each."""
+    """Return {column: {min, max, mean, std, count, q01, ...}}, (d,) each, of numbers or booleans, (T,) or (T, d)."""
     statistics: Statistics = {}
     for key, values in columns.items():
         rows = np.array(values.reshape(len(values), -1).T, np.float64, order="C")

@@ -52,7 +52,7 @@ class CameraFiles:
         self._copied: dict[tuple[Dataset, Path], tuple[int, int]] = {}  # chunk and file index
 
     def copy(self, dataset: Dataset, episode: int) -> VideoSpan:
-        """Copy a dataset's film, once, and return the place of an episode in it."""
+        """Copy the video file that holds an episode, unless already copied; return the episode's place in it."""
         source, first, frames = dataset.clip(self._key, episode)
         if (dataset, source) not in self._copied:
             self.close()

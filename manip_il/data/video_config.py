@@ -21,7 +21,7 @@ class VideoConfig:
 
     vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
     pix_fmt: str = option("yuv420p", "pixel format")
-    g: int | None = option(2, "frames between key frames")  # the cost of reading a single frame
+    g: int | None = option(2, "frames between key frames")  # most frames that are decoded to read one
     crf: float | None = option(None, "quality; lower is better, with larger files; by default 23, for libsvtav1 30")
     preset: int | str | None = option(None, "the codec's speed preset; by default ultrafast, for libsvtav1 12")
 

@@ -23,7 +23,7 @@ from manip_il.doctor.finding import Finding, journals_of, list_first, of_episode
 _AXES = (["height", "width", "channels"], ["height", "width", "channel"], ["channels", "height", "width"])
 _TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # relative, because LeRobot computes in float32
 _TEMPORARY = re.compile(r"\..*\.tmp|.*\.(partial|incomplete|ffconcat)|tmp[a-z0-9_]{8}|images|\.cache")
-_LATE = 1e-4  # largest distance of a frame from its row in time that LeRobot's reader accepts [s]
+_LATE = 1e-4  # largest difference in time between a video frame and its row that LeRobot's reader accepts [s]
 
 
 def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
@@ -58,7 +58,7 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
-    """Check that episodes are numbered from 0 and contiguous, and rows belong to them, with times at the frame rate."""
+    """Check that episodes are contiguous and numbered from 0, and that rows match them and have times at the rate."""
     table, tasks, info = dataset.episodes, dataset.tasks, dataset.info
     ends = np.cumsum(table.length)
     frame = np.concatenate([np.arange(length) for length in table.length])
@@ -117,7 +117,7 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
 
 
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:
-    """Return how statistics differ from those of a column (N, n), or of a matrix along its last axis."""
+    """Return how stored statistics differ from a column's (N, n), or a matrix's along its last axis; "" if equal."""
     flat = values if stored["mean"].size == values.shape[1] else values.reshape(-1, feature.shape[-1])
     for name, share in _TOLERANCES.items():
         tolerance = share * np.abs(flat).max(axis=0) + 1e-9

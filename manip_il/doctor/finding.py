@@ -33,7 +33,7 @@ warning = partial(Finding, is_error=False)
 
 
 class NotWhole(ManipError):
-    """The dataset has errors; the message is the verdict."""
+    """Raised if a dataset has errors; the message is the verdict."""
 
 
 def journals_of(root: Path) -> Path:
@@ -42,7 +42,7 @@ def journals_of(root: Path) -> Path:
 
 
 def mend(root: Path, finding: Finding) -> str:
-    """Return the remedy: repair from journals or the dataset's own data, or else a new copy."""
+    """Return the remedy: to repair from journals or the dataset's own data, or else to get a new copy."""
     if journals_of(root).is_dir() or not finding.is_error or finding.place.startswith((INFO, STATS)):
         return f"repair it: manip-il data repair {root}"
     return "there are no journals to repair it from: pull or record it again"

@@ -119,7 +119,8 @@ def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
 def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_], arm: Mask) -> Iterator[Finding]:
     """Find commands that are never reached, mostly of the gripper, and arm commands that are clipped at a limit.
 
-    Actions and joints have the same units, or a joint follows by a small share. Rest at the ends is not clipping.
+    A joint that moves by a small share of its command but correlates with it has other units: no finding. Nor is an
+    episode that starts or ends at a limit clipped.
     """
     for name, told, found, is_arm in zip(names, action.T, state.T, arm, strict=True):
         (low, high), (below, above) = np.quantile(told, [0.01, 0.99]), np.quantile(found, [0.01, 0.99])
@@ -161,14 +162,14 @@ def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
-    """Check some pictures of every episode: size, black or frozen pictures, and swapped cameras."""
-    table, _ = dataset.episodes, dataset.data_files  # an error here is reported once
+    """Check some pictures of up to `_EPISODES` episodes: black or frozen ones, and swapped cameras."""
+    table, _ = dataset.episodes, dataset.data_files  # raises as in other checks, so that an error is reported once
     chosen = np.flatnonzero(table.length > 1)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(_EPISODES, len(chosen))).astype(int)]
     rows = np.linspace(table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1)
     cameras = [key for key in dataset.cameras if dataset.features[key].is_rgb and len(rows)]
     seen = {key: np.stack([_thumbnails(dataset.frames(key, one)) for one in rows]) for key in cameras}
-    moved = np.zeros((len(rows), _PICTURES - 1), bool)  # a tenth of a joint's range between pictures
+    moved = np.zeros((len(rows), _PICTURES - 1), bool)  # whether a joint moves by a tenth of its range in between
     if seen and s.STATE in dataset.features:
         state = dataset.columns([s.STATE])[s.STATE].reshape(len(dataset), -1).astype(np.float64)
         moved = (np.abs(np.diff(state[rows], axis=1)) > 0.1 * np.maximum(np.ptp(state, axis=0), 1e-9)).any(axis=2)
@@ -190,7 +191,7 @@ def _thumbnails(pictures: NDArray[np.uint8]) -> F64:
 
 
 def _find_swapped(left: F64, right: F64) -> Mask:
-    """Return the episodes, (E,), in which each of two cameras looks like the other one in most episodes."""
+    """Return the episodes, (E,), in which each of two cameras shows what the other one shows in most episodes."""
     pictures = np.stack([left.mean(axis=1), right.mean(axis=1)])
     typical = np.median(pictures, axis=1, keepdims=True)
     straight, crossed = (np.abs(pictures - one).mean(axis=(2, 3, 4)).sum(axis=0) for one in (typical, typical[::-1]))

@@ -129,7 +129,7 @@ def require_pair(left: Arm, right: Arm) -> None:
 
 
 def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
-    """Return the environment that all share, given by name. Raises `MismatchError` naming the first difference."""
+    """Return the environment that all share. envs: by arm or run. Raises `MismatchError` for the first difference."""
     (first, env), *others = envs.items()
     for name, other in others:
         require_equal(first, env, name, other, *(field.name for field in fields(env)))
@@ -153,5 +153,5 @@ def read_member(path: Path) -> Member:
 
 
 def _round_folder(run: Path, one: Round) -> Path:
-    """Return the folder, with its `eval.json`, of a run's round or of an iteration that was validated."""
+    """Return the folder of a run's round or validated iteration; it has the `eval.json` of its validation."""
     return run / "validation" / f"{one.round:06d}" if one.unit == "iteration" else run / f"round_{one.round:03d}"

@@ -138,7 +138,7 @@ def certify(
     """Measure the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
 
     The step of a perturbation is drawn uniformly from those that the undisturbed run takes until the task is solved;
-    the expert then has a whole horizon. on_episode: called with every episode as it ends.
+    from that step on, the expert has a whole horizon. on_episode: called with every episode as it ends.
     """
     seeds = stream_seeds("certificate", cases, seed)
 

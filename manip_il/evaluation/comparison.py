@@ -34,7 +34,7 @@ class Comparison:
     """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
 
     results: (left, right) for each training seed; episodes that only one of them ran do not count. Raises
-    `MismatchError` if robot, task or settings differ, `ManipError` if two share no episode.
+    `MismatchError` if robot, task or settings differ, `ManipError` if left and right share no episode.
     """
 
     left: str
@@ -88,7 +88,7 @@ class Comparison:
 
     @cached_property
     def p_value(self) -> float:
-        """Exact two-sided p over test episodes, each summed over training seeds; McNemar's if there is only one.
+        """Exact two-sided p over test episodes, each summed over training seeds; McNemar's for a single seed.
 
         It holds for these trained policies; `interval` also covers other training seeds.
         """
@@ -139,8 +139,8 @@ class Comparison:
 class Study:
     """Tested arms with the same training seeds, and what they cost.
 
-    baseline: the arm that the others are compared with; None for arms of different tasks. rule: chose each run's round.
-    target: validation success for which the cost is reported.
+    baseline: the arm that the others are compared with; None for arms of different tasks. rule: how each run's round
+    was chosen. target: validation success for which the cost is reported.
     """
 
     arms: tuple[Arm, ...]

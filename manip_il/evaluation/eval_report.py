@@ -73,7 +73,7 @@ def compare_report(study: Study, title: str, command: str, config: Mapping[str, 
     results, *costs = (replace(table, colours=of_arms) for table in study.tables)
     bars = [Bar(arm.name, tuple(one.test.success for one in arm.members), colours[arm.name]) for arm in study.arms]
     same = "the same " if study.baseline is not None else ""
-    note = f"Every policy ran {same}{first.success.n:,} test episodes, which were used for no choice."
+    note = f"Every policy ran {same}{first.success.n:,} test episodes, which were not used to select a policy."
     note += disturbed_note(first)
     if len(bars[0].successes) > 1:
         note += " In brackets and as dots: each training seed; the bar is their mean."

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-# Import this first: it chooses the OpenGL backend before mujoco is imported.
-import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.collect.edits import render_states
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
@@ -48,7 +46,7 @@ def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str
 
 
 def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film], str]:
-    """Return the films, made one by one; without OpenGL, none and the reason, which is also logged."""
+    """Return the films and ""; without off-screen OpenGL, [] and the reason, which is also logged."""
     films: list[Film] = []
     try:
         for film in made:

@@ -81,7 +81,7 @@ class EvalSettings:
 
     horizon: int
     tolerance: float
-    control_hz: int = 20  # this and the next: values for files without them
+    control_hz: int = 20  # this and the following have defaults for older files, which lack them
     success_steps: int = 5
     suite: str = NOMINAL.name
     conditions: tuple[Condition, ...] = (NOMINAL,)
@@ -144,7 +144,7 @@ class EvalResult:
         if len(seeds) != len(self.episodes):
             raise ManipError(
                 f"evaluation of {self.policy}: {len(self.episodes)} episodes on {len(seeds)} seeds; "
-                "every episode needs its own seed, those of parts by --eval.first="
+                "every episode needs its own seed; give each part another --eval.first"
             )
 
     @property
@@ -247,7 +247,7 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
         known = one.policy_sha256 or other.policy_sha256  # otherwise only the names show whether the policy is the same
         require_comparable(first, one, name, other, "policy_sha256" if known else "policy")
     if stopped := next((name for name, part in parts.items() if part.until_width is not None), None):
-        raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes merge")
+        raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes are merged")
     episodes = [episode for part in parts.values() for episode in part.episodes]
     return replace(one, episodes=tuple(sorted(episodes, key=lambda episode: episode.seed)))
 

@@ -44,7 +44,7 @@ History = tuple[Round, ...]
 
 
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
-    """Return a run's rounds in order from the lines of its `metrics.jsonl`. Raises `ManipError` for other lines.
+    """Return a run's rounds in order from the lines of its `metrics.jsonl`. Raises `ManipError` for invalid lines.
 
     For `manip-il rl gail`, `airl` and `ppo`, the rounds are the iterations that were validated.
     """
@@ -100,7 +100,7 @@ class Rule:
             rounds = tuple(one for one in rounds if one.amount(self.at) <= self.limit)
             if not rounds:
                 reached, most = format_amount(self.at, first), format_amount(self.at, self.limit)
-                raise UsageError(f"--at={self.at}: the first round of {name} ended at {reached}, another run at {most}")
+                raise UsageError(f"--at={self.at}: the first round of {name} ends at {reached}, another run has {most}")
         if self.checkpoint == "last":
             return rounds[-1]
         return max(rounds, key=lambda one: (one.validation.rate, one.round))
@@ -109,7 +109,7 @@ class Rule:
     def fact(self) -> str:
         """A sentence that states the rule."""
         which = "last round" if self.checkpoint == "last" else "round that was best on validation"
-        words = f"Of each run the {which} was tested, chosen before the test"
+        words = f"The {which} of each run was tested, chosen before the test"
         if self.at == "end" or self.limit is None:
             return f"{words}."
         return f"{words} among those within {format_amount(self.at, self.limit)}, which every run reached."

@@ -41,7 +41,7 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
 def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
     """Return one condition merged from the names in `--vary`, which every episode samples; empty without names.
 
-    Raises `UnknownName` for another name, `UsageError` for a file without a YAML of ranges or without effect here.
+    Raises `UnknownName` for another name, `UsageError` for a file that is no YAML of ranges, or if none has an effect.
     """
     if not names:
         return ()

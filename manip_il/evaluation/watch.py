@@ -1,4 +1,4 @@
-"""Episodes as they happen: in a window, whose sliders may drive the robot, or in Rerun, live or from a file."""
+"""Episodes as they happen: in a window, whose sliders may drive the robot, or in Rerun, live or written to a file."""
 
 from __future__ import annotations
 

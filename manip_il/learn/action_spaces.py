@@ -7,27 +7,28 @@ commanded opening, as in datasets and environments), and (p, R) = FK(q) the posi
     joint_delta    y = (q* - q, w*)
     ee_delta       y = (p* - p, log(R* R^T), 0 ..., w*)      with (p*, R*) = FK(q*)
 
-`joint_target` and `joint_delta` are lossless. The opening is absolute in all three: it is a command, not a motion. Two
-arms have two openings, each the last number of its arm.
+`joint_target` and `joint_delta` are lossless. The opening is absolute in all three: it is a command, not a motion. With
+two arms there are two openings, each the last number of its arm.
 
 `ee_delta` is a translation [m] and a rotation vector [rad] in the world frame, not the hand's: objects and goals are
-observed in the world frame, so that "towards it" is the same numbers for any orientation of the hand, and stock
-environments (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It has as many numbers as the robot's
-action, so that the network has the environment's shape; those between the six and the opening are 0 and are not read.
-Six numbers need an arm with at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R)
-(`ArmIK.moved`). It recovers the pose up to rounding, but not the joints: an arm with seven joints has an elbow motion
-that leaves the hand in place, which six numbers do not encode. As in the expert, the pull to the home posture
-determines it. A pose out of reach is approached.
+observed in the world frame, so that a motion towards an object has the same numbers for any orientation of the hand,
+and stock environments (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It is as long as the robot's
+action, so that the network's output fits the environment; the numbers between the first six and the opening are 0 and
+are ignored. The arm needs at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R)
+(`ArmIK.moved`). It recovers the pose up to rounding, but not the joints: an arm with seven joints can move its elbow
+without moving the hand, which six numbers do not encode. As in the expert, a posture task that pulls towards the home
+posture determines the elbow. If the pose is out of reach, the hand approaches it.
 
-The measured state is the frame's own: an action of a plan is converted at the step in which it is executed, with the
-joints measured then, so that plans of many actions (ACT's chunks, diffusion's horizons) are also converted exactly.
-Policies that learn plans see, for each frame of the window, the target minus the state of that frame.
+Each action is relative to the state measured at its own step: an action of a plan is converted at the step in which it
+is executed, so that plans of many actions (ACT's chunks, diffusion's horizons) are also converted exactly. Policies
+that learn plans are trained, for each frame of the window, on the target minus the state of that frame.
 
-Robots whose YAML has `lerobot` use degrees and 0 to 100 in s and a; the motion of their hand is also in [m] and [rad].
+Robots whose YAML has `lerobot` use degrees and 0 to 100 in s and a, but [m] and [rad] for the motion of the hand.
 
-`mlp` and `cnn` learn `joint_delta` by default, inside the network (`MLPNetwork`), which has the measured joints as
-inputs anyway and so is exported whole; `joint_target` is the same network without the sum. All other conversions are
-in the checkpoint's processors (`action_steps`): both deltas for LeRobot's policies, and `ee_delta` for every policy.
+`mlp` and `cnn` learn `joint_delta` by default. The network (`MLPNetwork`), which has the measured joints as inputs
+anyway, adds them itself, so that an exported network needs no conversion; for `joint_target` it adds nothing. All other
+conversions are in the checkpoint's processors (`action_steps`): both deltas for LeRobot's policies, and `ee_delta` for
+every policy.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ if TYPE_CHECKING:  # importing inverse kinematics takes a second
     from manip_il.robots.ik import ArmIK
     from manip_il.robots.robot import Robot
 
-LAST = (-1,)  # the gripper of a single arm
-_ARM = slice(None, -1)  # its joints, in state and action
+LAST = (-1,)  # index of the gripper's opening, for a single arm
+_ARM = slice(None, -1)  # joints of a single arm, in state and action
 _POSITION, _ROTATION, _POSE = slice(0, 3), slice(3, 6), 6
 Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
@@ -60,7 +61,7 @@ Numbers = TypeVar("Numbers", bound=np.floating[Any])
 class Conversion:
     """Converts actions to the targets of a space and back, row by row.
 
-    robot: the arm, for `ee_delta` only. grippers: indices of the numbers that are absolute in `joint_delta`, too.
+    robot: the arm, for `ee_delta` only. grippers: indices of the gripper openings, which are absolute in `joint_delta`.
 
     Raises `UnknownName` for an unknown robot, `UsageError` for an arm with fewer joints than a pose has numbers.
     """
@@ -73,15 +74,14 @@ class Conversion:
         if self.space != EE_DELTA:
             return
         if self.robot not in ROBOTS:  # paths are refused too: the name may come from a downloaded checkpoint
-            hint = f"{EE_DELTA} needs its kinematics; known: {', '.join(ROBOTS)}"
-            raise UnknownName("robot", self.robot, ROBOTS, hint)
+            raise UnknownName(f"robot for {EE_DELTA}:", self.robot, ROBOTS)
         if (joints := len(self._robot.joints)) < _POSE:
             raise UsageError(
                 f"{EE_DELTA} needs an arm with at least {_POSE} joints; {self.robot} has {joints}; use {JOINT_DELTA}"
             )
 
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return targets (N, n) for actions (N, n), joint targets and openings, relative to joint states (N, n)."""
+        """Return targets (N, n) for actions (N, n) (joint targets and openings) and measured joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return actions
         targets = actions.copy()
@@ -97,7 +97,7 @@ class Conversion:
         return targets
 
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return joint targets [rad] and openings [m] (N, n) for targets (N, n), relative to joint states (N, n)."""
+        """Return actions (N, n) (joint targets and openings) for targets (N, n) and measured joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return targets
         actions = targets.copy()
@@ -127,10 +127,10 @@ class Conversion:
 
 
 def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = None) -> Conversion:
-    """Return the conversion of a space for data of `spec`. start: the checkpoint that a fit continues from, if any.
+    """Return the conversion to a space for data of `spec`. start: the checkpoint that a fit continues from, if any.
 
-    Raises `MismatchError` naming both sides if the data's actions are not joint targets of a known robot with these
-    joints, in so far as the space needs that, and what `Conversion` raises.
+    Raises `MismatchError` naming both sides if the space is not `joint_target` and the data's actions are not joint
+    targets, or if it is `ee_delta` and the data's joint names are not the robot's, and what `Conversion` raises.
     """
     grippers = start.grippers if start is not None else GRIPPERS.get(spec.action_meaning, LAST)
     found = Conversion(space, spec.robot if space == EE_DELTA else "", grippers)

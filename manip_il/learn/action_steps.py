@@ -2,8 +2,8 @@
 
 `MeasuredJointsStep`, in the preprocessor, stores the measured joints of an observation; `JointTargetsStep`, at the end
 of the postprocessor, uses them to convert the policy's output to joint targets. A checkpoint with both works wherever
-LeRobot calls each once per step, as lerobot-eval does. LeRobot connects the two on loading, as it does its own steps
-of this kind. Ours derive from LeRobot's steps, which convert a whole plan relative to the joints at its start.
+LeRobot calls each once per step, as lerobot-eval does. They derive from LeRobot's own pair of steps, which converts a
+whole plan relative to the joints at its start; therefore LeRobot connects the two when it loads them.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _NORMALISER = "normalizer_processor"
 class MeasuredJointsStep(RelativeActionsProcessorStep):
     """Stores the raw joint state (B, n) of an observation; changes nothing.
 
-    converted: whether the actions that come with observations are converted already, as in training.
+    converted: whether actions that come with observations are already converted, as in our training.
     """
 
     converted: bool = False
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the same transition. Raises `ManipError` if it has an action from a dataset."""
+        """Return the same transition. Raises `ManipError` if it has an action that is not converted yet."""
         if transition.get(TransitionKey.ACTION) is not None and not self.converted:
             raise ManipError(
                 "this policy learns converted actions, which the dataset does not have; continue with "
@@ -65,11 +65,11 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
     grippers: tuple[int, ...] = LAST
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the transition with joint targets. Raises `ManipError` unless the output is that of one step."""
+        """Return the transition with joint targets. Raises `ManipError` unless the output is for a single step."""
         targets = transition.get(TransitionKey.ACTION)
         states = self.relative_step.get_cached_state() if self.relative_step is not None else None
         if not isinstance(targets, torch.Tensor) or states is None or targets.shape != states.shape:
-            given = f"{tuple(getattr(targets, 'shape', ()))} of {None if states is None else tuple(states.shape)}"
+            given = f"{tuple(getattr(targets, 'shape', ()))} and {None if states is None else tuple(states.shape)}"
             raise ManipError(
                 f"{self.action_space}: an action is converted with the joints measured at its own step; expected the "
                 f"output of one step and its observation, both (B, n), not {given}"

@@ -14,14 +14,14 @@ class PPOConfig:
     lr: float | None = option(
         None,
         "initial learning rate of actor and critic, which falls linearly to a twentieth; by default 5e-4, or 2e-4 "
-        "for a clone",
+        "with --init",
         at_least=1e-9,
         at_most=1,
     )
     epochs: int = option(10, "passes over an iteration's steps", at_least=1)
     minibatches: int = option(4, "gradient steps per pass", at_least=1)
     gamma: float | None = option(
-        None, "discount per control step; by default 0.9, or 0.97 for a clone", at_least=0, at_most=1
+        None, "discount per control step; by default 0.9, or 0.97 with --init", at_least=0, at_most=1
     )
 
     def __post_init__(self) -> None:

@@ -79,7 +79,7 @@ class Augment:
     def __call__(self, pictures: Tensor, generator: torch.Generator) -> Tensor:
         """Return pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that shape in [0, 1].
 
-        One draw per sample, from a generator on the CPU; it is the same for all T.
+        Crop and colours are drawn once per sample, the same for all T, from a generator on the CPU.
         """
         flat = pictures.flatten(0, -4)
         changed = torch.empty(flat.shape, dtype=torch.float32, device=flat.device)
@@ -98,7 +98,7 @@ class Augment:
 def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
     """Crop pictures (B, 3, H, W), padded by `shift` pixels, starting at row and column `moves` (B, 2)."""
     height, width = pictures.shape[-2:]
-    # pad bytes, before they become floats of four times the size; torch's own padding takes no bytes on a GPU
+    # pad bytes, which are a quarter of the size of floats; torch's own padding does not accept bytes on a GPU
     left, right = (side.expand(-1, -1, -1, shift) for side in (pictures[..., :1], pictures[..., -1:]))
     wide = torch.cat([left, pictures, right], dim=3)
     above, below = (side.expand(-1, -1, shift, -1) for side in (wide[..., :1, :], wide[..., -1:, :]))

@@ -30,7 +30,7 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
-_MLP_SHAPE = (  # what is the same in another mlp of this architecture
+_MLP_SHAPE = (  # options that define an mlp's architecture
     *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled", "grippers"),
 )
 
@@ -40,8 +40,8 @@ class Origin:
     """Robot, task and data that a policy was trained for, and the options of its fit; `manip_il.json`.
 
     observation: one of `OBSERVATIONS`. cameras, image_size: those of its training pictures, if any; look: the lighting
-    of these, as arguments of `sim.look.Look`, None if unknown. datasets: name, frames and weight of each. action_space:
-    the space that it learnt in, None for a checkpoint from before there was a choice.
+    of these pictures, as arguments of `sim.look.Look`, None if unknown. datasets: name, frames and weight of each.
+    action_space: the space that it learnt in, None for a checkpoint older than this field.
     """
 
     robot: str
@@ -117,9 +117,9 @@ def read_origin(path: Path) -> Origin | None:
 class Checkpoint:
     """A policy on disk. path: its `pretrained_model` folder. config: its `config.json`.
 
-    numbers: column -> size; pictures: camera -> (height, width) [pixels]; action: size of the action. space: the action
-    space that it learnt in; robot: the arm, for `ee_delta` only; grippers: see `Conversion`. origin: None if another
-    program wrote it. processors: file -> steps, each with `registry_name` and `config`.
+    numbers: numeric input column -> size; pictures: camera -> (height, width) [pixels]; action: size of the action.
+    space: the action space that it learnt in; robot: the arm, for `ee_delta` only; grippers: see `Conversion`. origin:
+    None if another program wrote the folder. processors: file -> steps, each with `registry_name` and `config`.
     """
 
     path: Path
@@ -137,7 +137,7 @@ class Checkpoint:
     def open(cls, path: Path) -> Checkpoint:
         """Read and check the files of a folder, except its weights.
 
-        Raises `ManipError` if the folder is incomplete or names code to import by its path.
+        Raises `ManipError` if the folder is incomplete or gives a processor's step by an import path.
         """
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
@@ -175,10 +175,10 @@ class Checkpoint:
 
     @property
     def cameras(self) -> CameraConfig | None:
-        """Cameras, size and lighting of its training pictures; None if it takes no pictures.
+        """Cameras, picture size and lighting as in training; None if the policy takes no pictures.
 
-        The lighting is the default if the checkpoint does not say. Raises `UsageError` for cameras that environments do
-        not have, and for an invalid size.
+        The lighting is the default if the checkpoint has none. Raises `UsageError` for cameras that environments
+        do not have, and for an invalid size.
         """
         if not self.pictures:
             return None
@@ -196,7 +196,7 @@ class Checkpoint:
         return {"type": MLP, **kept, "sigma": self.config.get("sigma", 0.0)}
 
     def check_fits(self, spec: RobotTaskSpec) -> None:
-        """Raise `MismatchError` naming both unless environments of `spec` have every input and take the action."""
+        """Raise `MismatchError` naming both sides unless environments of `spec` have all inputs and take the action."""
         if self.origin is not None:
             self.origin.check_fits(spec)
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
@@ -232,7 +232,7 @@ def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ..
 def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str, tuple[int, ...]]:
     """Return action space, robot and grippers: from the configuration of mlp and cnn, or the postprocessor's step.
 
-    Older checkpoints, which do not name the grippers, took the last number alone to be one.
+    Older checkpoints do not name the grippers; in these, only the last number counts as one.
     """
     options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
     own = config["type"] in OWN_SPACE
@@ -258,8 +258,8 @@ def require_trust(
 ) -> None:
     """Raise `ManipError`, naming what would be loaded, unless a policy loads nothing by name or `trust` is given.
 
-    settings: its options with `type`, as in `config.json`. source: where these come from, for the message. steps: those
-    of its processors.
+    settings: the policy's options with `type`, as in `config.json`. source: where they come from, for the message.
+    steps: those of its processors.
     """
     kind, named = settings["type"], list[Any]()
     if kind not in PLAIN or settings.get("vision_encoder_name"):

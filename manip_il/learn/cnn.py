@@ -34,10 +34,10 @@ NUMBERS = 4  # numbers per keypoint: x, y, spread, strength
 STRIDE = 4  # distance between cells of the heat maps [pixels]
 _LIGHT, _COLOUR = 4.0, 16.0  # pictures vary far more in brightness than in colour; these scales equalise them
 _SHARPNESS = 3.0  # gain before the softmax
-_SPREAD, _STRENGTH = 4.0, 0.3  # scale both to about -2 to 2
-DRAWS = 16  # noisy true states per picture, with `states`
-MOST_NOISE = 2.0  # their largest noise, as a multiple of the prediction's mean error in training
-_MEMORY = 0.99  # share of that mean error kept from step to step
+_SPREAD, _STRENGTH = 4.0, 0.3  # scale spread and strength to about -2 to 2
+DRAWS = 16  # noisy true states per row of a batch, if `states` is given
+MOST_NOISE = 2.0  # largest noise of these states, as a multiple of the prediction's mean error in training
+_MEMORY = 0.99  # weight of the previous value in the running mean of that error
 
 
 @PreTrainedConfig.register_subclass("cnn")
@@ -45,20 +45,20 @@ _MEMORY = 0.99  # share of that mean error kept from step to step
 class CNNConfig(MLPConfig):
     """Keypoints of every camera, found by a small convolutional network, and the mlp's perceptron on top.
 
-    channels: those of the encoder's layers; the first two halve the picture, the rest keep its size. keypoints: number
-    per camera. aux_weight: weight, in training, of the mean absolute error, in standard deviations, of a perceptron
-    that predicts `observation.environment_state` from joints and keypoints, if the dataset has that column and it is
-    not an input. The action is predicted from that prediction as well as from joints and keypoints; the true state is
+    channels: number in each convolutional layer; the first two layers halve the picture's sides, the others keep them.
+    keypoints: number per camera. aux_weight: if the dataset has `observation.environment_state` and it is not an input,
+    a second perceptron predicts it from joints and keypoints; this is the weight of its loss, the mean absolute error
+    in standard deviations. The action is predicted from joints, keypoints and this predicted state; the true state is
     never used to act. scales: as in the mlp, for the offsets in the predicted state, or in the true one if it is an
-    input; scaled: their columns there. heatmap_weight: weight, in training, of the cross-entropy [nats] between heat
-    maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a keypoint
-    of its own in addition to the others; 0: off. states: a dataset without pictures. The action is then predicted from
-    joints and predicted state alone, by the mlp's network, which learns from the true state, there and in the frames
-    with pictures, with noise of the size of the prediction's error (the "independent" concept bottleneck of Koh et al.,
-    ICML 2020). All other options are the mlp's.
+    input; scaled: columns of these offsets in that state. heatmap_weight: weight of the cross-entropy [nats] between
+    heat maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a
+    keypoint of its own in addition to `keypoints`; 0: off. states: a dataset without pictures. If given, the mlp's
+    network predicts the action from joints and predicted state alone. It is trained on the true states of this dataset
+    and of the frames with pictures, plus noise of the size of the prediction's error (the "independent" concept
+    bottleneck of Koh et al., ICML 2020). All other options are the mlp's.
 
-    `use_amp` runs the convolutions in half precision while training, if the processor has bfloat16: twice as fast.
-    Acting is always in single precision.
+    `use_amp` runs the convolutions in half precision while training, if the processor has bfloat16, which is twice as
+    fast. Acting is always in single precision.
 
     Raises what `MLPConfig` raises, and `UsageError` for sizes and weights out of range.
     """
@@ -67,7 +67,7 @@ class CNNConfig(MLPConfig):
     keypoints: int = option(32, "keypoints per camera", at_least=1)
     aux_weight: float = option(0.5, "weight of the loss of the predicted state", at_least=0)
     heatmap_weight: float = option(0.0, "weight of the loss of the heat maps", at_least=0)
-    states: str = option("", "dataset of states from which to learn to act on joints and predicted state alone")
+    states: str = option("", "dataset of states; the policy then acts on joints and predicted state alone")
     privileged_size: int = 0  # size of the predicted state; taken from the dataset
     named_points: int = 0  # number of points with a heat map; taken from the dataset
 
@@ -106,8 +106,8 @@ class CNNPolicy(MLPPolicy):
     """LeRobot's policy interface to one `KeypointEncoder` per camera and an `MLPNetwork` on joints and keypoints.
 
     Batches hold the columns of the mlp's (`observation.environment_state` only if it is an input) and
-    `observation.images.<camera>` (B, 3, H, W), from 0 to 1, which are averaged if they are larger than those learnt
-    from: `lerobot-eval` gives an environment's own.
+    `observation.images.<camera>` (B, 3, H, W), from 0 to 1. Pictures that are larger than in training, as those of
+    `lerobot-eval` may be, are reduced to that size by averaging.
 
     dataset_meta: as for the mlp. In training, the environment state is then also predicted from the keypoints
     (`CNNConfig.aux_weight`), and named points of the scene have heat maps (`heatmap_weight`); each frame's ground truth
@@ -127,7 +127,7 @@ class CNNPolicy(MLPPolicy):
         state = batch[STATE]
         if len(state) == 0:
             return torch.empty_like(state)
-        # The sums of a convolution depend on the batch size, so one row at a time. Half precision is for training only.
+        # The last bits of a convolution depend on the batch size, so one row at a time. Half precision is for training.
         with torch.autocast(state.device.type, enabled=False):
             keys = (*self.inputs, *self.cameras)
             rows = [self.network_inputs({key: batch[key][i : i + 1] for key in keys}) for i in range(len(state))]
@@ -146,7 +146,7 @@ class CNNPolicy(MLPPolicy):
         self._make(config)
 
     def _make(self, config: CNNConfig) -> None:
-        """Build the encoders, the perceptron that predicts the state and the one for the action, with these sizes."""
+        """Build the encoders, the perceptron that predicts the state and the one that predicts the action."""
         features, size = config.input_features or {}, config.privileged_size
         n = features[STATE].shape[0]
         count, named = config.named_points + config.keypoints, config.named_points > 0
@@ -191,7 +191,7 @@ class CNNPolicy(MLPPolicy):
             return torch.cat(parts, dim=-1)
 
     def _at_size(self, key: str, batch: dict[str, Tensor]) -> Tensor:
-        """Return a camera's pictures (B, 3, H, W) at the size learnt from; larger ones are averaged."""
+        """Return a camera's pictures (B, 3, H, W) at the size used in training, reduced by averaging if larger."""
         size = tuple((self.config.input_features or {})[key].shape[1:])
         return batch[key] if batch[key].shape[2:] == size else interpolate(batch[key], size, mode="area")
 
@@ -216,7 +216,7 @@ class CNNPolicy(MLPPolicy):
     def _losses_of_states(self, errors: Tensor) -> Tensor:
         """Return the action network's mean losses on `DRAWS` noisy true states a row, (B,).
 
-        errors: of the predicted state in this batch, (B, k), in its units.
+        errors: absolute errors of the predicted state in this batch, (B, k), in the state's units.
         """
         self.error.lerp_(errors.mean(0), 1.0 - _MEMORY if self.error.any() else 1.0)
         rows = torch.randint(len(self._table[0]), (DRAWS * len(errors),))
@@ -227,7 +227,7 @@ class CNNPolicy(MLPPolicy):
         return self.model.row_losses(self.model.encode(inputs), targets).view(len(errors), DRAWS).mean(1)
 
     def _of_frames(self, name: str, batch: dict[str, Tensor]) -> Tensor | None:
-        """Return what is stored of a batch's frames, (B, ...), by `index`, which LeRobot's preprocessor keeps."""
+        """Return the values stored for a batch's frames, (B, ...), by the batch's `index`; None if there are none."""
         if name not in self._by_index or batch.get(INDEX) is None:
             return None
         return self._by_index[name][batch[INDEX].reshape(-1).cpu()].to(batch[STATE].device)
@@ -239,7 +239,7 @@ class CNNPolicy(MLPPolicy):
         self._by_index[name][index] = values
 
     def _heat_map_losses(self, places: Tensor) -> Tensor:
-        """Return the mean over the cameras, (B,). places: (B, cameras, K, 3)."""
+        """Return each row's loss, averaged over the cameras, (B,). places: (B, cameras, K, 3)."""
         cameras = zip(self.encoders, places.unbind(1), strict=True)
         maps = [(cast(KeypointEncoder, one).maps, at) for one, at in cameras]
         found = [heat_map_losses(one[:, : at.shape[1]], at.to(one.device)) for one, at in maps if one is not None]
@@ -270,7 +270,7 @@ class CNNPolicy(MLPPolicy):
             self._learn_states(columns, truth, Path(config.states))
         else:
             super()._learn_columns(columns)
-        if truth is not None and config.privileged_size == sizes[0]:  # else it comes from another task
+        if truth is not None and config.privileged_size == sizes[0]:  # else the checkpoint is from another task
             statistics = fit_statistics(truth.numpy(), truth.numpy(), "mse")
             self.truth_mean.copy_(statistics["input_mean"])
             self.truth_scale.copy_(statistics["input_scale"])

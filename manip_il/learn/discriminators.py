@@ -8,8 +8,9 @@ Generative adversarial imitation learning, NeurIPS 2016). AIRL's has the form
 so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with adversarial inverse
 reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log D - log(1 - D); AIRL's is f - log pi.
 
-In AIRL pi is divided by exp(-H) with its entropy H. Otherwise -log pi, whose mean is H, would reward every step before
-the absorbing state but none in it, where no action is sampled, and f would have to track H as the spread changes.
+Here, AIRL's pi is divided by exp(-H), where H is its entropy. Otherwise -log pi, whose mean is H, would reward every
+step before the absorbing state but none in it, as no action is sampled there, and f would have to follow every change
+of H.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), 
 class Discriminator(nn.Module):
     """A discriminator, its optimiser and its input scales.
 
-    network: the actor, whose statistics scale the inputs. gamma: discount of AIRL's form; None for GAIL's.
+    network: the actor, whose statistics scale the inputs. gamma: discount in AIRL's f; None for GAIL's form.
     asks_density: whether the logit depends on the learner's log-density of the action, as in AIRL.
     """
 
@@ -75,9 +76,10 @@ class Discriminator(nn.Module):
     def fit(
         self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32] | None, rng: np.random.Generator
     ) -> dict[str, float]:
-        """Take an iteration's gradient steps; return the loss, and the accuracies before them.
+        """Take an iteration's gradient steps; return their mean loss, and the accuracies before them.
 
-        log_probs: the learner's log-densities of the expert's and its own actions, (N,) each, if it `asks_density`.
+        log_probs: the log-densities, under the learner's policy, of the expert's and of the learner's actions, (N,)
+        each, if the discriminator `asks_density`.
         """
         data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs or (None, None), strict=True)]
         with torch.no_grad():
@@ -99,7 +101,7 @@ class Discriminator(nn.Module):
         return loss.item()
 
     def _gradient_penalty(self, expert: Batch, learner: Batch, rng: np.random.Generator) -> Tensor:
-        """Return the mean (|gradient of logit| - 1)^2 between both (Gulrajani et al., Improved training of WGANs)."""
+        """Return the mean (|gradient of logit| - 1)^2 at points between both batches (Gulrajani et al. 2017)."""
         share = torch.from_numpy(rng.random((len(expert[0]), 1), dtype=np.float32))
         mixed = [a * share + b * (1 - share) for a, b in zip(expert[:3], learner[:3], strict=True)]
         inputs = [one.requires_grad_() for one in mixed]

@@ -1,12 +1,13 @@
 """LeRobot policies that run many episodes at once.
 
-They keep their memory (queues of actions, past observations, ensembles) in plain attributes, one for all rows of a
-batch. Here every episode has its own copy, which shares the weights and acts alone: it plans at its own times, and its
-actions are bit-identical whatever runs beside it.
+A LeRobot policy keeps its memory (queues of actions, past observations, ensembles) in plain attributes, one for all
+rows of a batch. Here every episode has its own copy of the policy, which shares the weights and acts alone: it plans at
+its own times, and its actions are bit-identical whatever other episodes run.
 
 Diffusion policies are slow to plan, so episodes share calls of the network, which takes an eighth of the time per plan.
-The last bits of a row's plan depend on the number of rows and on its index, not on the contents of other rows. So
-every call has `ROWS` rows, and an episode's number determines its row. LeRobot's plan, of one row, differs by rounding.
+The last bits of a row's plan depend on the number of rows and on the row's index, not on the contents of other rows.
+So every call has `ROWS` rows, and an episode's number determines its row. Plans differ by rounding from LeRobot's own,
+which are computed with a single row.
 """
 
 from __future__ import annotations
@@ -139,7 +140,7 @@ def _drawing(seed: int, device: torch.device) -> Iterator[None]:
     """Seed torch's global generator inside; restore its state afterwards."""
     cuda = device.type == "cuda"
     with torch.random.fork_rng(devices=[device] if cuda else []):
-        # not `torch.manual_seed`, which seeds every kind of device and takes as long as a small policy
+        # not `torch.manual_seed`, which seeds every kind of device and takes as long as a step of a small policy
         torch.default_generator.manual_seed(seed)
         if cuda:
             with torch.cuda.device(device):

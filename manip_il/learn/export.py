@@ -38,7 +38,7 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Exported:
-    """A file's content and metadata. difference: the largest from the checkpoint's actions on random observations."""
+    """A file's content, metadata, and largest difference from the checkpoint's actions on random observations."""
 
     data: bytes
     metadata: dict[str, Any]

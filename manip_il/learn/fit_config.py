@@ -40,10 +40,10 @@ class FitConfig:
     """Options of a fit; None stands for the default of the policy's kind.
 
     policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`, ...). action_space: see
-    `manip_il.learn.action_spaces`; by default that of the initial checkpoint, if there is one. threads: a second thread
-    is up to 1.8 times as fast if a core is free, and tens of times slower if none is. trust: whether models that the
-    policy or its checkpoint names may be loaded. seed: for weights and batches. init_from: a `pretrained_model` folder
-    with the initial weights.
+    `manip_il.learn.action_spaces`; by default that of the initial checkpoint, if there is one. threads: with a second
+    thread a fit is up to 1.8 times as fast if a core is free, and tens of times slower if none is. trust: whether
+    models that the policy or its checkpoint names may be loaded. seed: for weights and batches. init_from: a
+    `pretrained_model` folder with the initial weights.
 
     Raises `UsageError` for a number out of range.
     """

@@ -27,7 +27,7 @@ from manip_il.learn.fit_config import FitConfig, check_convertible
 from manip_il.learn.names import JOINT_TARGET
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
-# Options of LeRobot's policies that are meant for one machine or one command.
+# Options of LeRobot's policies that concern its Hub, its commands or one machine: not accepted here.
 NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
 
 
@@ -59,7 +59,7 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     that LeRobot refuses, `ManipError` if it names models that are not trusted.
     """
     given = {name: value for name, value in fit.policy.items() if name not in ("type", "path")}
-    if str(given.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot would choose another
+    if str(given.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot would switch devices
         raise UsageError(f"--policy.device={given['device']}, but PyTorch finds no GPU here; expected cpu")
     given.setdefault("device", "cuda" if torch.cuda.is_available() else "cpu")
     source, options = f"--policy.type={fit.kind}", dict(given)
@@ -67,7 +67,7 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     if fit.start is not None:
         source, saved = f"--policy.path={fit.start.path}", fit.start.config
         options = {name: value for name, value in saved.items() if name not in ("type", *NOT_OURS)}
-        if "pretrained_backbone_weights" in saved:  # the checkpoint has these; torchvision would download its own
+        if "pretrained_backbone_weights" in saved:  # the checkpoint has the weights; torchvision would download its own
             options["pretrained_backbone_weights"] = None
         options |= given
     require_trust({**options, "type": fit.kind}, source, fit.trust)
@@ -145,7 +145,7 @@ def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[Tra
     """Return a fit's options in LeRobot's form (policy, optimiser, schedule, logger, ...), and its action space.
 
     LeRobot writes these as `train_config.json`, apart from the dataset and the folder, which are not known yet.
-    action_meaning: that of the data; by default, actions that are not joint targets are learnt unchanged. Raises what
+    action_meaning: that of the data; actions that are not joint targets are by default learnt unchanged. Raises what
     `policy_config` raises, `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot does not
     know, `MismatchError` for an initial checkpoint that learnt in another action space.
     """

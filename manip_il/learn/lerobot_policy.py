@@ -29,7 +29,7 @@ _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less variation than th
 def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = None) -> PreTrainedPolicy:
     """Return a LeRobot policy with new weights, those in `config.pretrained_path`, or those of the run to resume.
 
-    An mlp that starts from another mlp's weights has the statistics of its own data, see `warm_start`. Raises
+    An mlp that starts from another mlp's weights takes input statistics from the new data, see `warm_start`. Raises
     `ManipError` for a checkpoint that cannot be loaded, and if a backbone's weights cannot be downloaded.
     """
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
@@ -45,7 +45,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     if warm:
         model: Any = policy.model
         warm_start(model, Path(str(start)))
-    if weights:  # the checkpoint has its own, so loading needs no network
+    if weights:  # the checkpoint will have all weights, so loading it needs no network
         config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
     config.pretrained_path = None
     return policy
@@ -54,7 +54,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
 def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion | None = None) -> tuple[Any, Any]:
     """Return new LeRobot pre- and postprocessors with the dataset's statistics.
 
-    conversion: that of the actions in the dataset's metadata, if the processors are to do one.
+    conversion: the one that the processors are to do, if any; the statistics are those of the converted actions.
     """
     before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
     if conversion is not None:

@@ -21,7 +21,7 @@ from torch.nn.functional import softplus
 LOSSES = ("mse", "l1", "gaussian", "mixture", "categorical")
 
 # With a deterministic expert the likelihood grows without bound as the deviation goes to zero. The
-# floor, 2 % of a target's own standard deviation, keeps the gradients finite.
+# floor, 2 % of a target's standard deviation in the data, keeps the gradients finite.
 MIN_LOG_STD = -4.0
 _REACH = 3.0  # half-width of a smeared target [standard deviations]
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -123,9 +123,10 @@ class CategoricalHead(Head):
 
     A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother et al., Stop
     regressing, ICML 2024, section 3.1), so that neighbouring bins count as near. `pad` bins of the same width at
-    either end hold what is smeared past it; else a target there, as of a capped joint step, would be pulled inwards.
-    With `sigma` 0 there are none, and a target is split between the two nearest bin centres (two-hot, as in
-    Schrittwieser et al., MuZero, 2020, appendix F). Either way the expectation over centres is the target.
+    either end hold what is smeared past the range; without them a target at its end, such as a joint step at its limit,
+    would be pulled inwards. With `sigma` 0 there are no such bins, and a target is split between the two nearest bin
+    centres (two-hot, as in Schrittwieser et al., MuZero, 2020, appendix F). Either way the expectation over the bin
+    centres is the target.
 
     Acts with the expectation over the likeliest bin and the bins within the smearing's half-width (at least its two
     neighbours): exact within a bin, unlike the argmax, and never between two separate modes, unlike the expectation

@@ -55,7 +55,7 @@ class WarmUpAndCosineConfig(LRSchedulerConfig):
 class MLPConfig(Shape, PreTrainedConfig):
     """A multi-layer perceptron from joint and environment state to one action; its options are those of `Shape`.
 
-    A saved configuration with features but no sigma is from before sigma existed, so its sigma is 0.
+    A configuration with features but no sigma was saved before sigma existed, so its sigma is 0.
 
     The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
@@ -103,8 +103,8 @@ class MLPPolicy(PreTrainedPolicy):
     Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, in training,
     `action` (B, n), all raw ([rad], [m]).
 
-    dataset_meta: LeRobot's, given by `make_policy` for training, or with a `table` of the columns; the statistics are
-    then computed from it, over the frames with a valid label.
+    dataset_meta: for training, LeRobot's metadata, which `make_policy` passes on; it may have a `table` of columns that
+    have been read already. The statistics are then computed from the frames with a valid label.
     """
 
     config_class = MLPConfig  # type: ignore[assignment]
@@ -152,7 +152,7 @@ class MLPPolicy(PreTrainedPolicy):
         self.model = MLPNetwork(width, features[STATE].shape[0], config)
 
     def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
-        """Return the columns of the inputs that are offsets between two things."""
+        """Return the indices of the inputs that are offsets between two things."""
         n = (config.input_features or {})[STATE].shape[0]
         return tuple(n + i for i in offsets_of(features if ENVIRONMENT_STATE in self.inputs else {}))
 
@@ -192,7 +192,7 @@ class MLPPolicy(PreTrainedPolicy):
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
-    """Return the columns of the environment state that are offsets between things. Raises `UsageError` if none is."""
+    """Return the indices in the environment state of offsets between two things. Raises `UsageError` if none is."""
     names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
     found = tuple(i for i, name in enumerate(names) if "_from_" in name)
     if not found:

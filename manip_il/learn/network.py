@@ -41,11 +41,11 @@ class Shape:
     """Sizes and kinds that a network is built from: the options of the `mlp` policy, and so of `MLPConfig`.
 
     loss: one of `LOSSES`. components: number in `mixture`. bins: number per dimension in `categorical`, over the range
-    of the data. sigma: how far `categorical` smears a target, in bins; 0: over the two nearest. clamp: bound on the
-    normalised inputs, in standard deviations, so that states far from the data cannot blow up the outputs.
-    action_space: one of `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among the inputs
-    (`object_from_ee.x`, ...), tanh(x / s) is an input, too. scaled: their columns, from the dataset. grippers: indices
-    of the numbers that are absolute in `joint_delta`, too, from the robot.
+    of the data. sigma: standard deviation of a smeared target in `categorical` [bins]; 0: split between the two nearest
+    bins. clamp: bound on the normalised inputs, in standard deviations, so that states far from the data cannot blow up
+    the outputs. action_space: one of `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among
+    the inputs (`object_from_ee.x`, ...), tanh(x / s) is an input, too. scaled: indices of these offsets, taken from the
+    dataset. grippers: indices of the gripper openings, which are absolute in `joint_delta`, taken from the robot.
 
     Raises `UnknownName` for an unknown loss or activation, `UsageError` for a size out of range.
     """
@@ -56,7 +56,7 @@ class Shape:
     loss: str = "l1"
     components: int = option(5, "Gaussians in a mixture", at_least=1)
     bins: int = option(21, "bins per dimension", at_least=2)
-    sigma: float | None = option(None, "smearing of targets [bins]; by default 3", at_least=0)
+    sigma: float | None = option(None, "smearing of categorical targets [bins]; by default 3", at_least=0)
     clamp: float = option(10.0, "bound on the inputs [standard deviations]", at_least=1e-9)
     action_space: str = JOINT_DELTA
     scales: tuple[float, ...] = ()
@@ -116,8 +116,8 @@ class MLPNetwork(nn.Module):
     """Perceptron, head and normalisation. Inputs (B, n + k) are raw; the first n are the measured joints.
 
     In the space `joint_delta` its targets are relative to the measured joints, except for the grippers', which are
-    absolute: the network adds the joints itself. In all others its actions are its targets, to be converted by
-    `action_spaces`. A row's action does not depend on the other rows, bit for bit.
+    absolute: the network adds the joints itself. In all other spaces it returns the targets, which `action_spaces`
+    converts to actions. A row's action does not depend on the other rows, bit for bit.
     """
 
     added: Tensor  # 1 for the measured joints that are added to the targets, else 0, (n,)
@@ -148,22 +148,22 @@ class MLPNetwork(nn.Module):
         self.register_buffer("target_high", torch.full((n,), torch.inf))
 
     def set_statistics(self, statistics: Statistics) -> None:
-        """Set the statistics of the data, saved with the weights. Inputs beyond those of `statistics` have none."""
+        """Set the statistics of the data. Inputs beyond the length of `statistics` keep mean 0 and scale 1."""
         for name, tensor in statistics.items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
     def expanded(self, inputs: Tensor) -> Tensor:
-        """Return inputs (B, n + k) with their offsets at each scale appended, so that millimetres count up close."""
+        """Return inputs (B, n + k) with tanh(offset / scale) appended for each scale, so that millimetres matter."""
         if not self.scales:
             return inputs
         return torch.cat([inputs, *(torch.tanh(inputs[:, self.scaled] / scale) for scale in self.scales)], dim=1)
 
     def encode(self, inputs: Tensor) -> Tensor:
-        """Return the perceptron's inputs for raw inputs (B, n + k)."""
+        """Return the perceptron's normalised inputs for raw inputs (B, n + k)."""
         return ((self.expanded(inputs) - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
 
     def encode_targets(self, targets: Tensor) -> Tensor:
-        """Return the head's targets for raw relative targets (B, n); 0 if the scale is 0."""
+        """Return normalised targets (B, n) for raw targets (B, n), as from `relative`; 0 for a target with scale 0."""
         inverse = torch.where(self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale))
         return (targets - self.target_mean) * inverse
 
@@ -213,7 +213,7 @@ def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
 def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     """Copy the weights from a `pretrained_model` folder; `network` then acts like that policy, up to rounding.
 
-    The input statistics stay those of the new data: the first layer compensates the difference. (An
+    The input statistics stay those of the new data: the first layer compensates for the difference. (An
     input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
     The range of the targets is also that of the new data; their mean and scale are copied, as they are
     only the unit of the outputs. Raises `MismatchError` for other shapes, `ManipError` for a file that cannot be read.

@@ -85,9 +85,10 @@ class LearnedPolicy:
         return found
 
     def begin(self, instructions: Mapping[int, str]) -> None:
-        """Reset the memory of episodes that begin; their instructions, by number, are for a policy that reads language.
+        """Reset the memory of episodes that begin.
 
-        An empty instruction stands for the policy's `task`.
+        instructions: episode number -> text for a policy that reads language; an empty one stands for the `task` of
+        `load`.
         """
         self._policy.begin(instructions)
 

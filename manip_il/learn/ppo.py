@@ -1,9 +1,8 @@
 """Proximal policy optimisation of the `mlp` policy's network, with a separate critic, by stable-baselines3's `PPO`.
 
-The actor is new, or the network of a clone with a spread of its own.
-Schulman et al., Proximal policy optimization algorithms, 2017. An iteration is one rollout of whole episodes that all
-begin and end together, so that the only state between iterations is the weights and the optimiser's state, which are
-saved as safetensors and JSON.
+(Schulman et al., Proximal policy optimization algorithms, 2017.) The actor is a new network, or that of a clone, with a
+new spread of its actions. An iteration is one rollout of whole episodes that all begin and end together, so that only
+the weights and the optimiser's state persist between iterations; they are saved as safetensors and JSON.
 """
 
 from __future__ import annotations
@@ -104,7 +103,7 @@ class ActorCritic(ActorCriticPolicy):
 
     @property
     def head(self) -> GaussianHead:
-        """The spread of the actor's actions."""
+        """The actor's head, which holds the spread of its actions."""
         assert isinstance(self.actor.head, GaussianHead)
         return self.actor.head
 
@@ -185,7 +184,8 @@ class Learner:
     def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
         """Take an iteration's gradient steps on what `collect` returned; rewards: (N,) in its order. Returns metrics.
 
-        actor: whether to update the actor as well as the critic. remaining: share of the run, scales the learning rate.
+        actor: whether to update the actor as well as the critic. remaining: share of the run that is left, by which the
+        learning rate is scaled.
         """
         buffer = self.ppo.rollout_buffer
         buffer.rewards[:] = rewards.reshape(buffer.rewards.shape)
@@ -244,10 +244,10 @@ def seed_generators(seed: int) -> None:
 
 
 def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec) -> Conversion:
-    """Return the conversion of the actor's actions: the clone's, else for `space`, by default that of hand motions.
+    """Return the conversion of the actor's actions: that of the clone in `start`, else that of `space` or `ee_delta`.
 
-    Raises `UsageError` for a `start` that is not usable, `MismatchError` for one trained on other data, and what
-    `conversion_for` raises.
+    Raises `UsageError` if `start` is not an mlp with one of the losses `_CENTRED`, `MismatchError` if it was trained
+    for another robot, task or action space, and what `conversion_for` raises.
     """
     if start is None:
         return conversion_for(space or EE_DELTA, spec)

@@ -1,7 +1,7 @@
 """A reward learnt from preferences: an ensemble of networks, its fit, and the folder that holds it.
 
-It is fitted with the Bradley-Terry model of preferences between clips, in folds: every pair is held out from some
-networks.
+It is fitted with the Bradley-Terry model of preferences between clips, in folds: every pair is held out from one of
+the networks.
 
     P(left is better) = (1 - E) sigmoid(R(left) - R(right)) + E / 2,    R(clip) = sum over its steps of r(s, a)
 
@@ -34,8 +34,8 @@ from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one
 from manip_il.learn.network import read_weights, threads
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
-PREFERENCE = "preference"  # its type in config.json
-_KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # LeRobot's types of its inputs
+PREFERENCE = "preference"  # type of such a reward in config.json
+_KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # LeRobot's types of the inputs
 _ROWS = 16_384  # rows evaluated at a time
 BY_CHANCE = 0.1  # E, the share of random answers
 _LR, _WEIGHT_DECAY, _BATCH = 1e-4, 1.0, 16
@@ -47,10 +47,10 @@ _RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
 class RewardShape:
     """Sizes of the networks. members: networks in the ensemble; width: units per layer; depth: hidden layers.
 
-    ways: columns of inputs that are an offset between two things [m], x, y and z, or x and y only; its length is an
-    input, too, or, with `logarithms`, the logarithm of that, so that the last centimetres count as much as the first
-    decimetres. Distances make up most of what progress is, and a few hundred answers are too few to learn a square
-    root from. unread: columns that the networks do not use.
+    ways: for each offset between two things [m], its input columns: x, y and z, or x and y. The offset's length is an
+    input, too; if `logarithms`, its logarithm, so that the last centimetres count as much as the first decimetres.
+    Progress mostly depends on distances, and a few hundred answers are too few to learn a square root from. unread:
+    input columns that the networks do not use.
     """
 
     members: int = 8
@@ -62,9 +62,9 @@ class RewardShape:
 
 
 def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
-    """Return the columns of every offset in a dataset's environment state, such as `goal_from_object`, after its state.
+    """Return the input columns of every offset in the environment state, such as `goal_from_object`.
 
-    Each once in 3D and once in the table's plane: hands approach from above.
+    Each offset appears twice, in 3D and in the plane of the table, as hands approach from above.
     """
     place = {name: len(spec.joint_names) + at for at, name in enumerate(spec.environment_state_names)}
     names = [name.removesuffix(".x") for name in place if "_from_" in name and name.endswith(".x")]
@@ -73,9 +73,9 @@ def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
 
 
 def joints_of(spec: RobotTaskSpec) -> tuple[int, ...]:
-    """Return the columns of the arm's joints and of their targets, if the environment state has the hand's pose.
+    """Return the input columns of the arm's joints and their targets if the environment state has the hand's pose.
 
-    Else return none. A few hundred answers are too few to learn that joints are redundant with the pose.
+    Otherwise return (). A few hundred answers are too few to learn that joints are redundant with the pose.
     """
     if not {"ee.x", "ee.y", "ee.z"} <= set(spec.environment_state_names):
         return ()
@@ -242,7 +242,8 @@ class Compared:
 class Fit:
     """The networks, and the held-out prediction for every answer.
 
-    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs: number trained.
+    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs: number of
+    epochs that the networks were trained for.
     """
 
     network: RewardNetwork

@@ -1,7 +1,7 @@
 """The samples of a fit in memory: numbers as tables, pictures decoded once.
 
-LeRobot's policies define by `*_delta_indices` which frames around its own a sample includes: its window. Frames outside
-the episode are replaced by the nearest one inside, and `<column>_is_pad` marks them.
+A sample may include frames around its own, its window, which LeRobot's policies define by `*_delta_indices`. Frames
+outside the episode are replaced by the nearest one inside, and `<column>_is_pad` marks them.
 """
 
 from __future__ import annotations
@@ -92,8 +92,9 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
 class Samples:
     """Samples in memory; a batch is one gather per column.
 
-    columns: numbers, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8 (N, 3, H, W). tasks: text of
-    every `task_index`, (M,). table: the columns as arrays, with those that are not inputs. train, held_out: samples.
+    columns: numeric columns, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8 (N, 3, H, W). tasks:
+    text of every `task_index`, (M,). table: the numeric columns as arrays, also those that are not inputs. train,
+    held_out: rows of the samples to train on and to validate with, (S,) each.
     """
 
     windows: Windows
@@ -125,10 +126,10 @@ def load_data(
     encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]] | None = None,
     on_frames: Callable[[int], None] | None = None,
 ) -> Samples:
-    """Return the samples of the concatenated datasets for a policy that has its features.
+    """Return the samples of the concatenated datasets for a policy whose features have been set.
 
-    meta: that of the datasets; its statistics are updated to the encoded actions. encode: maps actions (N, n) and
-    states (N, n) to the targets, if these are not the datasets' actions. on_frames: called with the number of newly
+    meta: the datasets; its statistics are updated to the encoded actions. encode: maps actions (N, n) and states (N, n)
+    to targets; None if the targets are the datasets' actions. on_frames: called with the number of newly
     decoded frames. Raises `NotFiniteError` and what `Windows.usable` raises.
     """
     features = [*(policy.input_features or {}), ACTION]
@@ -138,7 +139,7 @@ def load_data(
     table = joined_columns(meta.roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     for key in numbers:
-        table[key] = table[key].reshape(len(table[key]), -1)  # a column of one number a frame is a vector, too
+        table[key] = table[key].reshape(len(table[key]), -1)  # a column with one number per frame becomes a vector, too
         require_finite(f"column {key}", table[key])
     if encode is not None:
         table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])
@@ -161,7 +162,7 @@ def load_data(
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Return whether each frame counts in the loss, (N,): all do unless a column says otherwise."""
+    """Return whether each frame counts in the loss, (N,), by its `label_valid`; all do without such a column."""
     if LABEL_VALID not in table:
         return np.ones(len(table[ACTION]), dtype=bool)
     return np.asarray(table[LABEL_VALID]).reshape(-1) != 0

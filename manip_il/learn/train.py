@@ -66,7 +66,7 @@ class Trainer:
     `torchrun`, every process takes `batch_size` samples per step.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data that are not
-    finite, and `ManipError` for what the policy refuses.
+    finite, and `ManipError` for features that the policy refuses.
     """
 
     def __init__(

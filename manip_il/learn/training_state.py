@@ -50,7 +50,7 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
 
 
 def read_step(checkpoint: Path) -> dict[str, Any]:
-    """Return the step and the resume key of a checkpoint folder. Raises `ManipError` if it has none."""
+    """Return what `training_step.json` in a checkpoint folder holds. Raises `ManipError` if it cannot be read."""
     return checks.read_json(checkpoint / TRAINING_STATE / STEP_FILE, "the step of a run")
 
 
@@ -71,7 +71,7 @@ def new_checkpoint(final: Path) -> Generator[Path]:
 
 
 def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:
-    """Write the files that LeRobot's checkpoints lack: the origin, and the step with the resume key."""
+    """Write our own files of a checkpoint: the origin, and `step`, the content of `training_step.json`."""
     for path, values in (
         (f"{PRETRAINED_MODEL}/{META_FILE}", origin.to_json()),
         (f"{TRAINING_STATE}/{STEP_FILE}", step),
@@ -81,9 +81,9 @@ def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -
 
 @contextmanager
 def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
-    """Yield the functions to call with each record: for the metrics file, and for the other outputs asked for.
+    """Yield the functions to call with each record: for the metrics file, and for the other requested outputs.
 
-    step: the fit resumes from there. curves: whether to write to TensorBoard. pipeline: has the options for Weights &
+    step: where the fit resumes. curves: whether to write to TensorBoard. pipeline: has the options for Weights &
     Biases. Raises `UsageError` if one of them is not installed.
     """
     with ExitStack() as stack:

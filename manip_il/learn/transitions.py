@@ -6,10 +6,10 @@ actor-critic, ICLR 2019, section 4.2; Orsini et al., What matters for adversaria
 section 4). So an episode that has ended continues in an absorbing state, marked by a flag, until step H.
 Demonstrations are padded in the same way.
 
-An episode ends the demonstrations' `hold` steps after success. To continue acting after that would be no better: nobody
-demonstrated how to stay at the goal for long, so the learner's many states there would look unlike the demonstrations'
-few, and arriving late would pay off. The learner's share of time in the absorbing state equals that of the
-demonstrations exactly if it arrives as fast as they do.
+An episode ends as many steps after success as the demonstrations do, `hold`. It must not continue at the goal instead:
+nobody demonstrated how to stay there for long, so the learner's many states there would look unlike the demonstrations'
+few, and arriving late would pay off. The learner spends the same share of time in the absorbing state as the
+demonstrations if and only if it arrives as fast as they do.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Demonstrations:
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
         """Return all episodes as `steps` transitions each. encode: normalises raw targets (T, n).
 
-        Without a `hold` nothing is padded. Raises `UsageError` if one is longer.
+        If `hold` is None, nothing is padded. Raises `UsageError` if an episode is longer than `steps`.
         """
         if self.longest > steps:
             raise UsageError(
@@ -94,7 +94,7 @@ class Demonstrations:
 def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32]:
     """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode with T steps that ended.
 
-    N is the larger of T and `steps`: the rest is absorbing. With `steps` 0 the episode did not end and N is T - 1.
+    N is the larger of T and `steps`; rows after the end are absorbing. `steps` 0: the episode did not end; N is T - 1.
     """
     states = np.pad(inputs, ((0, 0), (0, 1)))
     if not steps:

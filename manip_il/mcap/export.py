@@ -1,7 +1,7 @@
 """Export any LeRobot v3.0 dataset as MCAP: one file per episode, one topic per column, bit for bit.
 
 States and actions become `foxglove.JointStates`, other numbers LeRobot's scalars, decoded pictures `foxglove.RawImage`,
-text `foxglove.Log`. With `mapping.yaml`, next to the files, an import makes the dataset again.
+text `foxglove.Log`. With `mapping.yaml`, next to the files, an import recreates the dataset.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
 
 
 def _mapping_of(info: Info) -> dict[str, Any]:
-    """Return the mapping with which an import makes the dataset again."""
+    """Return the mapping with which an import recreates the dataset."""
     near = {"resample": "nearest", "tolerance": round(_TOLERANCE / info.fps, 6)}
     features: dict[str, Any] = {}
     for one in _columns(info):
@@ -118,5 +118,5 @@ def _is_joints(column: Feature) -> bool:
 
 
 def _topic(key: str) -> str:
-    """Return a column's topic, with slashes because a dot would split it in Foxglove's paths."""
+    """Return a column's topic, with slashes instead of dots, at which Foxglove's paths would split it."""
     return "/" + key.replace(".", "/")

@@ -88,8 +88,8 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
 def pick(where: str, source: TopicSource, stamps: I64, times: I64) -> I64:
     """Return the index of the message in `stamps`, (N,), for each frame in `times`, (T,).
 
-    Both are ascending [ns], and no frame is before the first message. Raises `ManipError` with `where`, the place of
-    the gap and the tolerance if a frame's message is farther away than the tolerance.
+    Both are ascending [ns], and no frame is before the first message. Raises `ManipError` with `where`, the time of
+    the gap and the tolerance if a frame's message is farther away in time than the tolerance.
     """
     chosen = np.searchsorted(stamps, times, side="right") - 1
     if source.resample == "nearest":

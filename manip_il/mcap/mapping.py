@@ -24,7 +24,7 @@ _NTSC = 1001  # denominator of NTSC frame rates
 
 @dataclass(frozen=True)
 class TopicSource:
-    """The topic of a column, and which message a frame takes. tolerance: largest distance between them [s].
+    """The topic of a column, and which message a frame takes. tolerance: largest time between frame and message [s].
 
     resample: `nearest` in time (of two, the earlier one), or `previous`, the last one that is not later. Numbers or
     text are the values at all paths in `field`, in order; shape: by default (values,). Pictures have `video` instead:

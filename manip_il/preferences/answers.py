@@ -32,7 +32,7 @@ _ROUNDING = 1e-9  # returns that differ by less than this are equal
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer about the pair with that number. when: ISO 8601; None if a simulated teacher answered."""
+    """An answer about a pair. pair: its number. when: ISO 8601; None if a simulated teacher answered."""
 
     pair: int
     answer: str

@@ -1,7 +1,7 @@
 """Scores of a dataset's frames and episodes by a reward, and the file of sample weights for LeRobot's RA-BC.
 
 RA-BC learns from frames after which progress rises. A frame's own score does not tell whether to learn from it, because
-failing episodes also approach the goal at first. How the episode ends does tell, so the progress written is
+failing episodes also approach the goal at first. The episode's end does, so the progress written is
 
     progress_t = t (score of the episode - bar),    bar = upper quartile of the episodes' scores - BELOW
 
@@ -59,7 +59,7 @@ class Scores:
 
     @property
     def succeeded(self) -> NDArray[np.bool_] | None:
-        """Whether each episode succeeded at some step, (E,); None if the dataset does not say."""
+        """Whether each episode succeeded at some step, (E,); None if the dataset has no such column."""
         if self.data.success is None:
             return None
         return np.logical_or.reduceat(self.data.success, self.data.firsts)

@@ -31,7 +31,7 @@ _GRADIENT_TOLERANCE, _LOSS_TOLERANCE = 1e-4, 1e-6  # [m] and relative; L-BFGS-B 
 _LEAST_UNIT, _TINY = 1e-2, 1e-300  # smallest feature unit relative to the largest, and the smallest divisor
 _ABOVE = 1.001  # safety factor on the smallest weight for which the sum over all paths is finite
 _TOLERANCE = 1e-14  # relative; longer paths that add less are ignored
-_MOST_EDGES = 20_000  # longest path
+_MOST_EDGES = 20_000  # edges of the longest path that is summed
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float 
 def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     """Return the smallest weights (K,) [1/m] for which the sum over all paths is guaranteed to be finite.
 
-    This is log(largest number of edges of a node) over the shortest edge for length, and 0 for the other features.
+    The weight of length is the log of the largest number of edges from a node, divided by the length of the shortest
+    edge [m]; the other weights are 0.
     """
     found = np.zeros(demonstrations[0].problem.features.shape[1])
     shortest = min(float(one.problem.features[:, LENGTH].min()) for one in demonstrations)
@@ -132,7 +133,7 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 
 
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
-    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: [1/m].
+    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: see `PRIOR` [1/m].
 
     The search starts at twice the least weights on a few of the demonstrations, then continues on all of them.
     """

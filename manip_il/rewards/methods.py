@@ -22,7 +22,8 @@ class Learnt:
     """The weights that a method found.
 
     weights: (K,), divided by that of length. open: features in which all demonstrations agree, so that their weights
-    are not identified. intervals: the weights' credible intervals, (K, 2), or None; chains: their quality, in words.
+    are not identified. intervals: the weights' credible intervals, (K, 2), or None; chains: the sampling's quality, in
+    words.
     """
 
     method: str

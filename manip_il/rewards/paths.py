@@ -1,6 +1,6 @@
 """Paths to a goal on a graph whose edges have features: weights turn features into costs, Dijkstra finds cheap paths.
 
-Demonstrations are such paths. Comparing them with the alternatives tells something about the weights.
+Demonstrations are such paths. Weights are inferred from them by comparison with the alternatives.
 """
 
 from __future__ import annotations
@@ -128,15 +128,16 @@ def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstrati
 
 
 def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
-    """Return each demonstration's alternatives: feature sums of the distinct paths that are cheapest for tastes (n, K).
+    """Return the feature sums (m, K) of each demonstration's alternatives.
 
-    The demonstration's own sums come first: (m, K), m at most n + 1.
+    Alternatives are the distinct paths that are cheapest for one of the weights in `tastes` (n, K). The demonstration's
+    own sums come first, so m is at most n + 1.
     """
     return add_rivals(demonstrations, [one.sums[None] for one in demonstrations], tastes)
 
 
 def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64) -> list[F64]:
-    """Add alternatives for more tastes (n, K); return the sums (m, K) of each demonstration's alternatives."""
+    """Add the alternatives for more `tastes` (n, K); return the sums (m, K) of each demonstration's alternatives."""
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
         more = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]
@@ -147,6 +148,9 @@ def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tas
 
 
 def open_features(demonstrations: Sequence[Demonstration], sums: Sequence[F64]) -> list[int]:
-    """Return the features in which no demonstration differs from its alternatives (m, K): weights not identified."""
+    """Return the features in which no demonstration differs from its alternatives `sums` (m, K).
+
+    The weights of these features are not identified.
+    """
     off = [np.abs(others - one.sums).max(axis=0) for one, others in zip(demonstrations, sums, strict=True)]
     return [int(k) for k in np.flatnonzero(np.max(off, axis=0) <= _SAME)]

@@ -15,7 +15,7 @@ from manip_il.mdp import F64
 
 @dataclass(frozen=True, eq=False)
 class ServoUnits:
-    """Conversion from [rad] and [m] to degrees and 0 to 100, and back.
+    """Conversion between [rad] and [m], and the units of servos: degrees, and 0 to 100 for the gripper.
 
     openings: gripper openings [m], rising, (c,). percents: its servo's positions there, 0 to 100, (c,).
     """
@@ -39,7 +39,7 @@ class ActionSpace:
 
     low, high: what commands are clipped to, infinite for a joint that turns freely. scale: the longest step of a joint
     target from the measured joint [rad], the whole opening of the gripper [m]. relative: whether a learner's target is
-    relative to the measured joint; the gripper's is not. units: for a robot with servos; all of these, actions and
+    relative to the measured joint; the gripper's is not. units: set for a robot with servos; all of these, actions and
     measured states are then in degrees, the gripper's from 0 to 100.
     """
 
@@ -79,7 +79,7 @@ class ActionSpace:
         return action
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
-        """Return `action` (n,) within the bounds. Raises `MismatchError`, and `NotFiniteError` naming `step`."""
+        """Clip `action` (n,) to the bounds. Raises `MismatchError` for its shape, `NotFiniteError` naming `step`."""
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.low.shape:
             raise MismatchError("action shape", "the policy", action.shape, "the robot", self.low.shape)

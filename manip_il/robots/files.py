@@ -14,7 +14,7 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
-KEYS = ("model", "includes", "meshes", "mend")  # keys of a YAML
+KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ModelFiles:
 
     @classmethod
     def read(cls, what: str, tree: Mapping[str, Any], folder: Path) -> Self:
-        """Return the files of a YAML in a folder. Raises `ManipError` naming what is wrong."""
+        """Return the files that a YAML in `folder` names. what: prefix of keys in messages. Raises `ManipError`."""
         places = {key: place(what + key, tree[key], folder) for key in KEYS if key in tree and key != "mend"}
         return cls(**places, mend=read(f"{what}mend", dict[str, str], tree.get("mend", {})))
 
@@ -66,7 +66,7 @@ class ModelFiles:
         for old, new in self.mend.items():
             if old not in text:
                 raise ManipError(
-                    f"{self.model} has no {checks.shorten(old)} for mend to replace (nor are included files changed)"
+                    f"{self.model} has no {checks.shorten(old)} for mend to replace (included files are not changed)"
                 )
             text = text.replace(old, new)
         return text.encode()
@@ -79,9 +79,9 @@ def _included(model: bytes, home: Path) -> set[str]:
 
 
 def read(what: str, kind: Any, value: Any) -> Any:
-    """Return a YAML's value as a type: a dataclass, whose fields are the keys, a tuple, a mapping, a number, text.
+    """Return a YAML's value as a `kind`: a dataclass, whose fields are the keys, a tuple, a mapping, a number or text.
 
-    Raises `UnknownName` for any other key, `ManipError` for a value that is missing, of the wrong type or invalid.
+    Raises `UnknownName` for an unknown key, `ManipError` for a value that is missing, of the wrong type or invalid.
     """
     import draccus  # imported here: names of robots do not need it
 
@@ -95,7 +95,7 @@ def read(what: str, kind: Any, value: Any) -> Any:
         return decode(kind, value)
     except ManipError as error:
         raise ManipError(f"{what}.{error}") from None
-    except Exception as error:  # draccus also raises bare ones
+    except Exception as error:  # draccus also raises plain `Exception`
         line = checks.one_line(error)
         raise ManipError(f"{what} is {checks.shorten(value)}: {line}") from None
 

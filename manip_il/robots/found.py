@@ -28,7 +28,7 @@ FROM_TIP = 0.012  # distance of the frame from the fingertips [m]
 _CLEAR = 0.006  # clearance of the fingertips over the table with the frame at its lowest [m]
 _SQUARE = 0.95  # cosine of the largest angle from a body axis at which the fingers' motion counts as parallel to it
 _LEAST_GAP = 1e-4  # least gap between half-closed fingers [m]
-_METRES, _TURN = 4, 6  # digits
+_METRES, _TURN = 4, 6  # decimals of positions [m] and of quaternions
 _STARTS, _STEPS = 40, 150  # inverse kinematics: number of random postures, and of steps from each
 _LONGEST = 0.2  # longest step of a joint [rad]
 _HIGHEST = 0.2  # height of the hand over the table, or half the workspace's height if that is less [m]
@@ -36,7 +36,7 @@ _LOWER = (1.0, 0.7, 0.4)  # shares of that height, tried in order
 _ARRIVED = 0.01  # tolerated pose error [m], a radian counting as 5 cm
 _ANGLE_AS_LENGTH = 0.05
 _ENOUGH = (0.5, 0.15, 0.25)  # sufficient margin to a limit [rad], smallest singular value, height of the links [m]
-_DIGITS = 4
+_DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: Mapping[str, Any]) -> Robot:
@@ -50,7 +50,7 @@ def complete(said: Mapping[str, Any]) -> Robot:
     found: dict[str, Any] = {
         "forces": tuple(_greatest_torque(motors.get(joint.name), joint) for joint in joints),
         "armature": tuple(float(joint.armature) or ARMATURE for joint in joints),
-        # provisional:
+        # provisional, replaced below:
         "ee": EndEffector(said["hand"], (0.0, 0.0, 0.0)),
         "home": (0.0,) * len(joints),
         "gains": (1.0,) * len(joints),
@@ -76,7 +76,7 @@ def _greatest_torque(motor: mujoco._specs.MjsActuator | None, joint: mujoco._spe
 
 
 def find_gains(robot: Robot) -> tuple[float, ...]:
-    """Return kp of each joint [N m/rad]: its natural frequency is 6 Hz with the inertia on it at home."""
+    """Return kp of each joint [N m/rad], which gives it a natural frequency of 6 Hz with the inertia at home."""
     model = arm_spec(robot).compile()
     data = mujoco.MjData(model)
     for name, value in zip(robot.joints, robot.home, strict=True):
@@ -91,7 +91,8 @@ def find_gains(robot: Robot) -> tuple[float, ...]:
 def find_ee(robot: Robot) -> EndEffector:
     """Return the frame between the fingertips: z from the hand to them, y along the fingers' motion.
 
-    Axes of the hand's body that nearly agree are used instead. Raises `UsageError` if the fingers do not come apart.
+    z is the nearest axis of the hand's body, and so is y if it nearly agrees with one. Raises `UsageError` if the
+    fingers do not come apart.
     """
     model, data = _settled(robot, _AT_OBJECT)
     hand = model.body(robot.hand).id
@@ -144,7 +145,7 @@ def _tip(robot: Robot, z: F64) -> float:
 
 
 def _along_axis(vector: F64, least: float = 0.0) -> F64:
-    """The unit vector of the axis nearest to a vector, (3,); the vector itself if its share is below `least`."""
+    """The unit vector (3,) of the axis nearest to a vector; the vector itself if its part along it is below `least`."""
     axis = int(np.argmax(np.abs(vector)))
     if abs(float(vector[axis])) < least:
         return vector
@@ -184,7 +185,7 @@ def _rounded(values: F64, digits: int) -> Any:
 
 
 def _best(robot: Robot, height: float) -> tuple[float, Robot]:
-    """Rating of the best posture for the hand's frame, minus infinity for none, and the robot with it."""
+    """Rating of the best posture for the hand's frame, minus infinity if there is none, and the robot with it."""
     soft = robot.leans
     middle = replace(robot, home=tuple(_counted(ArmIK(robot).limits).mean(axis=1)))
     ik, body = ArmIK(middle), Body(middle)
@@ -203,7 +204,7 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
 
 
 def _counted(limits: F64) -> F64:
-    """Limits of joints, (arm, 2) [rad]; a whole turn, or none, counts as half a turn to either side."""
+    """Limits of joints, (arm, 2) [rad]; a joint without limits, or free for a whole turn or more, has -pi and pi."""
     free = ~np.isfinite(limits).all(axis=1) | (limits[:, 1] - limits[:, 0] >= 2 * np.pi - 1e-3)
     return np.where(free[:, None], np.array([-np.pi, np.pi]), limits)
 

@@ -15,7 +15,7 @@ from manip_il.robots.spec import arm_spec
 _AT_TIP = 0.025  # distance from a fingertip beyond which a geom is no pad [m]
 _FAR = 1.0  # longest distance that is measured [m]
 _NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # [m]
-CLEARANCE = 0.02  # parts nearer than this collide [m]
+CLEARANCE = 0.02  # parts nearer than this count as colliding [m]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
@@ -36,7 +36,7 @@ def at_tip(model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], al
 
 
 def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, ends: F64 | None = None) -> float:
-    """Return the distance of two geoms, at most 1 m, and put their nearest points (6,) into `ends`; [m].
+    """Return the distance between two geoms [m], at most 1 m, and put their nearest points (6,) [m] into `ends`.
 
     For two separate geoms MuJoCo sometimes returns exactly 0, but not once one is moved slightly.
     """
@@ -52,7 +52,7 @@ def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, e
 
 
 def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequence[int]]) -> tuple[tuple[int, int], F64]:
-    """Return the nearest geoms of the first group and of the others, and their nearest points, (2, 3) [m]."""
+    """Return the nearest pair of a geom in the first group and one in another; and their nearest points, (2, 3) [m]."""
     first, *rest = groups
     least, pair, points, ends = np.inf, (first[0], rest[0][0]), np.zeros(6), np.empty(6)
     for one, other in itertools.product(first, [geom for group in rest for geom in group]):
@@ -79,7 +79,7 @@ class Body:
         return not self.meeting(q) <= self._at_home
 
     def meeting(self, q: F64) -> frozenset[frozenset[int]]:
-        """Return the pairs of parts, as bodies, that collide at joints (arm,) [rad]."""
+        """Return the pairs of bodies, by id, that collide at joints (arm,) [rad]."""
         self._data.qpos[self._q] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)

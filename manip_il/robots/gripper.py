@@ -34,10 +34,10 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 class Sweep:
     """Measured relation of command and opening.
 
-    shares: how far from closed to open, 0 to 1, commanded and measured, rising, (c,). openings: gaps between the pads
-    at rest [m], rising, (c,). middles: positions of the middle between the pads along the hand's y [m], (c,); all 0 if
-    both sides move alike. pads: for each finger the indices of its pads, nearest to the other finger first; holding:
-    the same for the pads that may hold.
+    shares: positions between closed, 0, and open, 1, as commanded and as measured, rising, (c,). openings: gaps between
+    the pads at rest [m], rising, (c,). middles: positions of the middle between the pads along the hand's y [m], (c,);
+    all 0 if both sides move alike. pads: for each finger the indices of its pads among its geoms, nearest to the other
+    finger first; holding: the same for the geoms that may hold an object.
     """
 
     shares: F64
@@ -104,7 +104,7 @@ class Gripper:
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> bool:
         """Return whether every finger touches a geom. Needs kinematics to be up to date in `data`."""
-        # For two separate boxes `mj_geomDistance` sometimes returns 0, but only within its greatest distance.
+        # For two separate boxes `mj_geomDistance` sometimes returns 0, but only if they are nearer than its limit.
         return all(
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads)
             for pads in self._holding
@@ -129,14 +129,14 @@ def sweep(robot: Robot) -> Sweep:
             for own, rest in zip(groups, others, strict=True)
         ]
 
-    # The geoms that touch no other finger when open, so none around a jaw's hinge.
+    # Geoms that touch no other finger when open: this leaves out those around a jaw's hinge.
     jaws = [
         [geom for geom, gap in zip(*one, strict=True) if gap > 0]
         for one in zip(fingers, gaps_at(poses[-1], fingers), strict=True)
     ]
     if not all(jaws):
         raise UsageError(f"robot {robot.name}: the fingers touch when open; check gripper.open and gripper.fingers")
-    # Those near the tips; the links behind may pass beside the other finger's.
+    # Of these, the geoms near the tips; the links behind them may pass beside the other finger's.
     tips = [at_tip(model, data, jaw, data.site("ee").xmat.reshape(3, 3)[:, 2]) for jaw in jaws]
     gaps = [gaps_at(pose, tips) for pose in poses]
     least = [min(float(gap.min()) for gap in one) for one in gaps]
@@ -165,7 +165,7 @@ def sweep(robot: Robot) -> Sweep:
 
 
 def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[float], list[F64]]:
-    """The model, each finger's geoms, and for each command the share of the way reached and all joints."""
+    """The model, its data, each finger's geoms, and for each command the share of the way reached and `qpos`."""
     spec = arm_spec(robot)
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model = spec.compile()
@@ -187,12 +187,12 @@ def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[f
 
 
 def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
-    """The geoms whose gap is hardly more than the least at the tip, nearest first."""
+    """The geoms whose gap is at most `_PAD` more than the least at the tip, nearest first."""
     return [geoms[i] for i in np.argsort(gaps, kind="stable") if gaps[i] <= least + _PAD]
 
 
 def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = "") -> list[tuple[int, ...]]:
-    """Return for each finger the ids of the solid geoms of it and of its child bodies except other fingers.
+    """Return for each finger the ids of its solid geoms, including those of child bodies that are no other finger's.
 
     prefix: prefix of the bodies' names. Raises `UsageError` for a finger without such a geom.
     """

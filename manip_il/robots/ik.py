@@ -29,7 +29,7 @@ _LARGEST = 0.5  # largest step of a joint in `moved` [rad]
 class PoseProgram:
     """mink's quadratic program for a site's pose [m] and [rad] and a posture, within the joints' limits.
 
-    Stateless: every solution starts from the posture in `data`, after `update`, and from a fixed `home` (n,). costs: of
+    Stateless: a solution depends only on the posture in `data`, after `update`, and on a fixed `home` (n,). costs: of
     the rotation [1/rad], relative to 1 [1/m] for the position, and of joints away from `home` [1/rad].
     """
 
@@ -87,7 +87,7 @@ class ArmIK:
         self._links = [int(model.jnt_bodyid[joint.id]) for joint in joints[2:]]
 
     def ahead(self, position: F64) -> float:
-        """Return the yaw that counts as zero for a hand at a position (3,) [m]; [rad]."""
+        """Return the zero direction of the yaw of a hand at a position (3,) [m], as a yaw in the world [rad]."""
         return yaw_ahead(self._robot, self._data.xanchor[self._shoulder], position)
 
     def smallest_singular_value(self, q: F64) -> float:
@@ -167,7 +167,7 @@ class ArmIK:
         return jacobian[:, self._dofs]
 
     def _pose_error(self, position: F64, rotation: F64, weight: float) -> float:
-        """Distance to a pose, position and angle weighted as the frame task weights them, the angle by `weight`."""
+        """Pose error [m], weighted as by the frame task: position by 1, angle by `weight` [m/rad]."""
         dx, dy, dz = (self._ee - position).tolist()
         cosine = (float(self._ee_flat.dot(rotation.ravel())) - 1) / 2
         angle = math.acos(min(1.0, max(-1.0, cosine)))

@@ -72,7 +72,7 @@ class Reach:
         return self.origin.tolist()
 
     def error(self, position: Sequence[float] | F64) -> float:
-        """Return how far from `position` [m], (3,), the hand ends; plus its distance from the map if beyond it [m]."""
+        """Return how far from `position` (3,) [m] the hand ends [m]; outside the map, plus the distance from it."""
         place = (np.asarray(position) - self.origin) / _CELL
         last = np.array(self.errors.shape) - 1
         inside = np.minimum(np.maximum(place, 0.0), last)
@@ -109,7 +109,7 @@ class Reach:
         return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
 
     def leaning(self, position: Sequence[float] | F64) -> bool:
-        """Return whether a hand that may lean gets near `position` [m], (3,), as an upright one does farther in."""
+        """Return whether a hand that may lean gets near `position` (3,) [m]: an upright one does farther in."""
         if self.nearly(position):
             return True
         (x, y, z), (in_x, in_y, _) = position, (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist()

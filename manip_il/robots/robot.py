@@ -41,7 +41,7 @@ class EndEffector:
 class GripperConfig:
     """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch objects.
 
-    finger_mass: replaces that of every finger [kg]. force: limit of a driven joint, by default 40 N if it slides and
+    finger_mass: replaces every finger's mass [kg]. force: limit of a driven joint, by default 40 N if it slides and
     10 N m if it turns [N or N m]. files: those of a gripper with a model of its own, whose names begin with `gripper/`;
     position [m] and quaternion (wxyz): of that model in the hand's body.
     """
@@ -137,7 +137,7 @@ class LeRobotConfig:
         checks.whole("fps", self.fps, 1, _MOST_HZ)
 
     def percent(self, joint: F64) -> F64:
-        """Return the gripper's numbers, 0 to 100, for positions `joint` of its driven joint [rad]."""
+        """Return the gripper's positions, 0 to 100, for those of its driven joint, `joint` [rad]."""
         at_0, at_100 = self.gripper
         return 100 * (joint - at_0) / (at_100 - at_0)
 
@@ -156,9 +156,9 @@ class Robot:
     gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
     costs: those of inverse kinematics. yaw: zero direction, along the world's x or straight ahead of the shoulder.
     wrist_camera: name of the model's camera on its hand, or position of an added one in the frame `ee` [m]. cameras:
-    the scene's, if not in the default places: front, side. table: the scene's.
-    colours: red, green and blue of meshes without contacts, by patterns of names, of which later ones win. lerobot:
-    how LeRobot's recorder writes it, if its servos' units replace [rad] and [m].
+    poses of the scene's cameras, front and side, that replace the default ones. table: the scene's.
+    colours: red, green and blue of meshes without contacts, by patterns of their names; later patterns win. lerobot:
+    how LeRobot's recorder writes the robot; its servos' units then replace [rad] and [m].
     """
 
     name: str

@@ -34,7 +34,7 @@ def hand_down(yaw: float) -> F64:
 
 
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
-    """Return the yaw that counts as zero for a robot's hand at a position (3,), its shoulder at (3,) [m]; [rad]."""
+    """Return the zero direction of a hand's yaw, as a yaw in the world [rad]. position, shoulder: (3,) [m]."""
     return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.faces_ahead else 0.0
 
 

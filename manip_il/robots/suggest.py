@@ -103,7 +103,7 @@ def _flange(body: Any) -> Any:
 
 
 def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
-    """The joints of the fingers that motors drive: sliding ones, or else those next to the hand that have motors."""
+    """The finger joints to drive: those that slide, else those with motors, else those next to the hand."""
     joints = [joint for jaw in jaws for joint in (*jaw.joints, *(one for one in jaw.find_all("joint")))]
     joints = list({joint.name: joint for joint in joints}.values())
     slides = [joint for joint in joints if joint.type == mujoco.mjtJoint.mjJNT_SLIDE]

@@ -25,7 +25,7 @@ GROUP = "manip_il.robots"  # entry points: a name, and the path of a YAML
 
 
 def get_robot(name: str) -> Robot:
-    """Return a robot by its name, its YAML file, or a package's name for it. Raises `UnknownName`, `UsageError`."""
+    """Return a robot by its name, its YAML file or its entry point. Raises `UnknownName`, `UsageError`."""
     if name in ROBOTS:
         return _read(ROBOTS[name])
     if name.endswith(SUFFIXES):
@@ -37,7 +37,7 @@ def get_robot(name: str) -> Robot:
             why = checks.one_line(error)
             raise UsageError(f"robot {name} of {found.value}: {why}; expected the path of a YAML") from error
         return _read(path.absolute())
-    raise UnknownName("robot", name, ROBOTS, f"known: {', '.join(sorted(ROBOTS))}, or the path of a YAML")
+    raise UnknownName("robot", name, (*ROBOTS, "the path of a YAML"))
 
 
 def is_robot(name: str) -> bool:
@@ -92,7 +92,7 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
 
 
 def _gripper(tree: Mapping[str, Any], folder: Path) -> GripperConfig:
-    """Read a gripper; if it has a model of its own, its names get that one's prefix."""
+    """Read a gripper; if it has a model of its own, its names get the prefix `gripper/`."""
     own = {key: value for key, value in tree.items() if key not in KEYS}
     gripper: GripperConfig = read("gripper", GripperConfig, own)
     if "model" not in tree:

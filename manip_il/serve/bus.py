@@ -62,11 +62,11 @@ Calibration = dict[str, dict[str, int]]
 class Bus:
     """Servos on a pseudo-terminal, answered by a thread of their own.
 
-    calibration: what they keep without power, by joint name. bus[NAME]: a register of every servo, (n,), by LeRobot's
-    name. path: for any program that uses serial ports. lock: held while a packet is answered; hold it to read several
-    registers at one moment. connected: indices of the joints whose servos are on the bus. commands: number of writes to
-    several servos at once. on_read: called when one packet has read the positions of several servos, which is once per
-    step of a client.
+    calibration: the registers that the servos keep without power, by joint name. bus[NAME]: a register of every servo,
+    (n,), by LeRobot's name. path: device file, for any program that uses serial ports. lock: held while a packet is
+    answered; hold it to read several registers at the same moment. connected: indices of the joints whose servos are on
+    the bus. commands: number of sync writes received. on_read: called when one packet reads the positions of several
+    servos, which a client does once per control step.
     """
 
     def __init__(self, calibration: Calibration):
@@ -103,21 +103,21 @@ class Bus:
 
     @property
     def calibration(self) -> Calibration:
-        """What the servos keep without power, in the form of LeRobot's calibration file."""
+        """The registers that the servos keep without power, in the format of LeRobot's calibration file."""
         kept = {"drive_mode": np.zeros(len(self._names), int)} | {key: self[name] for key, name in _KEPT.items()}
         return {name: {key: int(kept[key][joint]) for key in kept} for joint, name in enumerate(self._names)}
 
     def goals(self) -> F64:
-        """Return the servos' last goals, within their limits [rad], (n,)."""
+        """Return the servos' last goals, clipped to their limits [rad], (n,)."""
         with self.lock:
             low, high, goal = self["Min_Position_Limit"], self["Max_Position_Limit"], self["Goal_Position"]
             encoder = np.where(low < high, np.clip(goal, low, high), goal) + self["Homing_Offset"]
         return np.asarray((encoder - _CENTRE) * STEP, float)
 
     def show(self, q: F64, velocity: ArrayLike = 0.0, load: ArrayLike = 0.0, *, settled: bool = False) -> None:
-        """Set what the servos measure, (n,): angle [rad], velocity [rad/s], share of the stall torque, -1 to 1.
+        """Set what the servos measure, (n,): angle [rad], velocity [rad/s], load as a share of stall torque, -1 to 1.
 
-        settled: whether their goals are set to the same angles.
+        settled: also set their goals to these angles.
         """
         with self.lock:
             self["Present_Position"] = encoder_steps(q) - self["Homing_Offset"]
@@ -137,7 +137,7 @@ class Bus:
         while not self._closing.is_set():
             if select.select([self._master], [], [], 0.1)[0]:
                 os.write(self._master, self.feed(os.read(self._master, 4096)))
-            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # root may open it, too
+            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # except for root
 
     @property
     def _is_in_use(self) -> bool:
@@ -171,7 +171,7 @@ class Bus:
         here = {int(self.memory[one, _ID]): self.memory[one] for one in self.connected}
         if instruction == protocol.INST_PING:
             if self._is_in_use:
-                _LOG.warning("%s is open in another program already: the second gets no answer", self.path)
+                _LOG.warning("%s is already in use by another program; a second one gets no answer", self.path)
                 return b""
             return b"".join(_packet(one) for one in here if number in (one, protocol.BROADCAST_ID))
         if instruction == protocol.INST_SYNC_READ and len(parameters) >= 2:
@@ -211,7 +211,7 @@ def _store(memory: U8, address: int, values: Iterable[int]) -> None:
 
 
 def _packet(number: int, parameters: bytes = b"") -> bytes:
-    """Return an answer without an error."""
+    """Return an answer packet whose error byte is 0."""
     body = bytes([number, len(parameters) + 2, 0]) + parameters
     return _HEAD + body + bytes([_checksum(body)])
 

@@ -26,8 +26,8 @@ _QUALITY = 90  # JPEG quality
 class Cameras:
     """A thread that streams a station's cameras on one port, `RATE` times per second.
 
-    images: the last picture of each. Raises `UsageError` for a port that is taken, `RenderError` without off-screen
-    OpenGL.
+    images: camera -> its last picture, RGB (height, width, 3). Raises `UsageError` for a port that is taken,
+    `RenderError` if there is no off-screen OpenGL.
     """
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
@@ -42,7 +42,7 @@ class Cameras:
         except zmq.ZMQError as error:
             raise UsageError(f"--camera_port={port} cannot be used ({error}); give another one") from error
         self._stop = threading.Event()
-        render.close()  # an OpenGL context belongs to the thread that made it, from here on the new one
+        render.close()  # an OpenGL context belongs to the thread that made it; the new thread makes its own
         self._thread = ThreadPoolExecutor(1)
         self._thread.submit(self._send).result()
         self._thread.submit(self._run)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 LEADERS = ("expert", "sliders", "none")  # or a policy
-IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}  # of `--servo=ideal`
-VARIED = {  # ranges of `--vary=servo`: factors, except for delay and offset, which are added
+IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}  # values for `--servo=ideal`
+VARIED = {  # ranges of `--vary=servo`: factors, except for delay [s] and offset [deg], which are added
     "stiffness": (0.7, 1.3),
     "torque": (0.8, 1.1),
     "speed": (0.8, 1.1),
@@ -56,7 +56,7 @@ class ServoConfig:
 class SessionConfig(Seeded):
     """Options of a session: how the follower's servos move, when a new world is drawn, and what is saved."""
 
-    output_dir: Path = option(Path("runs/serve"), "folder for the links follower and leader and their calibrations")
+    output_dir: Path = option(Path("runs/serve"), "folder of the ports follower and leader, and their calibrations")
     leader: str = option(
         "expert", "who moves the leader: expert, sliders (in a window), none, or a policy (a checkpoint or a run)"
     )
@@ -66,11 +66,11 @@ class SessionConfig(Seeded):
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
-        "solved", "without a COMMAND: draw a new world on Enter, or also one second after the task is solved"
+        "solved", "when to draw a new world without a COMMAND: on Enter, or also one second after the task is solved"
     )
     intervene: float = option(
         0.15,
-        "with LeRobot's DAgger: correct the policy if its targets differ from the expert's by more [rad]",
+        "with LeRobot's DAgger: correct the policy if its targets differ from the expert's by more than this [rad]",
         at_least=0,
     )
     log: Path | None = option(None, "folder for journals with what the client cannot see: states, labels, who drove")

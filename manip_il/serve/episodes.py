@@ -1,4 +1,4 @@
-"""Successive worlds of a session, and the data on each that a client does not see: states, labels, and who drove.
+"""Successive worlds of a session, and a log of what the client does not see: states, labels, and who drove.
 
 A frame is logged when the client reads the follower's position, so that the frames match those of its own dataset.
 """
@@ -20,10 +20,10 @@ from manip_il.tasks.envs import env_of
 
 
 class ServedEpisodes:
-    """Episodes of a station; those to keep are journals in a folder, for `manip-il data build`.
+    """Episodes of a station; those to keep are written as journals to a folder, for `manip-il data build`.
 
-    folder: None for no journals. seed: shifts the worlds; those that have a journal are not drawn again. leader: moves
-    the leader, by default the expert. driver: who moves the follower now.
+    folder: None to write none. seed: of the stream of worlds, as `--seed`; worlds that have a journal there are not
+    drawn again. leader: the function that moves the leader. driver: who moves the follower now.
     """
 
     def __init__(self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover):
@@ -71,7 +71,7 @@ class ServedEpisodes:
             self._journal.write(to_episode(frames))
 
     def _transition(self, step: int, reads: list[tuple[Read, Actor]]) -> Transition:
-        """Return a frame, with the follower's command and its outcome at the next frame."""
+        """Return the frame of one read, with the command and the outcome at the next read."""
         (now, actor), (after, _) = reads[step : step + 2]
         env = self._env
         env.set_state(after.state)

@@ -1,4 +1,4 @@
-"""Runs a LeRobot program against a station and does what a person would: presses its keys and moves the arms."""
+"""Run a LeRobot program on a station, and do what a person would: press its keys and move the arms."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Operator:
             os.kill(self._pid, signal.SIGTERM)
 
     def _hear(self, text: str) -> None:
-        """Forward printed text, which a slow disk may delay, and react to it."""
+        """Forward printed text to standard output, which may block, and react to it."""
         os.write(sys.stdout.fileno(), text.encode())
         self._heard += text
         while found := [(match, act) for pattern, act in self._says if (match := re.search(pattern, self._heard))]:
@@ -222,7 +222,7 @@ class Operator:
 
 
 def _start(command: Sequence[str]) -> tuple[int, int]:
-    """Run a program in a new terminal; return its process id and the terminal's other end."""
+    """Run a program in a new terminal; return its process id and our end of the terminal."""
     pid, terminal = pty.fork()
     if pid == 0:
         weigh_session()
@@ -237,14 +237,14 @@ def _start(command: Sequence[str]) -> tuple[int, int]:
 
 
 def weigh_session(weight: str = "-20") -> str:
-    """Raise the priority of this process's session if permitted, and return the former one; "" if not.
+    """Set the nice value (`weight`) of this process's session if permitted, and return the former one; "" if not.
 
-    Linux first shares CPU time among sessions. The program and its servos run in two, and each must answer the other
-    within milliseconds. Real-time priority would block the kernel's own threads, which carry bytes from one end of a
-    terminal to the other.
+    Linux first shares CPU time among sessions (autogroups). The program and its servos run in two sessions, and each
+    must answer the other within milliseconds. Real-time priority would block the kernel's own threads, which carry
+    bytes from one end of a terminal to the other.
     """
     with contextlib.suppress(OSError):
-        before = _AUTOGROUP.read_text().split()  # "/autogroup-12 nice 0"; nothing if sessions are not weighed
+        before = _AUTOGROUP.read_text().split()  # "/autogroup-12 nice 0"; empty if autogroups are off
         if before:
             _AUTOGROUP.write_text(weight)
             return before[-1]

@@ -19,7 +19,8 @@ _HAND = 100.0  # stiffness of a hand that holds an arm whose torque is off [N m/
 class Follower:
     """The servos of a bus as the motors of a simulated arm, in joint order, the gripper last.
 
-    Gravity acts on the arm. A servo whose torque is off keeps its position, as if a hand held it.
+    Gravity acts on the arm. A servo whose torque is off keeps its position, as if a hand held it. q: the joints'
+    addresses in `qpos`, (n,). step: time between calls of `command` [s].
     """
 
     def __init__(self, world: World, bus: Bus, step: float):
@@ -59,7 +60,7 @@ class Follower:
         return self._bus.goals() - self.offset
 
     def command(self) -> None:
-        """Set the motors from the registers; call it every `step` seconds."""
+        """Set the motors from the registers; call this every `step` seconds."""
         data, model, bus = self._world.data, self._world.model, self._bus
         q = data.qpos[self.q]
         with bus.lock:
@@ -70,7 +71,7 @@ class Follower:
         goal = self._coming.popleft()
         play = math.radians(self.config.play) / 2
         led = np.clip(self._at, goal - play, goal + play)
-        self._at = np.where(on, led, np.where(self._on, q, self._at))  # torque off: where it was turned off
+        self._at = np.where(on, led, np.where(self._on, q, self._at))  # torque off: stay where it was turned off
         self._on = on
         data.ctrl[self._ctrl] = np.where(on & (np.abs(self._at - q) < dead), q, self._at)
         gain = np.where(on, gain, _HAND)

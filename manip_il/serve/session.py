@@ -48,10 +48,11 @@ def serve(
 ) -> None:
     """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
 
-    cameras: those to serve; None for none. conditions: how worlds vary. policy: folder of the one that moves the
-    leader, if any, and whether to `trust` it; it must fit the environment and the cameras. say: called with lines for
-    the user. Raises `UsageError` for a robot without Feetech servos or a port that is taken, `MismatchError` for a
-    policy that does not fit, `RenderError` for a window without a display, `ManipError` if the program failed.
+    cameras: those to serve; None for none. conditions: how worlds vary. policy: folder of the policy that moves the
+    leader, if any; it must fit the environment and the cameras. trust: whether its models and code may be loaded. say:
+    called with lines for the user. Raises `UsageError` for a robot without Feetech servos or a port that is taken,
+    `MismatchError` for a policy that does not fit, `RenderError` for a window without a display, `ManipError` if the
+    program failed.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
@@ -86,7 +87,7 @@ def serve(
 
 
 def described(station: Station, config: SessionConfig, cameras: CameraConfig | None) -> list[str]:
-    """Return lines that say where everything is, one of them to copy."""
+    """Return lines for the user: the ports, their calibration files, and a `lerobot-record` command to copy."""
     root, port = config.output_dir, config.camera_port
     size = f"width: {cameras.width}, height: {cameras.height}, fps: {RATE}" if cameras else ""
     shown = ", ".join(
@@ -96,7 +97,7 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
     seen = f' --robot.cameras="{{{shown}}}"' if shown else ""
     return [
         *(f"{name}: {root / name} (its calibration: {root / name}.json)" for name in station.buses),
-        "to record demonstrations of the leader's, as with a real arm:",
+        "to record what the leader demonstrates, as with a real arm:",
         f"lerobot-record --robot.type=so101_follower --robot.port={root}/follower --robot.id=follower "
         f"--robot.calibration_dir={root}{seen} --teleop.type=so101_leader --teleop.port={root}/leader "
         f"--teleop.id=leader --teleop.calibration_dir={root} --dataset.repo_id=local/so101 "
@@ -105,7 +106,7 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
 
 
 def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | None) -> Mover:
-    """Return a policy that moves the leader, and sees what the cameras show."""
+    """Return a function that moves the leader by a policy, which sees the cameras' last pictures."""
     seed = None
 
     def move() -> F64:
@@ -120,7 +121,7 @@ def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | Non
 
 
 def slider_mover(station: Station) -> Mover:
-    """Open a window whose control sliders move the leader. Raises `RenderError` without a display."""
+    """Open a window; return a function that moves the leader to its sliders. Raises `RenderError` without a display."""
     env, window = station.env, Window(station.env.scene, _UNPACED, sliders=True)
     order, seed = np.array([*env.scene.arm_ctrl, *env.scene.gripper.ctrl]), None
 
@@ -148,14 +149,14 @@ def _operate(operator: Operator, station: Station, program: str, say: Say) -> No
 
 
 def _stand(station: Station, episodes: ServedEpisodes, renews: bool, say: Say) -> None:
-    """Serve clients until Ctrl-C; draw a new world on Enter and, if it `renews`, once the task is solved."""
+    """Serve clients until Ctrl-C; draw a new world on Enter and, if `renews`, once the task is solved."""
     station.on_read = episodes.frame
     episodes.begin(Actor.EXPERT)
 
     def each_step() -> bool:
         pressed = sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline()
         if pressed or (renews and station.is_solved):
-            say(f"seed {station.seed}: {'solved' if station.is_solved else 'left'}; a new world")
+            say(f"seed {station.seed}: {'solved' if station.is_solved else 'not solved'}; drawing a new world")
             episodes.renew()
             episodes.begin(Actor.EXPERT)
         return True

@@ -1,4 +1,4 @@
-"""A simulated arm, its world and its leader, which advance with the wall clock, whoever reads them."""
+"""A simulated arm, its world and its leader, which advance with the wall clock, whether or not a client reads them."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ Mover = Callable[[], F64 | None]
 
 
 class Read(NamedTuple):
-    """A client's read of the follower.
+    """The world and the follower at the moment when a client reads it.
 
-    told: its target at that time, after `commands` commands. sag: how far it hangs below its target. Both are joints
-    [rad], (n,).
+    told: the follower's target after `commands` commands. sag: how far the follower hangs below its target. Both are
+    joints [rad], (n,).
     """
 
     state: State
@@ -47,11 +47,11 @@ class Read(NamedTuple):
 class Station:
     """Two ports, `follower` and `leader`, in a folder, and the simulation behind them.
 
-    `NAME.json` beside each is its calibration in LeRobot's form, and holds what the servos keep without power. on_read:
-    called, from another thread, whenever a client reads the follower's position. mover: asked once a control step for
-    the joints to which the leader, which has no weight, moves [rad], (n,), or None to leave it. hand: joints at which
-    a hand holds both arms still. clock: paces the control steps. Raises `UsageError` for a robot without Feetech
-    servos.
+    `NAME.json` beside each port is its calibration in LeRobot's format: the registers that the servos keep without
+    power. on_read: called, from another thread, whenever a client reads the follower's position. mover: called every
+    control step; returns the joints to which the weightless leader moves [rad], (n,), or None to leave it. hand: joints
+    at which a hand holds both arms still [rad], (n,), or None. clock: paces the control steps. Raises `UsageError` for
+    a robot without Feetech servos.
     """
 
     def __init__(self, env: ManipEnv, config: SessionConfig):
@@ -104,11 +104,11 @@ class Station:
 
     @property
     def is_solved(self) -> bool:
-        """Whether the task has been solved for a while."""
+        """Whether the task has been solved for `HELD` seconds."""
         return self._solved >= HELD * self.env.config.control_hz
 
     def expert(self) -> F64 | None:
-        """Return the leader's joints [rad], (n,), as the expert would move it; None without a label.
+        """Return the joints [rad], (n,), to which the expert moves the leader; None if the state has no valid label.
 
         They exceed the label by the follower's sag and by the offset of its servos.
         """
@@ -180,7 +180,7 @@ class Station:
         return scene.actions.join(joints[:arm], scene.gripper.commanded(joints[arm:], joints[arm:]))
 
     def close(self) -> None:
-        """Save what the servos keep without power, close the ports, and remove their links."""
+        """Save the calibrations, close the ports, and remove their links."""
         for name, bus in self.buses.items():
             self._keep(name, bus)
             (self._config.output_dir / name).unlink(missing_ok=True)

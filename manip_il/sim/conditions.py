@@ -1,4 +1,4 @@
-"""Conditions: named ranges from which each episode draws, by its seed alone, how it differs from the nominal world.
+"""Conditions: named ranges of how episodes differ from the nominal world; an episode's seed alone decides its values.
 
 The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
 `env.py`, and during the episode by `events.py`.
@@ -46,12 +46,12 @@ _BOUNDS: dict[str, Range] = {
     "picture_delay": (0, 100),
 }
 _WHOLE = ("knock_step", "delay", "picture_delay", "clutter")
-_SEEDS = 2**31  # number of clutter seeds, each of which a state stores exactly
+_SEEDS = 2**31  # number of clutter seeds; a state stores each exactly, as a float
 _KNOCK_STEP = (5, 24)  # default for a condition with a knock
 _BODY = ("mass", "size", "friction")  # the object's physics
 _MODEL = (*_BODY, "joint_damping", "actuator_gain")
 _OBJECT = ("knock", "colour", *_BODY)
-PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # pictures only
+PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # only in pictures
 _SEEN = (*PICTURED, "picture_delay")
 
 
@@ -63,16 +63,16 @@ class Condition:
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
     knock: distance by which the object is moved once [m], at a control step from knock_step, by default 5 to 24.
     joint_noise [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position
-    in a policy's observations. delay: control steps by which those are late. mass [kg], size (edge or width [m]) and
-    sliding friction of the object. colour: each of the object's red, green and blue; table: the table's. joint_damping:
-    factor on the damping of every arm joint; actuator_gain: factor on its actuators' kp, and its square root on kv.
-    posture: largest offset of every joint from home at the start [rad]. camera_shift [m], camera_turn [deg]: of every
-    camera, in a random direction. brightness: factor on every lamp; light_turn: the lamps' about the vertical [deg].
-    clutter: number of visual objects around the workspace. picture_delay: control steps by which pictures alone are
-    late.
+    in a policy's observations. delay: control steps by which observations are late. mass [kg], size (edge or width [m])
+    and sliding friction of the object. colour: red, green and blue of the object, each from the range; table: the same
+    of the table. joint_damping: factor on the damping of every arm joint; actuator_gain: factor on kp of the arm's
+    actuators, whose kv changes by its square root. posture: largest offset of every joint from home at the start [rad].
+    camera_shift [m], camera_turn [deg]: shift and rotation of every camera, in a random direction. brightness: factor
+    on every lamp; light_turn: rotation of the lamps about the vertical [deg]. clutter: number of visual objects around
+    the workspace. picture_delay: control steps by which only pictures are late.
 
-    Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds, `ManipError` for a name
-    that cannot name a file.
+    Raises `UnknownName` for an unknown range, `UsageError` for a range that is empty or out of bounds, `ManipError` for
+    a name that cannot be a file's.
     """
 
     name: str
@@ -102,13 +102,13 @@ class Condition:
         return Condition(self.name, **kept)
 
     def changes_model(self) -> bool:
-        """Return whether the object or the arm differs from the compiled model's."""
+        """Return whether the condition changes the physics of the object or the arm."""
         return not self.ranges.keys().isdisjoint(_MODEL)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return what the episode of a seed draws, by the names of the ranges and in their units.
+        """Return the values drawn for the episode of a seed, by the names of the ranges and in their units.
 
-        Each value has a random stream of its own, so that another range leaves the other values unchanged.
+        Each value has a random stream of its own, so that adding a range leaves the other values unchanged.
         camera_shift and camera_turn have one vector (3,) per camera, in the camera's own frame.
         """
         return {name: _draw(name, range_, rng_for(seed, f"condition {name}")) for name, range_ in self.ranges.items()}

@@ -13,7 +13,7 @@ MOST_HZ = round(1 / DT_SIM)
 
 @dataclass(frozen=True)
 class Episodes:
-    """Timing, solving and ending of an environment's episodes. 0 means the robot's or task's own value."""
+    """Timing, success criterion and length of episodes. 0 means the robot's or task's own value."""
 
     control_hz: int = option(0, "control steps per second; 0: the robot's own (so101: 30, others: 20)")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
@@ -34,7 +34,7 @@ class Episodes:
 
 
 CAMERAS = ("front", "side", "wrist")
-OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # stock robots'
+OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # gym-aloha's
 MIN_SIDE, MAX_SIDE = 16, 2048  # sides of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 
@@ -43,8 +43,8 @@ _BRIGHTNESS = (0.1, 2.0)
 class Look:
     """Lighting of a scene: part of a dataset's fingerprint, and adjustable when pictures are rendered again.
 
-    shadows: draw the main lamp's; a picture then takes two to six times as long. brightness: factor on every lamp.
-    light_turn: rotation of the lamps about the vertical through the world's origin, -180 to 180 [deg].
+    shadows: draw those of the main lamp; a picture then takes two to six times as long. brightness: factor on every
+    lamp. light_turn: rotation of the lamps about the vertical through the world's origin, -180 to 180 [deg].
     Raises `UsageError` for a value out of range.
     """
 
@@ -65,10 +65,10 @@ FILM = Look(shadows=True)  # for people: shadows show how high things are
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """Cameras that see every step, and the height, width [pixels] and look of their pictures.
+    """Cameras that take a picture at every step, and the height, width [pixels] and look of their pictures.
 
-    Raises `UnknownName` for a camera, `UsageError` for none, for one named twice, and for a height or width that
-    is odd (which 4:2:0 video does not allow) or out of range.
+    Raises `UnknownName` for an unknown camera, `UsageError` if no camera is named or one is named twice, or if a height
+    or width is odd (which 4:2:0 video does not allow) or out of range.
     """
 
     names: tuple[str, ...]
@@ -90,7 +90,7 @@ class CameraConfig:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width."""
+        """Height and width [pixels]."""
         return self.height, self.width
 
 

@@ -191,7 +191,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return min(1.0, max(0.0, self._task.progress(self.world)))
 
     def get_state(self) -> State:
-        """Return everything that the future depends on; `set_state` restores it bit for bit."""
+        """Return the world's state and the step counts, which `set_state` restores bit for bit; no noise or delays."""
         return State(self.world.physics(), self.world.variation.copy(), self._step, self._streak, self._ever)
 
     def set_state(self, state: State) -> None:

@@ -40,9 +40,10 @@ class Kind:
 
 
 def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> F64:
-    """Return `action` (n,) with Gaussian noise: `share` of its full range, as in Meta-World's tests of its experts.
+    """Return `action` (n,) with Gaussian noise, as in Meta-World's tests of its experts.
 
-    The range of a joint is twice its longest step, the gripper's its whole opening.
+    share: the noise's standard deviation as a share of each entry's range: twice the longest step of a joint, the whole
+    opening of the gripper.
     """
     actions = world.scene.actions
     spread = np.where(actions.relative, 2, 1) * actions.scale
@@ -63,10 +64,10 @@ def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
-    """Move the task's first object sideways by a random distance [m], at rest, to a place within reach.
+    """Put the task's first object at rest at a place within reach, a random distance sideways.
 
-    height: how far up it is moved [m]; above 0 it is also turned at random, and falls. Draws in which it overlaps
-    something are drawn again; without an object, or a free place, nothing is moved.
+    distance: least and greatest [m]. height: how far up it is moved [m]; above 0 it is also turned at random, and
+    falls. A place where it overlaps something is drawn again; nothing moves if there is no object or no free place.
     """
     if not world.scene.task.objects:
         return
@@ -111,7 +112,7 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
 
 
 def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
-    """Return the robot's touching pairs of geoms, marked False; a pair that overlaps is there again, marked True."""
+    """Return the pairs of geoms that touch, one being the robot's, with False, and again with True if they overlap."""
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
     roots = model.body_rootid[model.geom_bodyid]
@@ -122,7 +123,7 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
 
 
 def open_gripper(world: World) -> None:
-    """Command the gripper to open, and put its fingers there."""
+    """Set the gripper's fingers and command to fully open."""
     gripper, data = world.scene.gripper, world.data
     data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
     _settle(world)
@@ -147,7 +148,7 @@ def kinds_for(task: Task) -> dict[str, Kind]:
 
 
 class Perturbation(Condition):
-    """A condition under which one of `KINDS` happens once. moments: seed -> the control step at which it does."""
+    """A condition under which one of `KINDS` happens once. moments: the control step at which it happens, by seed."""
 
     moments: Mapping[int, int]
 
@@ -161,14 +162,14 @@ class Perturbation(Condition):
 
 
 class _Training(Condition):
-    """A condition whose knock is drawn when it happens, as in all rollouts recorded so far."""
+    """A condition whose knock `Events` draws, not `draw`, so that a seed gives the same knock as in earlier data."""
 
     def draw(self, seed: int) -> dict[str, Any]:
         return super().draw(seed) | {name: self.ranges[name] for name in ("knock", "knock_step")}
 
 
 def standard_in(varied: Sequence[Condition]) -> Condition:
-    """Return `STANDARD` with the ranges of other conditions; itself if they have none."""
+    """Return `STANDARD` with the ranges of other conditions added; `STANDARD` itself if they have none."""
     ranges = {name: range_ for condition in varied for name, range_ in condition.ranges.items()}
     return _Training(STANDARD.name, **{**ranges, **STANDARD.ranges}) if ranges else STANDARD
 
@@ -177,7 +178,7 @@ STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), kn
 
 
 class Events:
-    """Events of one episode: `drawn` says which, how much and when; the rest is drawn from the seed."""
+    """Events of one episode: `drawn` says which, how strong and when; the rest is drawn from the seed."""
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
         self._world = world
@@ -210,7 +211,7 @@ class Events:
         return False
 
     def action(self, action: F64, step: int) -> F64:
-        """Return the action of a step as it reaches the robot, (n,)."""
+        """Return the action (n,) that is executed at a step: `action`, with noise or replaced if an event says so."""
         if self._kind is not None and self._kind.wrong is not None and step == self._kind_step:
             return self._kind.wrong(action, self._world, self._kind_rng)
         if self._random and self._random_rng.uniform() < self._random:
@@ -239,7 +240,7 @@ def _is_on_table(world: World, pose: F64) -> bool:
 
 
 def _place(world: World, name: str, pose: F64) -> bool:
-    """Put an object at rest at `pose` (7,); False if it overlaps something."""
+    """Put an object at rest at `pose` (7,); return False if it overlaps something."""
     world.place(name, pose[:3], pose[3:])
     _settle(world)
     geom = world.scene.objects[name].geom

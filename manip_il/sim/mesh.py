@@ -23,8 +23,8 @@ _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P
 class Mesh:
     """A closed mesh about its centre of mass: vertices (n, 3) [m], faces (m, 3), volume [m^3].
 
-    sha256: the file's. text: the option's value, with the file's path; stored: the same with its name and hash, as in
-    datasets.
+    sha256: hash of the file. text: the option's value, with the file's path; stored: the same with the file's name and
+    hash instead, as in datasets.
     """
 
     text: str
@@ -42,9 +42,9 @@ class Mesh:
 
 
 def parse_mesh(text: str) -> Mesh:
-    """Return the mesh that `mesh:PATH` or `mesh:PATH:LENGTH` means, read once.
+    """Return the mesh of `mesh:PATH` or `mesh:PATH:LENGTH`, read once per process.
 
-    LENGTH: its longest side [m]; without one the file is in metres. Raises `UsageError`.
+    LENGTH: its longest side [m]; if omitted, the file is in metres. Raises `UsageError`.
     """
     if (found := _TEXT.fullmatch(text)) is None:
         raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")

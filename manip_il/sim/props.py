@@ -14,7 +14,7 @@ from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
 F64 = NDArray[np.float64]
-VERSION = 3  # version of what is drawn in addition to the model, on which image policies are trained
+VERSION = 3  # version of the look of these objects, part of the fingerprint of pictures
 _POLE, _SHORTEST = 0.003, 0.03  # radius of a goal's pole, and its least height [m]
 _FOOT, _ARM = 1.2, 1.6  # radius of a goal's foot, half the length of its cross, in radii of the largest object
 _THIN, _GOAL = 0.001, 0.02  # height of a foot, radius of a goal [m]
@@ -22,14 +22,14 @@ _UP = np.eye(3)
 _ACROSS = (
     np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
     np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-)  # z along x, y
+)  # rotations that turn z along x, and along y
 _STAND = (0.10, 0.55, 0.28, 1.0)  # the stand's colour
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
-_HALF = (0.012, 0.04)  # half a thing's lengths, for a workspace as large as Panda's [m]
+_HALF = (0.012, 0.04)  # range of half a clutter object's lengths, for a workspace as large as Panda's [m]
 _USUAL = 0.15  # half width of Panda's workspace [m]
 _BESIDE, _WITHIN = 0.06, 0.24  # least and greatest distance of clutter from the workspace's edge [m]
 _FROM_BASE = 0.18  # least horizontal distance of clutter from the robot's first joint [m]
-_DRAWS = 50  # draws of a thing's place before it is left out
+_DRAWS = 50  # draws of a clutter object's place before it is left out
 
 
 class Prop(NamedTuple):
@@ -58,7 +58,7 @@ def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0
 
 
 def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
-    """The stand of a goal, visible around an object there: on the table a foot, in the air a pole with a cross."""
+    """The stand of a goal, wider than an object there: on the table a foot, in the air a pole with a cross."""
     body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
     if body < 0:
         return []
@@ -119,7 +119,7 @@ def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple
 
 
 def _furniture(scene: Scene, data: mujoco.MjData) -> list[tuple[float, float, float]]:
-    """Middle and radius [m], from above, of every fixed part of the task."""
+    """x, y and radius [m] of every fixed part of the task, seen from above."""
     model = scene.model
     fixed = [geom for geom in range(model.ngeom) if model.body_mocapid[model.body_rootid[model.geom_bodyid[geom]]] >= 0]
     return [(*data.geom_xpos[geom][:2].tolist(), float(model.geom_rbound[geom])) for geom in fixed]

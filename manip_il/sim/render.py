@@ -36,8 +36,8 @@ def pictures(
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    variation: the world's (v,), by default the scene's own. A picture depends only on that, `qpos` and mocap bodies: it
-    has the same bytes in any order.
+    variation: the world's (v,), by default the scene's own. A picture's bytes depend only on that, `qpos` and mocap
+    bodies, not on earlier pictures.
     Raises `RenderError`, which says what to unset or install, if there is no off-screen OpenGL.
     """
     renderer = _renderer(scene, cameras.look)
@@ -48,8 +48,8 @@ def pictures(
 def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
     """Return where points (K, 3) of the world [m] are in this process's last `pictures`: name -> (K, 3).
 
-    Columns: across and down from 0 to 1, and 1 for a point within the picture; zeros for any other. A point may be
-    occluded. Raises what `pictures` raises.
+    Columns: position across and down, each from 0 to 1, and 1; all three are 0 for a point outside the picture. A point
+    may be occluded. Raises what `pictures` raises.
     """
     renderer = _renderer(scene, cameras.look)
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}

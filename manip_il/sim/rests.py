@@ -1,6 +1,6 @@
 """How an object of any shape rests on the table, and where a downward hand can grasp it.
 
-Everything is about the object's convex hull, in the object's own frame, and computed once per process.
+Everything is computed from the object's convex hull, in the object's own frame, once per process.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 DEEPEST = 0.035  # depth of the ee site below an object's top at which the palm just clears it [m]
 LEAST_HEIGHT = 0.012  # least height of an object on the table: fingers slip over lower ones [m]
 LEAST_ROOM = 0.002  # least clearance of an open gripper around an object [m]
-_DIRECTIONS = 500  # directions in which the points of a fine hull are looked for
+_DIRECTIONS = 500  # directions whose outermost points are kept of a finer hull
 _ALIKE, _COPLANAR = 0.2, 0.01  # angles between sides that count as one, and between faces of one side [rad]
 _FINGER = 0.012  # half a finger's width plus its sideways error [m]
 _LEVEL = 0.004  # spacing of the heights at which widths are measured [m]
@@ -29,16 +29,16 @@ _APART = math.radians(25)  # least angle between two grasps [rad]
 _SLOPE = 0.1  # slope of the sides at the fingertips above which the object is grasped as low as possible
 _STEEP = 0.2  # grasps whose slope at the fingertips exceeds the smallest by more than this are dropped
 _WIDER = 0.02  # grasps wider than the narrowest by more than this are dropped [m]
-_ROUND = 0.03  # share of the width by which a round object's may vary
+_ROUND = 0.03  # largest variation of a round object's width, as a share of it
 
 
 class Rest(NamedTuple):
     """A side on which an object rests.
 
-    down: unit vector, (3,). height: the body origin's; tall: the object's; above: its top's over the grasp [m].
-    For each of w grasps: across (w, 3), unit vector along the fingers' motion; centre (w, 3), between the fingers;
-    sizes: width between them and length across them [m]. fits: the fingers go around it, and it is not too low for
-    them. round: any yaw will do.
+    down: unit vector that then points down, (3,). height: of the body's origin over the table [m]; tall: of the object
+    [m]; above: of its top over the grasp [m]. For each of w grasps: across (w, 3), unit vector along the fingers'
+    motion; centre (w, 3), middle between the fingers [m]; sizes: width between them and length across them [m]. fits:
+    the fingers go around it, and it is not too low for them. round: any yaw will do.
     """
 
     down: F64
@@ -55,8 +55,8 @@ class Rest(NamedTuple):
 class Hull:
     """An object's convex hull, and the sides on which it rests, for one gripper.
 
-    extents: lengths of the box about the body's origin that holds it [m]. downs: directions (n, 3) that point down
-    when it rests; the first is that of its modelled orientation, or the nearest to that.
+    extents: lengths of the box about the body's origin that holds it [m]. downs: unit vectors (n, 3) that point down
+    when it rests, one per side; the first is the nearest to down in its modelled orientation.
     """
 
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
@@ -168,7 +168,7 @@ def _turns(hull: ConvexHull, axes: F64) -> F64:
 
 
 class _Way(NamedTuple):
-    """turn: direction of the fingers' motion [rad]; middle: their middle along it, from the centre of mass [m]."""
+    """A grasp. turn: direction of the fingers' motion [rad]; middle: offset along it from the centre of mass [m]."""
 
     turn: float
     width: float

@@ -23,7 +23,7 @@ _SIZES = {
     "capsule": "DIAMETER or DIAMETERxLENGTH",
 }
 KINDS = tuple(_SIZES)
-ANY = "any"  # one of those kinds in each episode
+ANY = "any"  # one of `KINDS` in each episode
 _SIZES[ANY] = "WIDTH"
 MESH = "mesh"
 LONGEST_MESH = 0.2  # [m]
@@ -35,9 +35,9 @@ SHAPE_HELP = (
 
 @dataclass(frozen=True)
 class Shape:
-    """A wooden solid. kind: box, cylinder, sphere, capsule or mesh; lengths: along its own axes x, y and z [m].
+    """A wooden solid. kind: one of `KINDS`, mesh or any; lengths: along its own axes x, y and z [m].
 
-    any: one of these that a world draws, of the same width; a cube if nothing is drawn.
+    any: each episode draws one of `KINDS`, of the same width; a cube if nothing is drawn.
     Cylinders and capsules have their axis along z, and a capsule's length is that between the tips of its round ends.
     Raises `UsageError` for a length outside `SHORTEST` to `LONGEST`, or a capsule no longer than wide.
     """

@@ -48,7 +48,7 @@ class Rung:
 class Start:
     """Drawn start of an episode: (position (3,) [m], quaternion wxyz (4,)) of objects and mocap bodies.
 
-    What it does not name starts where `build` put it.
+    Bodies that are not named start where `build` put them.
     """
 
     poses: Mapping[str, tuple[F64, F64]]
@@ -129,7 +129,7 @@ class Task(Protocol):
 
 @runtime_checkable
 class Instructing(Protocol):
-    """A task whose text differs between episodes; the state holds which one, as a mocap body's pose."""
+    """A task whose text differs between episodes; a mocap body's pose in the state says which text it is."""
 
     def objects_in(self, world: World) -> tuple[str, ...]:
         """Return the objects that the text of a world's episode is about, which the arm must reach."""
@@ -174,7 +174,7 @@ class TakesArgument(Protocol):
 
     @property
     def argument_bodies(self) -> tuple[str, ...]:
-        """Mocap bodies whose places encode the variant; redrawn scenes keep them."""
+        """Mocap bodies whose places encode the variant; they stay when a scene is redrawn."""
         ...
 
 

@@ -55,9 +55,9 @@ class Clock:
 
 
 class Window:
-    """A window that shows a scene, `control_hz` times a second. sliders: open the right panel, which has them.
+    """A window that shows a scene, `control_hz` times a second.
 
-    Raises `RenderError` if there is no display.
+    sliders: open the right panel, which has the control sliders. Raises `RenderError` if there is no display.
     """
 
     def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):

@@ -26,7 +26,7 @@ from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
 
 PICTURE = "assets/episodes.png"
 _FRAMES, _EPISODES = 6, 50  # frames per camera, and episodes whose paths are drawn
-_OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is written again
+_OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is ours and is replaced
 _NOT_SHOWN = re.compile(  # lines of options that are paths, concern one machine, or may be secrets
     r"/|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
     r"image_cache_gb|log_freq|save_freq|tensorboard):|(?i:token|secret|passw|credential|api_?key)"
@@ -36,7 +36,7 @@ _NOT_SHOWN = re.compile(  # lines of options that are paths, concern one machine
 def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, Path]:
     """Write a card and a picture into `folder`; return them by their paths in the repository. place: USER/NAME.
 
-    A `README.md` that is not ours is kept, and the result has none. Raises `ManipError` if the folder cannot be read.
+    A `README.md` that is not ours is kept, and is not in the result. Raises `ManipError` if the folder cannot be read.
     """
     made, dataset = dict[str, Path](), Dataset.open(root) if kind == "dataset" else None
     if dataset and draw_picture(dataset, folder / "episodes.png"):

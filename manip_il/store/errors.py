@@ -58,7 +58,7 @@ def explained(what: str) -> Generator[None]:
 
 
 def redact(text: str, words: Iterable[str] = ()) -> str:
-    """Hide likely secrets in `text`, secrets in environment variables, and passwords in the addresses in `words`."""
+    """Hide secrets in `text`: likely ones, those in environment variables, and passwords of addresses in `words`."""
     secrets = {value for name, value in os.environ.items() if _SECRET_VARIABLE.search(name)}
     for word in words:
         password = (word.partition("://")[2] or word).partition(":")[2].rpartition("@")[0]

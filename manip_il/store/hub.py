@@ -65,7 +65,7 @@ class Hub:
             return Manifest(self.kind, files, head, copies=frozenset(copies if are_equal else ()))
 
     def additions(self, source: Path, local: Mapping[str, Path], folder: Path) -> dict[str, Path]:
-        """Write the card and its picture into `folder`; return them, and copies of a run's policy for the root."""
+        """Write the card and its picture into `folder`; return them and a run's policy, by paths at the root."""
         from manip_il.store.cards import write_cards  # imported here because no other remote needs matplotlib
 
         added = write_cards(source, self.kind, self._place, folder)
@@ -73,7 +73,7 @@ class Hub:
         return added if copies.keys() & local.keys() else added | {name: local[path] for name, path in copies.items()}
 
     def write(self, plan: PushPlan) -> None:
-        """Commit on top of `plan.before`, which the Hub refuses if that is outdated; move a dataset's tag."""
+        """Commit on top of `plan.before` (the Hub refuses if it is outdated), then move a dataset's tag."""
         with explained(f"push to {self.name}"):
             before = plan.before or self._create()
             gone = before.files.keys() - plan.manifest.files.keys()
@@ -97,7 +97,7 @@ class Hub:
         shutil.rmtree(folder / ".cache")  # the library's records of the download
 
     def _create(self) -> Manifest:
-        """Create the repository and the branch; return its content: nothing, or that of the main branch."""
+        """Create the repository and the branch; return the branch's content: empty, or as on the main branch."""
         self._api.create_repo(**self._repo, private=self._private, exist_ok=True)
         if self._revision:
             self._api.create_branch(**self._repo, branch=self._revision, exist_ok=True)

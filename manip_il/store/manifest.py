@@ -61,7 +61,7 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Files by path. version: its id on the remote. copies: files copied from a run's policy, not pulled."""
+    """Files by path. version: its id on the remote. copies: a run's policy repeated at the root, not pulled."""
 
     kind: Kind
     files: Mapping[str, File]
@@ -93,7 +93,7 @@ class Manifest:
 
 @dataclass(frozen=True)
 class PushPlan:
-    """Difference between a folder and the version before. local: the manifest's files. upload, remove: paths."""
+    """Difference between a folder and the remote's version (`before`). local: path -> file. upload, remove: paths."""
 
     manifest: Manifest
     before: Manifest | None

@@ -74,7 +74,7 @@ class Sftp(SFTPFileSystem):
 class Objects:
     """A folder in any file system that fsspec supports. quiet: show no progress."""
 
-    kind: Kind | None = None  # the address does not tell
+    kind: Kind | None = None  # the address does not say which
 
     def __init__(self, scheme: str, url: str, *, quiet: bool = False):
         """Raises `UsageError` for a scheme without a package, and for an invalid address."""
@@ -140,7 +140,7 @@ class Objects:
         return {"callback": bar, **({"batch_size": at_once} if self._fs.async_impl else {})}
 
     def _switch(self, new: Manifest, before: Manifest | None) -> None:
-        """Replace the manifest if it is still `before`: on S3 atomically; elsewhere it is read just before."""
+        """Replace the manifest if it is still `before`: on S3 atomically; elsewhere it is read again just before."""
         found, version = self.read(), before.version if before else None
         try:
             if (found.version if found else None) != version:

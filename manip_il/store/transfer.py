@@ -55,7 +55,7 @@ def open_remote(url: str, *, revision: str | None = None, private: bool = False,
 def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> PushPlan:
     """Push a folder, or with `dry_run` nothing; return the differences.
 
-    journals: include them. Raises `NotWhole` for a dataset, also in a run, in which a check finds errors, `UsageError`
+    journals: include them. Raises `NotWhole` if a check finds errors in the dataset, or in one of a run's, `UsageError`
     if a dataset is pushed to a policy's address or vice versa, and `RemoteError`.
     """
     kind: Kind = "dataset" if (source / INFO).is_file() else "policy"
@@ -71,7 +71,7 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
             raise NotWhole(f"{text}; see all with manip-il data check, and try manip-il data repair {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         local = list_files(source.absolute(), kind, journals=journals)
-        if isinstance(remote, Hub):  # from elsewhere, a pull returns the unchanged folder
+        if isinstance(remote, Hub):  # other remotes hold the folder unchanged
             local |= remote.additions(source, local, Path(folder))
         before = remote.read()
         if before and before.kind != kind:
@@ -103,7 +103,7 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
     beside, skip = journals_of(target), len(f"{JOURNALS}/")
     journals = [path for path in files if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")]
     if beside.exists() and not overwrite and not all(files[path].fits(beside / path[skip:]) for path in journals):
-        raise FolderExistsError(beside)  # unless it is left from a killed pull
+        raise FolderExistsError(beside)  # equal journals are left from a killed pull
     with atomic.new_folder(target, replace=overwrite) as partial:
         _fetch(partial, remote, manifest)
         for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from manip_il.errors import UsageError
+from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
@@ -94,7 +94,8 @@ def _with_task(config: EnvConfig) -> EnvConfig:
 def _of_stock(config: EnvConfig) -> EnvConfig:
     """Return settings with the stock robot's fixed values; raises `UsageError` if another value was given."""
     robot = stock.ROBOTS[config.robot]
-    stock.get_stock(config.task, config.robot)
+    if config.task not in robot.tasks:
+        raise UnknownName(f"task of {config.robot}", config.task, robot.tasks)
     if config.object:
         raise UsageError(f"object is {config.object}; {config.robot} is unmodified, so omit --task.object")
     for name, value in robot.fixed.items():

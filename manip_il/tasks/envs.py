@@ -8,7 +8,7 @@ from typing import Any
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import Condition
-from manip_il.sim.config import DT_SIM, CameraConfig, Look
+from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import Scene, build_scene
 from manip_il.sim.task import Task
@@ -16,12 +16,12 @@ from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.table import get_task
 
 
-def scene_of(robot: str, task: str, shape: str = "", step: float = DT_SIM) -> Scene:
+def scene_of(robot: str, task: str, shape: str = "") -> Scene:
     """Return the compiled scene of a robot and a task, given by name or file.
 
-    shape: the object's, as in `EnvConfig.object`. step: physics time step [s]. Raises `UnknownName`, `UsageError`.
+    shape: the object's, as in `EnvConfig.object`. Raises `UnknownName`, `UsageError`.
     """
-    return build_scene(get_robot(robot), get_task(task, shape), step)
+    return build_scene(get_robot(robot), get_task(task, shape))
 
 
 def config_scene(config: EnvConfig) -> Scene:

@@ -214,8 +214,6 @@ def _nearest(
 
 def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
     """Return how much the open fingers of a grasp would hit a neighbour of the object, 0 to 1."""
-    if not neighbours:
-        return 0.0
     thick, half, clear = FINGER
     c, s, worst = math.cos(yaw), math.sin(yaw), 0.0
     for x, y in neighbours:
@@ -282,8 +280,6 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
 
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
     """Return the angle of a hand (3, 3) from pointing down [rad], less what it may lean (`lean`: 0 to 1)."""
-    if not lean:
-        return angle
     free = min(angle_off_vertical(hand), lean * LEAN)
     return math.sqrt(max(0.0, angle * angle - free * free))
 

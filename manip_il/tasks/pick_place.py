@@ -42,7 +42,7 @@ class PickPlace:
     def with_shape(self, shape: Shape) -> Self:
         """Return the task with another object, which its instruction also names."""
         instruction = self.instruction.replace(self.shape.word, shape.word)
-        limits = Limits() if shape == CUBE else ANY_SHAPE
+        limits = self.limits if shape == CUBE else ANY_SHAPE
         return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, limits=limits)
 
     def build(self, spec: mujoco.MjSpec) -> None:
@@ -62,7 +62,9 @@ class PickPlace:
 
     def observe(self, world: World) -> Observed:
         """Return hand, goal, cube and the vectors between them; cosine and sine of four times a cube's yaw."""
-        return observe_cube(world, OBJECT)
+        to_goal = world.goal - world.pose(OBJECT).position
+        seen = observe_object(world, OBJECT)
+        return {**observe_hand(world), "goal": world.goal, **seen, f"goal_from_{OBJECT}": to_goal}
 
     def error(self, world: World) -> float:
         """Return the distance of the cube's centre from the goal [m]."""
@@ -98,13 +100,6 @@ class Lift(PickPlace):
 
         goal, at, turn = draw_until(draw_both, lambda drawn: drawn[0] is not None, world, "the goal")
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
-
-
-def observe_cube(world: World, name: str) -> Observed:
-    """Return `environment_state` of a task with one cube and a goal for it."""
-    goal = world.goal
-    way = goal - world.pose(name).position
-    return {**observe_hand(world), "goal": goal, **observe_object(world, name), f"goal_from_{name}": way}
 
 
 def observe_object(world: World, name: str) -> Observed:

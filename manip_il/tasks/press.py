@@ -48,10 +48,6 @@ def _aim(world: World) -> Target:
     return Target(at, hand_down(world.ahead(at)), CLOSED)
 
 
-def _is_down(world: World) -> bool:
-    return TRAVEL - pressed(world) < STOPPED
-
-
 class Press:
     """Press a button to its stop against its spring, and keep it there for a moment."""
 
@@ -62,7 +58,7 @@ class Press:
     grasped = ()
     sizes = None
     rungs = (
-        Rung("pressed", _is_down, _aim),
+        Rung("pressed", lambda w: TRAVEL - pressed(w) < STOPPED, _aim),
         Rung("press", lambda w: _off(w) < OVER, _aim),
         Rung("approach", lambda w: True, _aim),
     )

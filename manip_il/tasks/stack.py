@@ -58,10 +58,6 @@ def _let_go(world: World) -> Target:
     return let_go(world, TOP, grasp_of(world, TOP).half + AWAY)
 
 
-def _carry(world: World) -> Target:
-    return carry(world, TOP, place_on_base(world) - [0.0, 0.0, PRESS], OVER_BASE)
-
-
 class Stack:
     """Put the red cube on the blue one and let go: it must stand by itself for a second."""
 
@@ -74,7 +70,7 @@ class Stack:
     rungs = (
         Rung("done", lambda w: stands(w) and _hand_is_away(w), _let_go),
         Rung("let_go", lambda w: stands(w) or _rests(w), _let_go),
-        Rung("carry", lambda w: held(w, TOP), _carry),
+        Rung("carry", lambda w: held(w, TOP), lambda w: carry(w, TOP, place_on_base(w) - [0.0, 0.0, PRESS], OVER_BASE)),
         *grasp_rungs(lambda w: TOP),
     )
 

@@ -60,12 +60,15 @@ def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
 
 
 def draw_resting(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> F64:
-    """Draw a resting place of an object's centre, (3,) [m], not under the hand; room: see `has_room`."""
+    """Draw a resting place of an object's centre, (3,) [m], not under the hand; room: see `draw_resting_place`."""
     return draw_resting_place(rng, world, name, resting_height(world, name), room)
 
 
 def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
-    """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's start."""
+    """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's start.
+
+    room: how far around it the hand reaches, too [m], so that an object that is knocked stays within reach.
+    """
     space = world.scene.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
@@ -73,18 +76,10 @@ def draw_resting_place(rng: np.random.Generator, world: World, name: str, height
         return np.append(draw_xy(rng, world), height)
 
     def fits(at: F64) -> bool:
-        return bool(np.linalg.norm(at[:2] - centre) >= apart) and has_room(world, at, room)
+        around = ((0, 0, 0), (room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0))
+        return bool(np.linalg.norm(at[:2] - centre) >= apart) and all(world.reach.has(at + way) for way in around)
 
     return draw_until(draw, fits, world, name)
-
-
-def has_room(world: World, at: F64, room: float) -> bool:
-    """Return whether the hand reaches a point (3,) and the points `room` around it [m].
-
-    With that margin, an object that is knocked stays within reach.
-    """
-    around = ((room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0)) if room else ()
-    return world.reach.has(at) and all(world.reach.has(at + np.array(way)) for way in around)
 
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:

@@ -93,7 +93,7 @@ def _named(name: str) -> Task:
         return TASKS[name]
     entry = _entry_point(name)
     if entry is None:
-        raise UnknownName("task", name, TASKS, f"known: {', '.join(sorted(TASKS))}, or the path of a Python file")
+        raise UnknownName("task", name, (*TASKS, "the path of a Python file"))
     try:
         cls = entry.load()
     except Exception as error:

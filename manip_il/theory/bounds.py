@@ -2,8 +2,9 @@
 
 Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross & Bagnell 2010).
 Theorem 8.2: one that errs in a share eps of its own states loses at most u H eps; u is the largest cost of one wrong
-step if the expert then drives (Ross et al. 2011, Theorem 2.2; the chapter has u in its constant). Rewards are 0 to 1
-per step. Policies are fitted to trajectories; in states without data they take the worst action, as theory allows.
+step if the expert then drives (Ross et al. 2011, Theorem 2.2; stated as H eps, it has u in its constant). Rewards are
+0 to 1 per step. Policies are fitted to trajectories; in states without data they take the worst action, as the theorems
+allow.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ def _theorems(theory: Theory) -> Section:
         tables=(slope_table(theory),),
         notes=(
             "Log-log slopes of gap over error, with 95 % bootstrap intervals over the draws of data. u is the largest "
-            "cost of one wrong step if the expert then drives. The chapter has H ε with u in its constant: if no "
+            "cost of one wrong step if the expert then drives. Stated as H ε, the theorem has u in its constant: if no "
             "recovery is possible, as on the tightrope, u is H, and DAgger loses as much as cloning (Ross et al. 2011; "
             "Rajaraman et al. 2020).",
             f"Points: {DRAWS} fits per horizon, to trajectories that leave about {ERROR:g}/H of the states unseen; in "
@@ -223,7 +223,7 @@ def _arm(shift: Shift) -> list[Section]:
 
 def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
     """Positions of the hand in the data and in the policy's rollouts, from above and from the side, by round."""
-    if len(rounds) > _CLOUDS:  # most of the early rounds, in which most changes
+    if len(rounds) > _CLOUDS:  # mostly early rounds, which differ most
         rounds = [rounds[index] for index in (0, 1, 2, (len(rounds) + 2) // 2, len(rounds) - 1)]
     with drawing(len(rounds), 2, size=(9.0 / len(rounds), 2.2), share=True) as (drawn, axes):
         for column, one in enumerate(rounds):

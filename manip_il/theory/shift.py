@@ -33,7 +33,7 @@ from manip_il.tasks.config import EnvConfig
 F64 = NDArray[np.float64]
 EPISODES = 50  # episodes of the expert and of each round's policy
 WRONG = 0.25  # an action is wrong if any joint is off the label by more than this share of its largest step
-MOST_STATES = 4_000  # training states that are compared
+MOST_STATES = 4_000  # largest number of training states to compare with
 _HAND = ("ee.x", "ee.y", "ee.z")
 _OBSERVED = (schema.STATE, schema.ENVIRONMENT_STATE)
 _COLUMNS = (*_OBSERVED, schema.ACTION, schema.EXECUTED_ACTION, schema.LABEL_VALID)
@@ -197,7 +197,7 @@ def _is_wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.b
 
 
 def relative_distance(states: F64, data: F64, fresh: F64) -> float:
-    """Return the median distance of states (N, d) to their nearest in the data (M, d), relative to that of `fresh`.
+    """Return the median distance of states (N, d) to the nearest row of the data (M, d), relative to that of `fresh`.
 
     fresh: the expert's states in new episodes, (F, d). Columns are scaled by the data's standard deviations.
     """

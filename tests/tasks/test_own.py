@@ -151,7 +151,7 @@ def test_a_package_brings_names(touch, monkeypatch):
     monkeypatch.setattr(table, "entry_points", lambda group, name: [Entry()] if name == "touch" else [])
     table._named.cache_clear()
     assert get_task("touch").instruction == "Touch the top of the cube."
-    with pytest.raises(UnknownName, match="or the path of a Python file"):
+    with pytest.raises(UnknownName, match="the path of a Python file"):
         get_task("tuch")
     with pytest.raises(UsageError, match="does not exist"):
         get_task("tuch.py")

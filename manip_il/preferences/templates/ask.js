@@ -17,7 +17,7 @@ function keep() {
 
 function recall() {
   try {
-    localStorage.setItem(key + " probe", "");  // under another key: a reload may come before what was kept is here
+    localStorage.setItem(key + " probe", "");  // another key: right after a reload, saved answers may not be here yet
     localStorage.removeItem(key + " probe");
   } catch {
     keeps = false;
@@ -37,7 +37,7 @@ function recall() {
 function film(name, base64) {
   const video = element(name);
   video.src = "data:video/mp4;base64," + base64;
-  video.play().catch(() => {});  // a browser that plays nothing by itself shows the first picture
+  video.play().catch(() => {});  // a browser that blocks autoplay shows the first picture
 }
 
 function show() {
@@ -88,7 +88,7 @@ document.addEventListener("keydown", (event) => {
   if (event.target === who || event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   if (event.key === "u" || event.key === "U") undo();
   else if (keys[event.key]) {
-    event.preventDefault();  // an arrow would scroll
+    event.preventDefault();  // arrow keys would scroll the page
     answer(keys[event.key]);
   }
 });

@@ -151,15 +151,11 @@ class Grid:
         while path and path[-1] != nodes[-1]:
             begin = len(nodes) - 1 - nodes[::-1].index(path[-1])  # skips detours that return to this node
             nodes = nodes[begin:]
-            ahead = [place for place, node in enumerate(nodes[1:_LOOK], 1) if self.joined(path[-1], node)]
+            ahead = [place for place, node in enumerate(nodes[1:_LOOK], 1) if self.problem.numbers[path[-1], node]]
             last = ahead[-1] if ahead else 1
             path += [nodes[last]] if ahead else self._between(path[-1], nodes[last])
             nodes = nodes[last:]
         return np.array(path, np.int64)
-
-    def joined(self, start: int, end: int) -> bool:
-        """Return whether an edge leads from one node to another."""
-        return bool(self.problem.numbers[start, end])
 
     def _between(self, start: int, end: int) -> list[int]:
         lengths = PathProblem(self._links.edges, self._links.cells[:, None], len(self.points), end)

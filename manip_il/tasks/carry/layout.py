@@ -121,18 +121,12 @@ class Layout:
         If it is negative, object or hand is nearer to an obstacle than `ASIDE` or `ABOVE`.
         """
         found = np.full(len(points), np.inf)
-        bottoms, radii = self._parts
+        bottoms, radii = np.array(self.parts).T
         for _, middle, half, height in self.boxes:
             over = points[:, 2, None] + (bottoms - (height + ABOVE))
             beside = _beside(points, middle, half)[:, None] - (radii + ASIDE)
             np.minimum(found, np.maximum(beside, over).min(axis=1), out=found)
         return found
-
-    @cached_property
-    def _parts(self) -> tuple[F64, F64]:
-        """Bottoms and radii of the parts, (P,) each [m]."""
-        bottoms, radii = np.array(self.parts).T
-        return bottoms, radii
 
     def is_free(self, start: F64, end: F64, spare: float) -> bool:
         """Return whether a straight line from (3,) to (3,) [m] keeps room to spare [m]."""

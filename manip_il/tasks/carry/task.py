@@ -38,7 +38,7 @@ from manip_il.tasks.carry.obstacles import (
 )
 from manip_il.tasks.grasp import grasp_of, once_per_state
 from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
-from manip_il.tasks.pick_place import OBJECT, PickPlace, observe_cube
+from manip_il.tasks.pick_place import OBJECT, PickPlace
 from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying, draw_xy, turn_left
 
 NAME = "carry"
@@ -118,6 +118,7 @@ class Carry(PickPlace):
     name: str = NAME
     instruction: str = "Carry the cube past what stands on the table to the green goal."
     limits: Limits = Limits(horizon=200)
+    argument_bodies = TASTE_BODIES
     rungs: tuple[Rung, ...] = (
         Rung("at_goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
         Rung("carry", lambda w: held(w, OBJECT), _to_goal),
@@ -165,7 +166,7 @@ class Carry(PickPlace):
 
     def observe(self, world: World) -> Observed:
         """Return what `pick_place` observes, and every obstacle's position and presence, but not the reward."""
-        return {**observe_cube(world, OBJECT), **observe_obstacles(world)}
+        return {**super().observe(world), **observe_obstacles(world)}
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label (obstacles overlap, no room for the hand, no path to the goal), or ""."""
@@ -179,11 +180,6 @@ class Carry(PickPlace):
         else:
             leads = descent_of(world).leads(at)
         return "" if leads else "no free path to the goal"
-
-    @property
-    def argument_bodies(self) -> tuple[str, ...]:
-        """Bodies that hold the reward."""
-        return TASTE_BODIES
 
     def progress(self, world: World) -> float:
         """Return progress by the distance to the grasp, then by the cost-to-go over the cost of a metre at the goal."""

@@ -12,13 +12,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-# Import this first: it chooses the OpenGL backend before mujoco is imported.
-import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import MismatchError
 from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.tasks.stock.base import WHOLE, StockBase
-from manip_il.tasks.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
+from manip_il.tasks.stock.table import STATE_NAMES, STOCK, TOLERANCE, StockTask
 
 
 class StockActions(ActionSpace):
@@ -39,9 +37,8 @@ class StockEnv(StockBase):
     actions = ACTIONS
 
     def __init__(self, task: str):
-        found = get_stock(task)
-        assert isinstance(found, StockTask)
-        self.task, self.task_description = found, found.instruction
+        self.task = STOCK[task]
+        self.task_description = self.task.instruction
         self._env = _make(self.task)
         self.model: mujoco.MjModel = self._env.model
         self.data: mujoco.MjData = self._env.data
@@ -63,11 +60,8 @@ class StockEnv(StockBase):
     @property
     def progress(self) -> float:
         """Share of the task that is done: 1 within the tolerance, 0.5 at twice that distance."""
-        return TOLERANCE / max(TOLERANCE, self.distance())
-
-    def distance(self) -> float:
-        """Return the distance of the cube, or the gripper if there is none, from the goal [m]."""
-        return float(np.linalg.norm((self.object if self.task.has_object else self.gripper) - self.goal))
+        left = np.linalg.norm((self.object if self.task.has_object else self.gripper) - self.goal)
+        return TOLERANCE / max(TOLERANCE, float(left))
 
     @property
     def gripper(self) -> F64:

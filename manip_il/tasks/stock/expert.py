@@ -56,16 +56,8 @@ def _to_grasp(env: StockEnv) -> F64:
     return _to_cube(env) + [0, 0, GRASP_HEIGHT]
 
 
-def _reach(env: StockEnv) -> tuple[F64, float]:
-    return env.goal - env.gripper, CLOSE
-
-
 def _holds(env: StockEnv) -> bool:
     return bool((np.abs(_to_grasp(env)) < GRASPED).all() and env.opening < HELD)
-
-
-def _carry(env: StockEnv) -> tuple[F64, float]:
-    return env.goal - env.object, CLOSE
 
 
 def _between(env: StockEnv) -> bool:
@@ -95,10 +87,6 @@ def _rests_at_goal(env: StockEnv) -> bool:
     velocity = env.object_velocity[:2]
     left = (env.goal - env.object)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
     return bool(np.hypot(*left) < AT_GOAL)
-
-
-def _stay(env: StockEnv) -> tuple[F64, float]:
-    return np.zeros(3), CLOSE
 
 
 def _direction(env: StockEnv) -> F64:
@@ -203,15 +191,15 @@ def _is_free(start: F64, end: F64) -> bool:
 
 
 LADDERS: dict[str, tuple[StockRung, ...]] = {
-    "FetchReach-v4": (StockRung("approach", always, _reach),),
+    "FetchReach-v4": (StockRung("approach", always, lambda env: (env.goal - env.gripper, CLOSE)),),
     "FetchPush-v4": (
-        StockRung("hold", _rests_at_goal, _stay),
+        StockRung("hold", _rests_at_goal, lambda env: (np.zeros(3), CLOSE)),
         StockRung("push", _is_behind, _push),
         StockRung("approach", _is_better_over, _over_cube),
         StockRung("approach", always, _around),
     ),
     "FetchPickAndPlace-v4": (
-        StockRung("carry", _holds, _carry),
+        StockRung("carry", _holds, lambda env: (env.goal - env.object, CLOSE)),
         StockRung("grasp", _between, _grasp),
         StockRung("approach", always, _over),
     ),

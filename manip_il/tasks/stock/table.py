@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from manip_il.errors import UnknownName
 from manip_il.sim.config import OTHERS
 
 ROBOT = "fetch_stock"
@@ -161,11 +160,3 @@ ROBOTS = {
         ends_solved=True,
     ),
 }
-
-
-def get_stock(name: str, robot: str = ROBOT) -> StockTask | AlohaTask:
-    """Return the table's entry; raises `UnknownName`."""
-    tasks = ROBOTS[robot].tasks
-    if name not in tasks:
-        raise UnknownName(f"task of {robot}", name, tasks)
-    return tasks[name]

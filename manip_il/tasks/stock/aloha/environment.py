@@ -11,8 +11,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-# Import this first: it chooses the OpenGL backend before mujoco is imported.
-import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
@@ -21,7 +19,7 @@ from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
 from manip_il.tasks.stock.aloha.ladder import AlohaScene, read_hand
 from manip_il.tasks.stock.base import WHOLE, StockBase
-from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, AlohaTask, get_stock
+from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, ALOHA_TASKS
 
 INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
 MOST_REWARD = 4
@@ -53,10 +51,9 @@ class AlohaEnv(StockBase):
     """
 
     def __init__(self, task: str, cameras: CameraConfig | None = None):
-        found = get_stock(task, ALOHA)
-        assert isinstance(found, AlohaTask)
-        self.task, self.task_description, self._cameras = found, found.instruction, cameras
-        self._env = _gym_aloha().AlohaEnv(found.own, obs_type="pixels_agent_pos")
+        self.task, self._cameras = ALOHA_TASKS[task], cameras
+        self.task_description = self.task.instruction
+        self._env = _gym_aloha().AlohaEnv(self.task.own, obs_type="pixels_agent_pos")
         self.physics = self._env._env.physics
         self.draw = self.physics.render
         self.physics.render = lambda **_: _BLANK  # it would draw three pictures in every step, whatever is observed

@@ -83,10 +83,6 @@ class Transfer(AlohaScene):
         return float(np.linalg.norm(self.cube - MEETING))
 
 
-def _is_handed(scene: Transfer) -> bool:
-    return scene.left_holds and scene.left.gap < LEFT_CLOSED
-
-
 def _let_go(scene: Transfer) -> HandTarget:
     """Open, then back off."""
     hand = scene.right
@@ -98,14 +94,6 @@ def _let_go(scene: Transfer) -> HandTarget:
 def _carry(scene: Transfer) -> HandTarget:
     hand = scene.right
     return HandTarget(hand.position + MEETING - scene.cube, pitched(hand.outward, PITCH), CLOSED, CARRIED)
-
-
-def _left_may_close(scene: Transfer) -> bool:
-    return scene.lifted and scene.is_at_grasp("left", CUBE, scene.left_grasp)
-
-
-def _is_brought(scene: Transfer) -> bool:
-    return scene.right_holds and scene.lifted and scene.to_go < NEAR
 
 
 def _come(scene: Transfer) -> HandTarget:
@@ -122,12 +110,16 @@ RUNGS = {
         StockRung(
             "hold", lambda one: one.left_holds, lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED)
         ),
-        StockRung("close", _left_may_close, lambda one: close_on(one, CUBE, one.left_grasp, CARRIED)),
-        StockRung("come", _is_brought, _come),
+        StockRung(
+            "close",
+            lambda one: one.lifted and one.is_at_grasp("left", CUBE, one.left_grasp),
+            lambda one: close_on(one, CUBE, one.left_grasp, CARRIED),
+        ),
+        StockRung("come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come),
         StockRung("wait", always, _wait),
     ),
     "right": (
-        StockRung("release", _is_handed, _let_go),
+        StockRung("release", lambda one: one.left_holds and one.left.gap < LEFT_CLOSED, _let_go),
         StockRung("carry", lambda one: one.right_holds, _carry),
         *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
