@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -41,7 +41,6 @@ from manip_il.seeding import rng_for, stream_base, stream_seeds
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 Acting = Callable[[F32], F32]  # raw inputs (B, d) to raw targets (B, 1)
-Kept = TypeVar("Kept", bound=Discriminator)
 LOOPS: dict[str, Callable[..., Iterator[Any]]] = {"gail": gail, "airl": airl}
 LIMITS = {"gail": 0.95, "airl": 0.90}
 _TORQUE, _GRAVITY, _TOP = 2.0, 10.0, 0.5  # Pendulum-v1's [N m], [m/s^2]; angle at which the expert balances [rad]
@@ -162,7 +161,7 @@ class Run:
         self._learner = Learner(self._network, settings.ppo, self._envs, settings.episode_steps, settings.log_std)
         self._expert = shown.padded(settings.episode_steps, actions.normalised)
 
-    def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
+    def keep(self, make: Callable[[MLPNetwork], Discriminator]) -> Discriminator:
         seed_generators(self._stream("discriminator"))
         return make(self._network)
 

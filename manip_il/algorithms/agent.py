@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +28,6 @@ from manip_il.learn.training_state import PRETRAINED_MODEL, TRAINING_STATE, new_
 from manip_il.learn.transitions import Transitions, read_demonstrations
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-
-Kept = TypeVar("Kept", bound=Discriminator)
 
 
 class Agent:
@@ -63,7 +61,7 @@ class Agent:
             self._learner = Learner(self._policy.model, config.ppo, self.envs, horizon, log_std, clone=clone)
         self._expert = demonstrations.padded(horizon, actions.normalised) if demonstrations else None
 
-    def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
+    def keep(self, make: Callable[[MLPNetwork], Discriminator]) -> Discriminator:
         """Return `make(network)`, a discriminator that is saved with the agent. network: the actor's."""
         seed_generators(self._stream("discriminator"))
         self._modules["discriminator"] = made = make(self._policy.model)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.names import MLP
 from manip_il.option import Seeded, check_bounds, option
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, make_config
@@ -174,8 +173,6 @@ class RunConfig(Seeded):
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
     """Return how many actions a policy plans at once, and how many frames of an episode's end it does not learn."""
-    if fit.kind == MLP:  # avoids importing LeRobot, which takes seconds
-        return 1, 0
     from manip_il.learn.lerobot_config import policy_config
 
     policy = policy_config(fit)

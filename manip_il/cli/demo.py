@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.tables import PolicyRow
 
 RUN: Given = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # replace the defaults of dagger
+ENOUGH = 1.25  # demonstrations recorded for a number of labels, relative to what round 0 suggests
 FIT: Given = {"steps": 3_000, "batch_size": 256}
 
 
@@ -76,16 +78,18 @@ class DemoOptions:
         self, config: RunConfig, folder: Path, engine: Engine, stages: Stages
     ) -> tuple[list[Path | None], list[PolicyRow]]:
         """Run DAgger, clone from as many labels, and test both, round 0 and the expert (policy None)."""
-        from manip_il.algorithms.cloning import clone_with_labels
         from manip_il.algorithms.results import best_result
+        from manip_il.algorithms.run import Run
         from manip_il.evaluation.runner import Trial
         from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, PolicyRow
         from manip_il.seeding import stream_seeds
 
         results = run_rounds(config, folder / "dagger", engine, stages)
         first, best = results[0], best_result(results)
-        most, dagger, cloning = results[-1].labels, folder / "dagger", folder / "cloning"
-        policy, labels = clone_with_labels(config, most, dagger, cloning, engine, stages.watch())
+        most = results[-1].labels
+        run = Run(replace(config, label_budget=most), folder / "cloning", engine, stages.watch())
+        more = run.demonstrations(math.ceil(ENOUGH * config.demonstrations * most / first.labels))
+        policy = run.fit([more]).path
         trials = [
             Trial.of(config.env, stream_seeds("test", count, config.seed), suite)
             for suite, count in (("nominal", self.test_episodes), ("knocked", self.disturbed_episodes))
@@ -93,7 +97,7 @@ class DemoOptions:
         contestants = (
             ("expert", None, None, EXPERT),
             ("cloning", first.policy, first.labels, CLONING),
-            ("cloning with as many labels", policy, labels, CLONING),
+            ("cloning with as many labels", policy, more.labels, CLONING),
             (f"DAgger (round {best.number})", best.policy, best.labels, DAGGER),
         )
         rows = list[PolicyRow]()

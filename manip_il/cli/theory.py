@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -33,13 +34,14 @@ class TheoryOptions:
 
     def run(self) -> None:
         """Compute and measure; write the report and the JSON file; print the slopes."""
-        from manip_il.theory.bounds import all_curves
+        from manip_il.theory.bounds import curves
         from manip_il.theory.linear import drifts
+        from manip_il.theory.processes import PROCESSES
         from manip_il.theory.report import FILE_NAME, Theory, slope_table, theory_report
 
         with self.output.open(self) as folder:
             shift = self._shift(self.source) if self.source else None
-            theory = Theory(tuple(all_curves()), tuple(drifts()), shift)
+            theory = Theory(tuple(chain(*map(curves, PROCESSES))), tuple(drifts()), shift)
             page = theory_report(theory, command_line(), to_plain(self))
             fact = f"policies above their bound: {theory.above}"
             publish(folder / FILE_NAME, theory.to_json(), [slope_table(theory)], fact, page=page)

@@ -99,7 +99,7 @@ class ExportOptions:
 
     def run(self) -> None:
         """Export, compare, write."""
-        from manip_il.learn.checkpoint import policy_sha256, read_config
+        from manip_il.learn.checkpoint import read_config
         from manip_il.learn.export import export_onnx
 
         self.file.check()
@@ -107,12 +107,12 @@ class ExportOptions:
         if (kind := read_config(path)["type"]) not in EXPORTABLE:
             raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
         try:
-            exported = export_onnx(path, policy_sha256(path))
+            content, difference = export_onnx(path)
         except ImportError as error:
             raise ManipError(f"an ONNX file needs {error.name}: pip install 'manip_il[export]'") from error
-        write_file(self.file.output, exported.data)
-        say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
-        say(f"exported: {self.file.output} ({len(exported.data):,} bytes)")
+        write_file(self.file.output, content)
+        say(f"largest difference from {path} over random observations: {difference:.1e}")
+        say(f"exported: {self.file.output} ({len(content):,} bytes)")
 
 
 @dataclass(frozen=True)

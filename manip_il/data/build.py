@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import itertools
-import json
 import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,7 +16,7 @@ import numpy as np
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.atomic import write_file
+from manip_il.data.atomic import write_json
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints
@@ -54,7 +53,7 @@ class Recording:
 
     def write(self, journals: Path) -> None:
         """Write `recording.json` next to the journals."""
-        write_file(journals / RECORDING, (json.dumps(asdict(self), indent=1) + "\n").encode())
+        write_json(journals / RECORDING, asdict(self))
 
     @classmethod
     def read(cls, journals: Path) -> Recording:
@@ -64,7 +63,6 @@ class Recording:
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
         with reading(path):
             data = checks.read_json(path, "the settings of a recording")
-            checks.repo_id("repo_id", data.get("repo_id"))
             return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
 
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:

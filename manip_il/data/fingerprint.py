@@ -24,7 +24,7 @@ def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> di
 
     Equal fingerprints mean equal bytes. No package is imported for it; a missing one is `absent`.
     """
-    versions = {name: _version(name) for name in _PACKAGES}
+    versions = {name: metadata.version(name) for name in _PACKAGES}
     return {
         "python": platform.python_version(),
         **versions,
@@ -68,10 +68,3 @@ def canonical_json(value: Any) -> str:
     Also takes dataclasses. Raises `TypeError` for anything else.
     """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=dataclasses.asdict)
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "absent"

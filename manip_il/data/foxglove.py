@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,9 @@ SCALARS: dict[str, Any] = {
 }
 
 
-def frame_times(episode: Episode, spec: s.RobotTaskSpec) -> list[int]:
-    """Return every frame's log time [ns]."""
-    return [frame * NANOSECONDS // spec.fps for frame in range(len(episode))]
+def frame_times(count: int, rate: int | Fraction) -> list[int]:
+    """Return the times of an episode's frames [ns], from 0, at a rate [frames/s]."""
+    return [frame * NANOSECONDS * rate.denominator // rate.numerator for frame in range(count)]
 
 
 def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Messages:

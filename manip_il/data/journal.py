@@ -52,7 +52,7 @@ class Journal:
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=_RECORD)
         writer.add_metadata(_RECORD, _to_texts(self, episode))
-        times = foxglove.frame_times(episode, self.spec)
+        times = foxglove.frame_times(len(episode), self.spec.fps)
         channels = foxglove.episode_channels(episode, times, self.spec.joint_names)
         foxglove.add_channels(writer, channels, times)
         for key, column in episode.columns.items():

@@ -56,7 +56,7 @@ def write_dataset(
     raises `FolderExistsError` if `root` is not empty; then what `ordered_columns` raises, and `ManipError` if there are
     no episodes or the disk is full.
     """
-    about = features(spec), spec.fps, spec.lerobot_type, video
+    about = features(spec), spec.fps, spec.robot_type or spec.robot, video
     with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about)) as writer:
         for item in episodes:
             episode, films = (item, None) if isinstance(item, Episode) else item

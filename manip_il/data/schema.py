@@ -92,11 +92,6 @@ class RobotTaskSpec:
         return cls(**values)
 
     @property
-    def lerobot_type(self) -> str:
-        """The robot's name in LeRobot's `meta/info.json`."""
-        return self.robot_type or self.robot
-
-    @property
     def image_keys(self) -> dict[str, str]:
         """Column -> camera."""
         return {IMAGES + camera: camera for camera in self.cameras}
@@ -117,12 +112,13 @@ def robot_of(robot_type: str) -> dict[str, str]:
 def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
     joints, pictured = list(spec.joint_names), "video" if spec.video else "image"
+    points = [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
     pictures = {"dtype": pictured, "shape": (*spec.image_size, 3), "names": ["height", "width", "channels"]}
     return {
         STATE: _feature("float32", joints),
         ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
         **{key: dict(pictures) for key in spec.image_keys},
-        **{key: _feature("float32", keypoint_numbers(spec)) for key in spec.keypoint_keys},
+        **{key: _feature("float32", points) for key in spec.keypoint_keys},
         ACTION: _feature("float32", joints),
         EXECUTED_ACTION: _feature("float32", joints),
         ACTOR: _feature("int64", ["actor"]),
@@ -137,11 +133,6 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
         ROUND: _feature("int64", ["round"]),
         BETA: _feature("float32", ["beta"]),
     }
-
-
-def keypoint_numbers(spec: RobotTaskSpec) -> list[str]:
-    """Return the names of the numbers (3 K,) of a camera's keypoints."""
-    return [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
 
 
 def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,30 +59,18 @@ class Report:
 
     def render(self) -> str:
         """Return the page as one string of HTML."""
-        return _environment().get_template("report.html.j2").render(report=self)
+        environment = Environment(
+            loader=PackageLoader("manip_il.evaluation"),
+            autoescape=True,
+            trim_blocks=True,
+            lstrip_blocks=True,
+            undefined=StrictUndefined,
+        )
+        filters: dict[str, Any] = environment.filters
+        filters["base64"] = lambda content: base64.b64encode(content).decode("ascii")
+        filters["yaml"] = lambda tree: yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True)
+        return environment.get_template("report.html.j2").render(report=self)
 
     def write(self, path: Path) -> None:
         """Write the page to `path` atomically, creating its folder."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, self.render().encode())
-
-
-@cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("manip_il.evaluation"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-    )
-    environment.filters.update(base64=_base64, yaml=_yaml)
-    return environment
-
-
-def _base64(content: bytes) -> str:
-    return base64.b64encode(content).decode("ascii")
-
-
-def _yaml(tree: Mapping[str, Any]) -> str:
-    return yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True)

@@ -39,9 +39,9 @@ class Table:
         return Table(tuple(self.columns[i] for i in keep), rows, self.colours)
 
 
-def print_table(table: Table, console: Console | None = None) -> None:
+def print_table(table: Table) -> None:
     """Print the non-empty columns: in colour on a terminal, else as plain text."""
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     terminal = console.is_terminal
     if not terminal:
         console = Console(file=console.file, width=_PLAIN_WIDTH, color_system=None, highlight=False)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 _AT_ONCE = 16  # pictures processed at a time, so that intermediate results stay in the cache
 _GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue: ITU-R BT.601
@@ -59,7 +60,7 @@ def to_float(pictures: Tensor) -> Tensor:
 
 def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str, Any]:
     """Return the batch with its uint8 pictures, (B, 3, H, W), as float32 in [0, 1]."""
-    return batch | {key: to_float(batch[key]) for key in cameras if batch[key].dtype == torch.uint8}
+    return batch | {key: to_float(batch[key]) for key in cameras}
 
 
 @dataclass(frozen=True)
@@ -98,11 +99,7 @@ class Augment:
 def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
     """Crop pictures (B, 3, H, W), padded by `shift` pixels, starting at row and column `moves` (B, 2)."""
     height, width = pictures.shape[-2:]
-    # pad bytes, which are a quarter of the size of floats; torch's own padding does not accept bytes on a GPU
-    left, right = (side.expand(-1, -1, -1, shift) for side in (pictures[..., :1], pictures[..., -1:]))
-    wide = torch.cat([left, pictures, right], dim=3)
-    above, below = (side.expand(-1, -1, shift, -1) for side in (wide[..., :1, :], wide[..., -1:, :]))
-    padded = torch.cat([above, wide, below], dim=2)
+    padded = functional.pad(pictures.float(), (shift,) * 4, mode="replicate")
     for one, source, (y, x) in zip(target, padded, moves.tolist(), strict=True):
         one.copy_(source[:, y : y + height, x : x + width])
 

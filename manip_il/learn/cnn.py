@@ -23,7 +23,7 @@ from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.mlp import MLPConfig, MLPPolicy, offsets_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
-from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
+from manip_il.learn.network import MLPNetwork, Shape, fit_statistics, perceptron
 from manip_il.learn.samples import Table, valid_frames
 from manip_il.option import option
 
@@ -95,13 +95,6 @@ class CNNConfig(MLPConfig):
             raise UsageError(f"the cnn policy needs pictures (observation.images.*); the inputs are {have}")
 
 
-def _perceptron(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for size in (inputs, *[width] * (depth - 1)):
-        layers += [nn.Linear(size, width), nn.SiLU()]
-    return nn.Sequential(*layers, nn.Linear(width, outputs))
-
-
 class CNNPolicy(MLPPolicy):
     """LeRobot's policy interface to one `KeypointEncoder` per camera and an `MLPNetwork` on joints and keypoints.
 
@@ -155,7 +148,7 @@ class CNNPolicy(MLPPolicy):
         self.seen_size = sum(features[key].shape[0] for key in self.inputs) + sum(one.size for one in encoders)
         self.privileged = None
         if size:
-            self.privileged = _perceptron(self.seen_size, config.width, config.depth, size)
+            self.privileged = perceptron(self.seen_size, config.width, config.depth, size, nn.SiLU)
             self.register_buffer("truth_mean", torch.zeros(size))
             self.register_buffer("truth_scale", torch.ones(size))
         self.offsets = list(config.scaled) if size or ENVIRONMENT_STATE in self.inputs else []

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from manip_il.learn.adversarial_config import DiscriminatorConfig
-from manip_il.learn.network import MLPNetwork
+from manip_il.learn.network import MLPNetwork, perceptron
 from manip_il.learn.transitions import F32, Transitions
 
 LARGEST_REWARD = 10.0
@@ -51,8 +51,8 @@ class Discriminator(nn.Module):
         self.register_buffer("clamp", torch.tensor(network.clamp))
         self.register_buffer("free", (network.target_scale > 0).float())
         encoded = len(self.mean) + 1
-        self.g = _perceptron(encoded + len(self.free), config.width)
-        self.h = None if gamma is None else _perceptron(encoded, config.width)
+        self.g = perceptron(encoded + len(self.free), config.width, 2, 1, nn.ReLU)
+        self.h = None if gamma is None else perceptron(encoded, config.width, 2, 1, nn.ReLU)
         self._gamma = gamma or 0.0
         self.optimizer = torch.optim.Adam(self.parameters(), lr=config.lr, fused=True)
 
@@ -120,11 +120,6 @@ class Discriminator(nn.Module):
         given = torch.from_numpy(states)
         x, absorbing = (given[:, :-1] - self.mean) * self.scale, given[:, -1:]
         return torch.cat([x.clamp(-self.clamp, self.clamp) * (1.0 - absorbing), absorbing], dim=1)
-
-
-def _perceptron(inputs: int, width: int) -> nn.Sequential:
-    """Return a network of two hidden layers with one output, (B, inputs) to (B, 1)."""
-    return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 1))
 
 
 def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:

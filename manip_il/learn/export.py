@@ -11,7 +11,6 @@ import json
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, override
 
@@ -23,6 +22,7 @@ from torch import Tensor, nn
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
+from manip_il.learn.checkpoint import policy_sha256
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
@@ -34,15 +34,6 @@ _UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
 _UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
 
 Arrays = dict[str, NDArray[Any]]
-
-
-@dataclass(frozen=True)
-class Exported:
-    """A file's content, metadata, and largest difference from the checkpoint's actions on random observations."""
-
-    data: bytes
-    metadata: dict[str, Any]
-    difference: float
 
 
 class PolicyFunction(nn.Module):
@@ -69,17 +60,22 @@ class PolicyFunction(nn.Module):
         return self.network.actions(self.policy.network_inputs({**batch, **pictures}))
 
 
-def export_onnx(path: Path, policy_sha256: str) -> Exported:
-    """Return the policy in a `pretrained_model` folder as ONNX.
+def export_onnx(path: Path) -> tuple[bytes, float]:
+    """Return the policy in a `pretrained_model` folder as ONNX, and its largest difference from the actions there.
 
-    Raises `ManipError` if the file would act differently from the checkpoint, and what `LearnedPolicy.load` raises.
+    Raises `ManipError` for a policy that cannot be exported or whose file would act differently from the checkpoint,
+    and what `LearnedPolicy.load` raises.
     """
     import onnx
     import onnxruntime
 
-    policy = _load(path)
+    policy = LearnedPolicy.load(path)
+    if policy.checkpoint.space == EE_DELTA:
+        raise ManipError(
+            f"{path} learnt {EE_DELTA}, whose inverse kinematics cannot be exported; train with {JOINT_DELTA}"
+        )
     function = PolicyFunction(policy)
-    metadata = file_metadata(policy, function.inputs, policy_sha256)
+    metadata = file_metadata(policy, function.inputs, policy_sha256(path))
     example = _observations(policy, function, rows=2)
     content = io.BytesIO()
     with warnings.catch_warnings(action="ignore"):
@@ -110,7 +106,7 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
             f"{path}: the exported file's actions differ by up to {difference:.2g} from the checkpoint's; expected at "
             f"most {TOLERANCE:g}, so nothing was written"
         )
-    return Exported(data, metadata, difference)
+    return data, difference
 
 
 def file_metadata(policy: LearnedPolicy, inputs: Sequence[str], sha256: str) -> dict[str, Any]:
@@ -143,16 +139,6 @@ def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
         units = ["1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2]) for name in names]
     meanings = {name: values for name, values in (("names", names), ("units", units)) if values}
     return {"name": key, "dtype": "float32", "shape": ["batch", size], **meanings}
-
-
-def _load(path: Path) -> LearnedPolicy:
-    """Return the policy in a folder. Raises `ManipError` for a policy that cannot be exported."""
-    policy = LearnedPolicy.load(path)
-    if policy.checkpoint.space == EE_DELTA:
-        raise ManipError(
-            f"{path} learnt {EE_DELTA}, whose inverse kinematics cannot be exported; train with {JOINT_DELTA}"
-        )
-    return policy
 
 
 def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) -> Arrays:

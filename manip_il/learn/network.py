@@ -112,6 +112,14 @@ def _mean_and_deviation(values: NDArray[np.float32]) -> tuple[NDArray[np.float64
     return mean, np.sqrt(np.square(values - mean).mean(0))
 
 
+def perceptron(inputs: int, width: int, depth: int, outputs: int, activation: type[nn.Module]) -> nn.Sequential:
+    """Return a network of `depth` hidden layers, (B, inputs) to (B, outputs)."""
+    layers: list[nn.Module] = []
+    for size in (inputs, *[width] * (depth - 1)):
+        layers += [nn.Linear(size, width), activation()]
+    return nn.Sequential(*layers, nn.Linear(width, outputs))
+
+
 class MLPNetwork(nn.Module):
     """Perceptron, head and normalisation. Inputs (B, n + k) are raw; the first n are the measured joints.
 
@@ -137,10 +145,8 @@ class MLPNetwork(nn.Module):
         self.scales, self.scaled, self.inputs = shape.scales, list(shape.scaled), inputs
         inputs += len(shape.scales) * len(shape.scaled)
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma or 0.0)
-        layers: list[nn.Module] = []
-        for width in (inputs, *[shape.width] * (shape.depth - 1)):
-            layers += [nn.Linear(width, shape.width), ACTIVATIONS[shape.activation]()]
-        self.layers = nn.Sequential(*layers, nn.Linear(shape.width, self.head.size))
+        activation = ACTIVATIONS[shape.activation]
+        self.layers = perceptron(inputs, shape.width, shape.depth, self.head.size, activation)
         for name, size in (("input", inputs), ("target", n)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))

@@ -37,7 +37,7 @@ from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import MIN_LOG_STD, GaussianHead, floored_log_std
 from manip_il.learn.mlp import MLPConfig, MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
-from manip_il.learn.network import MLPNetwork, fit_statistics, read_weights
+from manip_il.learn.network import MLPNetwork, fit_statistics, perceptron, read_weights
 from manip_il.learn.transitions import F32, Transitions
 
 EXTRA = 2  # numbers appended to the policy's inputs: flag of the absorbing state, elapsed share of the episode
@@ -68,9 +68,7 @@ class ActorCritic(ActorCriticPolicy):
         super().__init__(observation_space, action_space, lr_schedule, **settings)
         inputs = network.input_mean.shape[0] + EXTRA
         self.actor = network
-        self.critic = nn.Sequential(
-            nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
-        )
+        self.critic = perceptron(inputs, width, 2, 1, nn.Tanh)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1), eps=1e-5, fused=True)
 
     @override

@@ -7,6 +7,7 @@ text `foxglove.Log`. With `mapping.yaml`, next to the files, an import recreates
 from __future__ import annotations
 
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from manip_il.data.camera import Camera
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, Info
 from manip_il.errors import ManipError
-from manip_il.mcap.mapping import TASK, TEXT, exact_rate, frame_times
+from manip_il.mcap.mapping import TASK, TEXT
 from manip_il.mdp import require_finite
 
 MAPPING = "mapping.yaml"
@@ -54,11 +55,10 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
     if missing := set(table[layout.TASK_INDEX].tolist()) - set(texts):
         raise ManipError(f"{dataset.root}: rows have task {min(missing)}, which {layout.TASKS} lacks")
     cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
-    about, rate = (dataset.root / layout.INFO).read_text(encoding="utf-8"), exact_rate(dataset.fps)
-    episodes = dataset.episodes
+    episodes, rate = dataset.episodes, Fraction(str(dataset.fps))
     for place, episode in enumerate(episodes.index.tolist()):
         start, stop = int(episodes.start[place]), int(episodes.stop[place])
-        times = frame_times(stop - start, rate)
+        times = foxglove.frame_times(stop - start, rate)
         tasks = [texts[number] for number in table[layout.TASK_INDEX][start:stop].tolist()]
         channels = {_TASK_TOPIC: foxglove.texts(TASK, tasks, times)}
         for one in columns:
@@ -68,7 +68,6 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
         with path.open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
             writer.start(profile="", library="manip_il")
-            writer.add_metadata("lerobot", {"info": about, "episode_index": str(episode)})
             foxglove.add_channels(writer, channels, times)
             writer.finish()
         yield path

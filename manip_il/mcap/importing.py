@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data.atomic import new_folder
-from manip_il.data.foxglove import NANOSECONDS
+from manip_il.data.foxglove import NANOSECONDS, frame_times
 from manip_il.data.lerobot_write import TableWriter
 from manip_il.errors import ManipError, MismatchError, nearest
-from manip_il.mcap.mapping import TASK, TEXT, Mapping, TopicSource, exact_rate, frame_times
+from manip_il.mcap.mapping import TASK, TEXT, Mapping, TopicSource
 from manip_il.mcap.path import values_at
 from manip_il.mcap.read import read_messages, read_pictures, read_topics
 
@@ -75,7 +75,7 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
             topics = read_topics(path)
             known = f"{nearest(source.topic, topics)}; its topics: {', '.join(topics)}"
             raise ManipError(f"{path} has no messages of {source.topic}{known}")
-    times = _times(path, stamps, exact_rate(mapping.fps))
+    times = _times(path, stamps, Fraction(str(mapping.fps)))
     rows: dict[str, Any] = {TASK: [mapping.task] * len(times)}
     for key, source in mapping.sources.items():
         where = f"{path}, topic {source.topic}, {key}"

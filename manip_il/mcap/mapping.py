@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal
 
 import draccus
 
 from manip_il import checks
-from manip_il.data.foxglove import NANOSECONDS
 from manip_il.data.info import INDEX_FEATURES, NUMBERS
 from manip_il.data.schema import MOST_FPS
 from manip_il.errors import ManipError, UsageError
@@ -19,7 +17,6 @@ from manip_il.mcap.path import check_path
 
 TEXT = "string"  # LeRobot's dtype for text
 TASK = "task"  # key of a frame's task text
-_NTSC = 1001  # denominator of NTSC frame rates
 
 
 @dataclass(frozen=True)
@@ -107,17 +104,6 @@ def load_mapping(path: Path) -> Mapping:
         return Mapping(**given)
     except (ManipError, TypeError) as error:  # the latter names an unknown or missing key
         raise UsageError(f"{path}: {error}") from error
-
-
-def exact_rate(fps: float) -> Fraction:
-    """Return a rate as an exact fraction: one with a small denominator (up to NTSC's), else its decimals."""
-    small = Fraction(fps).limit_denominator(_NTSC)
-    return small if float(small) == fps else Fraction(str(fps))
-
-
-def frame_times(count: int, rate: Fraction) -> list[int]:
-    """Return the times of an episode's frames [ns], from 0."""
-    return [frame * NANOSECONDS * rate.denominator // rate.numerator for frame in range(count)]
 
 
 def _source(what: str, table: Any) -> TopicSource:

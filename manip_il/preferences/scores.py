@@ -69,10 +69,6 @@ class Scores:
         """Area under the ROC curve for detecting failed episodes by a low score; None if all or none failed."""
         return roc_auc(self.episodes, self.succeeded)
 
-    def worst(self, count: int) -> list[int]:
-        """Return the numbers of the episodes with the lowest scores, lowest first."""
-        return np.argsort(self.episodes, kind="stable")[:count].tolist()
-
     def to_json(self) -> dict[str, Any]:
         """Return the content of `scores.json`; frames' scores are in the parquet file."""
         succeeded, bar = self.succeeded, self.bar
@@ -139,7 +135,7 @@ def write_weights(path: Path, scores: Scores) -> None:
         pq.write_table(table, path)
 
 
-def worst_table(scores: Scores, count: int = WORST) -> Table:
+def worst_table(scores: Scores) -> Table:
     """Return a table of the episodes with the lowest scores, lowest first."""
     data, succeeded = scores.data, scores.succeeded
     rows = tuple(
@@ -149,7 +145,7 @@ def worst_table(scores: Scores, count: int = WORST) -> Table:
             "" if succeeded is None else ("yes" if succeeded[place] else "no"),
             f"{data.lengths[place]:,}",
         )
-        for place in scores.worst(count)
+        for place in np.argsort(scores.episodes, kind="stable")[:WORST].tolist()
     )
     return Table(("episode", "score", "success", "frames"), rows).filled()
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from manip_il.collect.edits import SERVED
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
+from manip_il.data.build import Recording
 from manip_il.data.episodes import to_episode
 from manip_il.data.journal import Journal, list_seeds
 from manip_il.mdp import Actor, Transition
@@ -34,6 +36,7 @@ class ServedEpisodes:
         self._journal = Journal(folder, env_spec(config), env_fingerprint(config)) if folder is not None else None
         if self._journal is not None:
             self._journal.prepare()
+            Recording(f"local/{config.name}", provenance={"driver": SERVED}).write(self._journal.folder)
         there = set(list_seeds(folder)) if folder is not None else set[int]()
         self._seeds = (one for one in stream_seeds("demonstrations", BLOCK, seed) if one not in there)
         self.renew()

@@ -1,4 +1,4 @@
-"""Cards for the Hub: `README.md` of a dataset or policy, rendered from `card.md.jinja`, and a picture.
+"""Cards for the Hub: `README.md` of a dataset or policy, from `card.md.jinja`, and a picture of its cameras.
 
 Cards hold no absolute path, token or date, so that the same folder gives the same bytes. A card of another program's
 dataset or policy claims neither our licence nor our authorship.
@@ -18,14 +18,14 @@ from matplotlib.figure import Figure
 from manip_il import checks
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
-from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
+from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.finding import journals_of
 from manip_il.errors import ManipError
 from manip_il.store.errors import redact
 from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
 
 PICTURE = "assets/episodes.png"
-_FRAMES, _EPISODES = 6, 50  # frames per camera, and episodes whose paths are drawn
+_FRAMES = 6  # per camera
 _OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is ours and is replaced
 _NOT_SHOWN = re.compile(  # lines of options that are paths, concern one machine, or may be secrets
     r"/|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
@@ -39,8 +39,9 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
     A `README.md` that is not ours is kept, and is not in the result. Raises `ManipError` if the folder cannot be read.
     """
     made, dataset = dict[str, Path](), Dataset.open(root) if kind == "dataset" else None
-    if dataset and draw_picture(dataset, folder / "episodes.png"):
+    if dataset and dataset.cameras:
         made[PICTURE] = folder / "episodes.png"
+        draw_picture(dataset, made[PICTURE])
     if not (root / CARD).is_file() or any(mark in (root / CARD).read_bytes() for mark in _OURS):
         environment = jinja2.Environment(finalize=lambda value: redact(value) if isinstance(value, str) else value)
         environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")
@@ -86,43 +87,12 @@ def options(folder: Path) -> str:
     return "\n".join(shown) if text.startswith("# manip-il") else ""
 
 
-def draw_picture(dataset: Dataset, path: Path) -> bool:
-    """Draw frames of the first episode or, without cameras, the object's paths; return False if there are neither."""
-    feature = dataset.features.get(s.ENVIRONMENT_STATE)
-    names, figure = list(feature.labels) if feature else [], Figure((8, 4), layout="constrained")
-    if dataset.cameras:
-        _draw_frames(dataset, figure)
-    elif {f"{thing}.{axis}" for thing in ("object", "goal") for axis in "xyz"} <= set(names):
-        _draw_paths(dataset, names, figure)
-    else:
-        return False
-    figure.savefig(path, dpi=100, metadata={"Software": None})
-    return True
-
-
-def _draw_frames(dataset: Dataset, figure: Figure) -> None:
+def draw_picture(dataset: Dataset, path: Path) -> None:
     """Draw evenly spaced frames of the first episode, one row per camera."""
     rows, cameras = dataset.rows_of(0), dataset.cameras
     picked = rows[np.unique(np.linspace(0, len(rows) - 1, _FRAMES).round().astype(int))]
-    figure.set_figheight(figure.get_figwidth() / _FRAMES * len(cameras))
+    figure = Figure((8, 8 / _FRAMES * len(cameras)), layout="constrained")
     for axis, key in zip(figure.subplots(len(cameras), squeeze=False)[:, 0], cameras, strict=True):
         axis.imshow(np.concatenate(list(dataset.frames(key, picked)), axis=1))
         axis.axis("off")
-
-
-def _draw_paths(dataset: Dataset, names: list[str], figure: Figure) -> None:
-    """Draw the object's paths in the first episodes and the goals, from above and from the side [m]."""
-    table = dataset.columns([s.ENVIRONMENT_STATE, EPISODE_INDEX])
-    index, values = table[EPISODE_INDEX].reshape(-1), table[s.ENVIRONMENT_STATE]
-    episodes = [values[index == episode] for episode in np.unique(index)[:_EPISODES]]
-    firsts = np.array([rows[0] for rows in episodes])
-    axes = figure.subplots(1, 2)
-    for axis, (across, up), side in zip(axes, ("xy", "xz"), ("above", "the side"), strict=True):
-        x, y, goal_x, goal_y = (names.index(f"{thing}.{one}") for thing in ("object", "goal") for one in (across, up))
-        for rows in episodes:
-            axis.plot(rows[:, x], rows[:, y], color="#8aa4c8", linewidth=1)
-        axis.plot(firsts[:, x], firsts[:, y], "s", color="#c0392b", markersize=4, label="object at the start")
-        axis.plot(firsts[:, goal_x], firsts[:, goal_y], "o", color="#2e8b57", fillstyle="none", label="goal")
-        axis.set(title=f"from {side}, {len(episodes)} episodes", xlabel=f"{across} [m]", ylabel=f"{up} [m]")
-        axis.set_aspect("equal", adjustable="datalim")
-    axes[0].legend()
+    figure.savefig(path, dpi=100, metadata={"Software": None})

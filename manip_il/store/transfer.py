@@ -31,8 +31,6 @@ from manip_il.store.manifest import (
 )
 from manip_il.store.objects import Objects
 
-TRIES = 2  # downloads of a file until its hash is right
-_LARGE = 50_000_000  # files from this size on are synced one by one, smaller ones all together [bytes]
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")
 _OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
 
@@ -119,20 +117,15 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
 
 def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
     """Download all files of a version into a folder, verify their hashes, and open datasets in a child process."""
-    wrong = list(manifest.files)
-    for _ in range(TRIES):
-        for path in wrong:
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        remote.fetch(manifest, wrong, folder)
-        with ThreadPoolExecutor() as pool:
-            # large files are synced while they are hashed, which takes as long
-            pool.map(atomic.sync, [folder / path for path in wrong if manifest.files[path].size >= _LARGE])
-            fits = pool.map(lambda path: manifest.files[path].fits(folder / path), wrong)
-            wrong = [path for path, is_right in zip(wrong, fits, strict=True) if not is_right]
-        if not wrong:
-            break
-    else:
-        text = f"{checks.shorten(wrong[0])} had the wrong hash twice"
-        raise RemoteError(f"{remote.name}: {text}; nothing was kept; push to an empty folder, and pull from there")
+    files = manifest.files
+    for path in files:
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+    remote.fetch(manifest, list(files), folder)
+    with ThreadPoolExecutor() as pool:
+        fits = pool.map(lambda path: files[path].fits(folder / path), files)
+        wrong = next((path for path, is_right in zip(files, fits, strict=True) if not is_right), None)
+    if wrong is not None:
+        text = f"{checks.shorten(wrong)} has the wrong hash; nothing was kept; pull again"
+        raise RemoteError(f"{remote.name}: {text}; if that does not help, push to an empty folder, and pull from there")
     for dataset in datasets_in(folder):
         check_arrived(dataset)

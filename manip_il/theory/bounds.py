@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.seeding import rng_for
-from manip_il.theory.processes import PLACES, PROCESSES, Process
+from manip_il.theory.processes import PLACES, Process
 
 F64 = NDArray[np.float64]
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
@@ -82,13 +82,7 @@ class LossCurve:
         return np.log(ratios) @ x / (x @ x)
 
 
-def all_curves(horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[LossCurve]:
-    """Yield the curves of every process and learner."""
-    for process in PROCESSES:
-        yield from curves(process, horizons, draws)
-
-
-def curves(process: Process, horizons: Sequence[int], draws: int) -> Iterator[LossCurve]:
+def curves(process: Process, horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[LossCurve]:
     """Yield the curves of both learners on one process."""
     found: dict[Learner, list[F64]] = {"cloning": [], "DAgger": []}
     for horizon in horizons:
@@ -106,7 +100,7 @@ def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
     """
     horizon, own = policies.shape[1], process.visits(policies) * policies
     gaps = (own * process.wrong_costs(horizon)).sum(axis=(1, 2))
-    wrong = process.expert_visits(horizon) * policies if learner == "cloning" else own
+    wrong = process.visits(np.zeros((horizon, process.states))) * policies if learner == "cloning" else own
     factor = horizon if learner == "cloning" else process.recoverability(horizon)
     errors = wrong.sum(axis=(1, 2)) / horizon
     return np.stack([errors, gaps, factor * horizon * errors])

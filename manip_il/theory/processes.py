@@ -6,7 +6,7 @@ A policy is its probability (H, S) of a wrong action at each step in each state;
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,6 @@ class Process:
         """Number of states."""
         return len(self.start)
 
-    @cache  # noqa: B019  (only three processes exist, as long as the program runs)
     def wrong_costs(self, horizon: int) -> F64:
         """Return the cost of one wrong action at each step in each state if the expert then drives, (H, S)."""
         found, after = np.empty((horizon, self.states)), np.zeros(self.states)
@@ -47,16 +46,10 @@ class Process:
             found[t], after = right - wrong, right
         return found
 
-    @cache  # noqa: B019
     def recoverability(self, horizon: int) -> float:
         """Return u: the largest cost of one wrong action, over the states that some policy reaches."""
         uniform = np.full((horizon, self.states), 0.5)
         return float(self.wrong_costs(horizon)[self.visits(uniform) > 0].max())
-
-    @cache  # noqa: B019
-    def expert_visits(self, horizon: int) -> F64:
-        """Return the distribution of the expert's state at each step, (H, S)."""
-        return self.visits(np.zeros((horizon, self.states)))
 
     def visits(self, policy: F64) -> F64:
         """Return the distribution of the state at each step, (..., H, S), under policies (..., H, S)."""

@@ -211,7 +211,7 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
     with pytest.raises(MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"):
         trainer_of(sources, tmp_path / "other", {"path": str(path)}, JOINT_DELTA)
     with pytest.raises(ManipError, match="cannot be exported; train with joint_delta"):
-        export_onnx(path, "")
+        export_onnx(path)
 
 
 def test_a_checkpoint_from_before_there_was_a_choice_acts_as_it_did(table, sources, tmp_path):

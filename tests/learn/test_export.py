@@ -21,7 +21,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
 from manip_il.errors import ManipError
 from manip_il.learn import export
-from manip_il.learn.checkpoint import Origin
+from manip_il.learn.checkpoint import Origin, policy_sha256
 from manip_il.learn.export import TOLERANCE, export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
@@ -85,11 +85,11 @@ def lerobot_actions(checkpoint: Path, observation: Observation) -> NDArray[np.fl
 
 
 def check_equal(checkpoint: Path, observations: list[Observation]) -> None:
-    exported = export_onnx(checkpoint, "")
-    session = onnxruntime.InferenceSession(exported.data)
+    content, _ = export_onnx(checkpoint)
+    session = onnxruntime.InferenceSession(content)
     for observation in observations:
         expected = lerobot_actions(checkpoint, observation)
-        taken = {one["name"]: observation[one["name"]] for one in exported.metadata["inputs"]}
+        taken = {one["name"]: observation[one["name"]] for one in metadata_in(content)["inputs"]}
         actions = np.asarray(session.run(["action"], taken)[0])
         assert actions.dtype == np.float32
         assert actions.shape == expected.shape
@@ -121,7 +121,8 @@ def metadata_in(data: bytes) -> dict[str, Any]:
 
 def test_the_metadata_name_every_number_with_its_unit(tmp_path):
     spec, _ = sample()
-    told = metadata_in(export_onnx(write_cnn(tmp_path / "cnn", spec, "both"), "abc").data)
+    checkpoint = write_cnn(tmp_path / "cnn", spec, "both")
+    told = metadata_in(export_onnx(checkpoint)[0])
     assert {key: value for key, value in told.items() if key not in ("inputs", "outputs")} == {
         "robot": "panda",
         "task": "pick_place",
@@ -129,7 +130,7 @@ def test_the_metadata_name_every_number_with_its_unit(tmp_path):
         "action_meaning": "joint position targets [rad], gripper opening command [m]",
         "policy_type": "cnn",
         "policy_loss": "l1",
-        "policy_sha256": "abc",
+        "policy_sha256": policy_sha256(checkpoint),
     }
     state, around, front, wrist = told["inputs"]
     joints = {"dtype": "float32", "shape": ["batch", 8], "names": list(spec.joint_names), "units": ["rad"] * 7 + ["m"]}
@@ -154,4 +155,4 @@ def test_a_file_that_acts_otherwise_is_refused(spec, tmp_path, monkeypatch):
     policy, make = LearnedPolicy.load(other), export.PolicyFunction
     monkeypatch.setattr(export, "PolicyFunction", lambda _: make(policy))
     with pytest.raises(ManipError, match=r"differ by up to 2e-05 from the checkpoint's; expected at most 1e-05"):
-        export_onnx(checkpoint, "")
+        export_onnx(checkpoint)

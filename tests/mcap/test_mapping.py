@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +10,7 @@ import pytest
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 
 from manip_il.errors import ManipError
-from manip_il.mcap.mapping import Mapping, TopicSource, exact_rate, frame_times, load_mapping
+from manip_il.mcap.mapping import Mapping, TopicSource, load_mapping
 from manip_il.mcap.path import values_at
 
 from .use import load
@@ -27,14 +26,6 @@ def test_a_mapping_is_its_file_and_the_example_loads(tmp_path: Path) -> None:
     assert load(tmp_path, **TREE) == Mapping(20, "do it", {"action": number, "observation.images.c": camera})
     example = load_mapping(ROOT / "configs/mcap/panda.yaml")
     assert [one.topic for one in example.sources.values()][:3] == ["/joint_states", "/tf", "/action"]
-
-
-@pytest.mark.parametrize(
-    ("fps", "rate"), [(30, Fraction(30)), (29.97, Fraction(2997, 100)), (30_000 / 1001, Fraction(30_000, 1001))]
-)
-def test_a_fractional_rate_is_exact(fps: float, rate: Fraction) -> None:
-    assert exact_rate(fps) == rate
-    assert frame_times(900, rate)[899] == 899 * 10**9 // rate
 
 
 def test_a_path_leads_to_values_or_says_where_it_ends() -> None:

@@ -47,7 +47,7 @@ def test_features_are_those_that_lerobots_recorder_makes(real):
     for key, feature in theirs.items():
         assert {**ours[key], "info": None} == {**feature, "shape": tuple(feature["shape"]), "info": None}, key
     assert list(theirs) == [ACTION, STATE, "observation.images.front"]
-    assert (spec.lerobot_type, spec.robot, spec.fps) == (real.name, "so101", 30)
+    assert (spec.robot_type, spec.robot, spec.fps) == (real.name, "so101", 30)
 
 
 def test_a_measured_state_is_what_the_real_arms_servos_read(real):

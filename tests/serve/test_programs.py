@@ -15,6 +15,8 @@ from lerobot.datasets import LeRobotDataset
 from numpy.typing import NDArray
 
 from manip_il.cli.main import main
+from manip_il.collect.edits import SERVED
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
 from manip_il.mdp import Actor, Episode
 
@@ -64,6 +66,7 @@ def test_record_keeps_solved_episodes_with_the_frames_of_the_log(run: Run, tmp_p
     assert np.abs(first - logged[0].columns["observation.state"][0]).max() < 0.2  # a step of the encoder
     assert abs(len(recorded) - sum(map(len, logged))) <= 2
     assert main(["data", "build", f"{tmp_path}/log", f"{tmp_path}/ours"]) == 0
+    assert Dataset.open(tmp_path / "ours").provenance["driver"] == SERVED  # redrawn labels then hold the servos' sag
 
 
 def test_teleoperate_follows_the_expert_from_world_to_world(run: Run):

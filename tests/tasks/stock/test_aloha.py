@@ -151,7 +151,7 @@ def test_names_and_numbers_are_those_of_lerobots_datasets(task: str):
     spec = env_spec(config(task))
     assert spec.joint_names[:2] == ("left_waist", "left_shoulder")
     assert spec.joint_names[6::7] == ("left_gripper", "right_gripper")
-    assert (spec.fps, spec.lerobot_type, len(spec.joint_names)) == (50, "aloha", 14)
+    assert (spec.fps, spec.robot_type or spec.robot, len(spec.joint_names)) == (50, "aloha", 14)
     assert episode.columns["action"].shape[1] == 14
     assert episode.columns["observation.environment_state"].shape[1] == len(spec.environment_state_names)
     assert episode.columns["sim_state"].shape[1] == spec.sim_state_size
