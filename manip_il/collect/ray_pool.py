@@ -23,7 +23,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
-from manip_il.sim.mesh import mesh_path, moved
+from manip_il.sim.mesh import mesh_path
 from manip_il.tasks.table import SUFFIX
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
@@ -125,9 +125,9 @@ def run_there(
             file = _unpack(task, Path(folder) / "task") / Path(job.env.task).name
             job = replace(job, env=replace(job.env, task=str(file)))
         if mesh is not None:
-            name = Path(mesh_path(job.env.object) or "").name
-            at = _unpack(mesh, Path(folder) / "mesh") / name
-            job = replace(job, env=replace(job.env, object=moved(job.env.object, at)))
+            path = mesh_path(job.env.object) or ""
+            at = _unpack(mesh, Path(folder) / "mesh") / Path(path).name
+            job = replace(job, env=replace(job.env, object=job.env.object.replace(path, str(at), 1)))
         if isinstance(job.driver, PolicyDriver):
             here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
             job = replace(job, driver=replace(job.driver, policies=here))

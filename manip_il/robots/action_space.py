@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -83,9 +82,9 @@ class ActionSpace:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.low.shape:
             raise MismatchError("action shape", "the policy", action.shape, "the robot", self.low.shape)
-        if not (math.isfinite(action.dot(action)) or np.isfinite(action).all()):  # the first, fast test may overflow
+        if not np.isfinite(action).all():
             raise NotFiniteError(f"action at step {step} is not finite: {action}")
-        return np.minimum(np.maximum(action, self.low), self.high)
+        return np.clip(action, self.low, self.high)
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
         """Draw joint targets within the longest step of the measured joints in `state` (n,), the gripper anywhere."""

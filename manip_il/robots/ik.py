@@ -12,7 +12,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import rotation_matrix, rotation_vector, yaw_ahead
+from manip_il.robots.rotations import angle_between, rotation_matrix, rotation_vector, yaw_ahead
 from manip_il.robots.spec import arm_model
 
 _POSITION_COST = 1.0  # [1/m]
@@ -79,8 +79,8 @@ class ArmIK:
         joints = [model.joint(name) for name in robot.joints]
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
         self._data = data = self._program.data  # views that follow the posture
-        self._ee, self._ee_flat = data.site_xpos[self._site], data.site_xmat[self._site]
-        self._ee_rotation, self._qpos = self._ee_flat.reshape(3, 3), data.qpos
+        self._ee, self._ee_rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+        self._qpos = data.qpos
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._jacobian = np.zeros((6, model.nv))
         self._robot, self._shoulder = robot, joints[0].id
@@ -169,6 +169,4 @@ class ArmIK:
     def _pose_error(self, position: F64, rotation: F64, weight: float) -> float:
         """Pose error [m], weighted as by the frame task: position by 1, angle by `weight` [m/rad]."""
         dx, dy, dz = (self._ee - position).tolist()
-        cosine = (float(self._ee_flat.dot(rotation.ravel())) - 1) / 2
-        angle = math.acos(min(1.0, max(-1.0, cosine)))
-        return math.hypot(dx, dy, dz, weight * angle)
+        return math.hypot(dx, dy, dz, weight * angle_between(self._ee_rotation, rotation))

@@ -15,7 +15,6 @@ from manip_il.robots.files import ModelFiles, require_lengths
 
 TABLE_BEYOND = 0.08  # offset of the table's middle from the workspace's middle, away from the robot [m]
 RATE = 20  # default control steps per second
-_MOST_HZ = 500
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
 FOUND = ("home", "gains", "forces", "armature", "ee")  # found on the model if the YAML does not give them
@@ -134,7 +133,6 @@ class LeRobotConfig:
 
     def __post_init__(self) -> None:
         checks.name("robot_type", self.robot_type)
-        checks.whole("fps", self.fps, 1, _MOST_HZ)
 
     def percent(self, joint: F64) -> F64:
         """Return the gripper's positions, 0 to 100, for those of its driven joint, `joint` [rad]."""

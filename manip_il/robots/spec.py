@@ -263,10 +263,9 @@ def _foreign(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
 
 def _paint(robot: Robot, spec: mujoco.MjSpec) -> None:
     for geom in spec.geoms:
-        for pattern, colour in reversed(list(robot.colours.items())):
+        for pattern, colour in robot.colours.items():
             if geom.meshname and fnmatch.fnmatch(geom.meshname, pattern) and not (geom.contype or geom.conaffinity):
                 geom.rgba = np.array([*colour, 1.0])
-                break
 
 
 def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:

@@ -76,7 +76,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._max_episode_steps = self.config.horizon
         self.task = task.name
         limits = np.vstack([self.scene.actions.low, self.scene.actions.high])
-        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi)  # a joint that turns freely
+        turn = 2 * np.pi if robot.lerobot is None else 360.0
+        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * turn)  # a joint that turns freely
         self.action_space = gymnasium.spaces.Box(*limits.astype(np.float32), dtype=np.float32)
         self.observation_space = self._observation_space()
 
@@ -198,6 +199,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """Restore a state of the same scene. Raises `MismatchError` for another scene's."""
         self.world.restore(state.physics, state.variation)
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
+        self._observed.clear()
+        self._pictured.clear()
 
     def observe(self) -> Observation:
         """Return what a policy observes now, with the episode's delay and noise; call it once per control step.
@@ -211,7 +214,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             seen = self._pictures(self._view), projections(self.scene, self._view, points)
         self._pictured.append(seen)
         (images, keypoints), text = self._pictured[0], self.task_description
-        self._observed.append(Observation(joint_state(world), environment_state(world), images, text, keypoints))
+        self._observed.append(
+            Observation(world.measured.astype(np.float32), environment_state(world), images, text, keypoints)
+        )
         return self._observed[0]
 
     def _measured(self) -> World:
@@ -270,12 +275,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             picture = gymnasium.spaces.Box(0, 255, (*self._view.size, 3), np.uint8)
             spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
         return gymnasium.spaces.Dict(spaces)
-
-
-def joint_state(world: World) -> F32:
-    """Return measured joint positions and gripper opening in the units of the robot's actions, float32 (n,)."""
-    scene, data = world.scene, world.data
-    return scene.actions.join(data.qpos[scene.arm_q], world.opening).astype(np.float32)
 
 
 def environment_state(world: World) -> F32:

@@ -52,7 +52,7 @@ def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> 
 
 def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
     """Draw an action within one longest joint step of the measured joints, with any gripper opening; (n,)."""
-    return world.scene.actions.random_near(_measured(world), rng)
+    return world.scene.actions.random_near(world.measured, rng)
 
 
 def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
@@ -60,7 +60,7 @@ def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
     actions = world.scene.actions
     low, high = actions.low[actions.gripper], actions.high[actions.gripper]
     opposite = high if action[actions.gripper] < (low + high) / 2 else low
-    return np.where(actions.relative, 2 * _measured(world) - action, opposite)
+    return np.where(actions.relative, 2 * world.measured - action, opposite)
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
@@ -221,11 +221,6 @@ class Events:
 
 def _ends(value: Any) -> tuple[Any, Any]:
     return value if isinstance(value, tuple) else (value, value)
-
-
-def _measured(world: World) -> F64:
-    """Measured state in the units of actions, (n,)."""
-    return world.scene.actions.join(world.data.qpos[world.scene.arm_q], world.opening)
 
 
 def _settle(world: World) -> None:

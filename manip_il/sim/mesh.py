@@ -49,7 +49,8 @@ def parse_mesh(text: str) -> Mesh:
     if (found := _TEXT.fullmatch(text)) is None:
         raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
     if found["hash"]:
-        raise UsageError(f"object {text}: only the name of the mesh was stored; give --task.object={nameable(text)}")
+        give = re.sub(r"^mesh:(.*)#[0-9a-f]{12}", r"mesh:PATH/\1", text)
+        raise UsageError(f"object {text}: only the name of the mesh was stored; give --task.object={give}")
     return _read(found["path"], float((found["length"] or ":0")[1:]))
 
 
@@ -63,16 +64,6 @@ def is_stored(text: str) -> bool:
     """Return whether a text has a mesh's name and hash, as in datasets, and not its file's path."""
     found = _TEXT.fullmatch(text)
     return bool(found and found["hash"])
-
-
-def nameable(text: str) -> str:
-    """Return a stored mesh's text as an option takes it, with PATH for the file's folder."""
-    return re.sub(r"^mesh:(.*)#[0-9a-f]{12}", r"mesh:PATH/\1", text)
-
-
-def moved(text: str, path: Path) -> str:
-    """Return a mesh's text with its file at another path."""
-    return text.replace(mesh_path(text) or "", str(path), 1)
 
 
 @cache

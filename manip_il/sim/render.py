@@ -132,7 +132,9 @@ class _Renderer:
 
     def picture(self, camera: str | mujoco.MjvCamera, size: tuple[int, int], *, axes: bool = False) -> Picture:
         height, width = (_FINER * side for side in size)
-        self._make_room(height, width)
+        have = self._context.offHeight, self._context.offWidth
+        if height > have[0] or width > have[1]:  # pictures of all sizes share one buffer
+            mujoco.mjr_resizeOffscreen(max(width, have[1]), max(height, have[0]), self._context)
         if isinstance(camera, str):
             self._camera.fixedcamid = self._cameras[camera]
             camera = self._camera
@@ -155,12 +157,6 @@ class _Renderer:
         found = np.stack([0.5 + x / (2 * half * aspect), 0.5 - y / (2 * half), np.ones_like(x)], axis=1)
         inside = ((found[:, :2] >= 0) & (found[:, :2] <= 1)).all(axis=1) & np.isfinite(ahead)
         return np.where(inside[:, None], found, 0.0).astype(np.float32)
-
-    def _make_room(self, height: int, width: int) -> None:
-        """Grow the buffer that pictures of all sizes share, so that these may alternate at no cost."""
-        have_height, have_width = self._context.offHeight, self._context.offWidth
-        if height > have_height or width > have_width:
-            mujoco.mjr_resizeOffscreen(max(width, have_width), max(height, have_height), self._context)
 
 
 def _coarser(fine: NDArray[np.uint8]) -> Picture:

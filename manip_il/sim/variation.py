@@ -166,14 +166,14 @@ def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, sh
     kind, condim, rolling = own, int(plain.geom_condim[geom]), float(plain.geom_friction[geom, 2])
     if shape is not None:
         kind, (condim, rolling) = int(GEOMS[shape]), contact(shape)
+    like, at, inertia = plain, geom, plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
+    if kind != own or not np.array_equal(size, plain.geom_size[geom]):
+        like, at = _solid(kind, size, mass), 0
+        inertia = like.body_inertia[1]
     if kind != _MESH:
         nodes = slice(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body])
-        changed.geom_size[geom], changed.geom_rbound[geom] = size, _bound(kind, size)
-        changed.geom_aabb[geom, 3:] = changed.bvh_aabb[nodes, 3:] = extents(kind, size) / 2
-    if kind == own and np.array_equal(size, plain.geom_size[geom]):
-        inertia = plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
-    else:
-        inertia = _inertia(kind, size, mass)
+        changed.geom_size[geom], changed.geom_rbound[geom] = size, like.geom_rbound[at]
+        changed.geom_aabb[geom, 3:] = changed.bvh_aabb[nodes, 3:] = like.geom_aabb[at, 3:]
     changed.geom_type[geom], changed.geom_condim[geom] = kind, condim
     changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
     # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn friction gets it.
@@ -198,33 +198,8 @@ def extents(kind: int, size: F64) -> F64:
     )
 
 
-def _bound(kind: int, size: F64) -> float:
-    """Return the radius of the sphere around a geom [m]."""
-    if kind == int(mujoco.mjtGeom.mjGEOM_BOX):
-        return float(np.linalg.norm(size))
-    if kind == int(mujoco.mjtGeom.mjGEOM_CYLINDER):
-        return float(np.hypot(size[0], size[1]))
-    return float(extents(kind, size).max() / 2)
-
-
-def _inertia(kind: int, size: F64, mass: float) -> F64:
-    """Return the principal moments of a solid geom [kg m^2], (3,)."""
-    x, y, z = extents(kind, size)
-    if kind == int(mujoco.mjtGeom.mjGEOM_BOX):
-        return mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
-    if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
-        return np.full(3, mass * x * x / 10)
-    if kind == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
-        return _capsule_inertia(x / 2, z - x, mass)
-    across = mass / 12 * (3 * x * x / 4 + z * z)
-    return np.array([across, across, mass * x * x / 8])
-
-
-def _capsule_inertia(radius: float, height: float, mass: float) -> F64:
-    """Moments of inertia of a cylinder of a radius and height [m] with a hemisphere on both ends."""
-    round_, balls = height, 4 / 3 * radius  # volumes over the circle's area
-    cylinder, ball = mass * round_ / (round_ + balls), mass * balls / (round_ + balls)
-    along = cylinder * radius**2 / 2 + ball * 2 * radius**2 / 5
-    across = cylinder * (height**2 / 12 + radius**2 / 4)
-    across += ball * (2 * radius**2 / 5 + height**2 / 4 + 3 * height * radius / 8)
-    return np.array([across, across, along])
+def _solid(kind: int, size: F64, mass: float) -> mujoco.MjModel:
+    """Compile a body of one geom, for its inertia and bounds."""
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body().add_geom(type=mujoco.mjtGeom(kind), size=size, mass=mass)
+    return spec.compile()

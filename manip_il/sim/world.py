@@ -195,6 +195,11 @@ class World:
         return self.data.mocap_pos[self._mocap_goal]
 
     @property
+    def measured(self) -> F64:
+        """Joint positions and gripper opening in the units of the robot's actions, (n,)."""
+        return self.scene.actions.join(self.data.qpos[self.scene.arm_q], self.opening)
+
+    @property
     def opening(self) -> float:
         """Opening between the gripper's pads [m]."""
         return self.remember("opening", lambda: self.gripper.opening(self.data.qpos))

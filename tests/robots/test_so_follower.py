@@ -13,7 +13,7 @@ from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots import ROBOTS
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import ManipEnv, joint_state
+from manip_il.sim.env import ManipEnv
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
 
@@ -54,10 +54,10 @@ def test_a_measured_state_is_what_the_real_arms_servos_read(real):
     env = started("so101", "pick_place", seed=3, object="box:0.025")
     rng, actions = np.random.default_rng(0), env.scene.actions
     for _ in range(20):
-        env.advance(actions.random_near(joint_state(env.world), rng))
+        env.advance(actions.random_near(env.world.measured, rng))
         stand(real, env)
         read = real.get_observation()
-        ours = dict(zip(actions.names, joint_state(env.world).tolist(), strict=True))
+        ours = dict(zip(actions.names, env.world.measured.tolist(), strict=True))
         assert list(ours) == [name for name in read if name.endswith(".pos")]
         for name in ours:
             assert abs(ours[name] - read[name]) < OUT_OF_STEP, name

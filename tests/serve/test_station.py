@@ -20,7 +20,6 @@ from manip_il.mdp import F64
 from manip_il.serve import operator, session
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.serve.station import Station
-from manip_il.sim.env import joint_state
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
 
@@ -61,19 +60,19 @@ def told(station: Station, joint: int, degrees: float) -> None:
 def test_joints_go_where_they_are_told(tmp_path: Path, servo: str, most: float):
     """Ideal servos to within a fraction of a degree; real ones sag and have play."""
     station = station_of(tmp_path, servo)
-    before = joint_state(station.env.world)
+    before = station.env.world.measured
     told(station, 0, 20.0)
     run(station, 2.0)
-    moved = joint_state(station.env.world) - before
+    moved = station.env.world.measured - before
     assert moved[0] == pytest.approx(20.0, abs=most)
     assert np.abs(moved[1:5]).max() < most
     station.close()
 
 
 def test_an_arm_whose_torque_is_off_stays(station: Station):
-    before = joint_state(station.env.world)
+    before = station.env.world.measured
     run(station, 1.0)
-    assert np.abs(joint_state(station.env.world) - before)[:5].max() < 2.0
+    assert np.abs(station.env.world.measured - before)[:5].max() < 2.0
 
 
 def test_a_lower_gain_sags_more(station: Station):
