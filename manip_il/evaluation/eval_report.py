@@ -164,7 +164,8 @@ def _conditions(result: EvalResult) -> Section:
         Bar(row[0], (success,), colour)
         for row, success, colour in zip(table.rows, successes, table.colours, strict=False)  # one condition: one row
     ]
-    ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
+    hold = settings.hold
+    ends = {None: "", 0: ", which ends the episode"}.get(hold, f"; an episode ends {hold} steps after it")
     intervals = "Intervals are Wilson's score intervals."
     if result.until_width is not None:
         intervals = "Intervals are from a confidence sequence, which is valid whenever the evaluation stops."

@@ -45,14 +45,15 @@ class Cameras:
         render.close()  # an OpenGL context belongs to the thread that made it; the new thread makes its own
         self._thread = ThreadPoolExecutor(1)
         self._thread.submit(self._send).result()
-        self._thread.submit(self._run)
+        self._running = self._thread.submit(self._run)
 
     def close(self) -> None:
-        """Stop the thread and free the port."""
+        """Stop the thread and free the port. Raises the error that has ended the stream, if one has."""
         self._stop.set()
         self._thread.submit(render.close)
         self._thread.shutdown()
         self._socket.close()
+        self._running.result()
 
     def _run(self) -> None:
         clock = Clock(RATE)
