@@ -42,7 +42,7 @@ _SIDE = 80  # points along each side of the map
 
 @dataclass(frozen=True)
 class Carried:
-    """An episode's path. positions: the object's, from its start to the goal, (T, 3) [m]."""
+    """An episode's path. positions: those of the object, from its start to the goal, (T, 3) [m]."""
 
     episode: int
     grid: Grid
@@ -125,7 +125,7 @@ class Inverse:
 
     @property
     def excess(self) -> float:
-        """Excess cost of the demonstrations relative to that of the re-planned paths, both by these weights."""
+        """By these weights, the demonstrations' cost beyond that of the re-planned paths, as a share of the latter."""
         shown, planned = self.means
         return float(shown @ self.weights / (planned @ self.weights) - 1)
 

@@ -56,9 +56,9 @@ class EditSource:
 def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> EditSource:
     """Open a dataset whose states are to be restored.
 
-    robot, task: files of the user's own robot and task. shape: the object's, if it is a mesh. Raises `ManipError` if
-    the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or object, and what
-    `make_config` raises for a robot, task or object that is not built in.
+    robot, task: files of the user's own robot and task. shape: as in `EnvConfig.object`, if the object is a mesh.
+    Raises `ManipError` if the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or
+    object, and what `make_config` raises for a robot, task or object that is not built in.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec

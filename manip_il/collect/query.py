@@ -130,7 +130,10 @@ def parse_query(text: str) -> Query:
 
 
 def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
-    """Return when a rollout queries the expert; for `one` without takeover never, as `labelled` does so afterwards."""
+    """Return the rule by which a rollout queries the expert.
+
+    For `one` without takeover it never queries: `labelled` labels the drawn step when the episode is over.
+    """
     if label == "last":
         return lambda turns, actions: [turn.step == setting.horizon - 1 for turn in turns]
     if query.kind == "one" and label != "takeover":

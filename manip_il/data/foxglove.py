@@ -54,20 +54,20 @@ def frame_times(count: int, rate: int | Fraction) -> list[int]:
 
 
 def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Messages:
-    """Yield positions (T, n) of named joints."""
+    """Yield one message per row of the positions (T, n) of named joints."""
     for time, row in zip(times, values.tolist(), strict=True):
         joints = [JointState(name=name, position=position) for name, position in zip(names, row, strict=True)]
         yield JointStates(timestamp=_stamp(time), joints=joints)
 
 
 def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
-    """Yield labelled numbers. rows: T rows of finite Python numbers, because JSON has no others."""
+    """Yield one JSON message of labelled numbers per row. rows: T rows of finite Python numbers; JSON has no others."""
     for row in rows:
         yield json.dumps({"scalars": [{"label": one, "value": value} for one, value in zip(labels, row, strict=True)]})
 
 
 def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
-    """Yield RGB pictures (height, width, 3), without loss."""
+    """Yield one message per RGB picture (height, width, 3), uncompressed."""
     for time, picture in zip(times, pictures, strict=True):
         height, width, depth = picture.shape
         yield RawImage(

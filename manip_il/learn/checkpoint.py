@@ -270,7 +270,7 @@ def require_trust(
     texts = sorted({value for value in named if isinstance(value, str)})
     if (kind not in PLAIN or texts) and not trust:
         raise ManipError(
-            f"{source} is a policy of type {kind!r}, which loads what it names ({checks.shorten(texts)}): "
+            f"{source} is a policy of type {kind!r}, whose configuration names what to load ({checks.shorten(texts)}): "
             "this downloads files and may run code in them; if you trust its source, add --trust=true"
         )
 

@@ -43,22 +43,22 @@ _MEMORY = 0.99  # weight of the previous value in the running mean of that error
 @PreTrainedConfig.register_subclass("cnn")
 @dataclass
 class CNNConfig(MLPConfig):
-    """Keypoints of every camera, found by a small convolutional network, and the mlp's perceptron on top.
+    """A small convolutional network that finds keypoints in every camera's picture, and the mlp's perceptron on top.
 
     channels: number in each convolutional layer; the first two layers halve the picture's sides, the others keep them.
     keypoints: number per camera. aux_weight: if the dataset has `observation.environment_state` and it is not an input,
     a second perceptron predicts it from joints and keypoints; this is the weight of its loss, the mean absolute error
     in standard deviations. The action is predicted from joints, keypoints and this predicted state; the true state is
-    never used to act. scales: as in the mlp, for the offsets in the predicted state, or in the true one if it is an
-    input; scaled: columns of these offsets in that state. heatmap_weight: weight of the cross-entropy [nats] between
-    heat maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a
+    never used to act. scales: as in the mlp, but for the offsets in the environment state (predicted, or true if it is
+    an input); scaled: indices of these offsets in it. heatmap_weight: weight of the cross-entropy [nats] between heat
+    maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a
     keypoint of its own in addition to `keypoints`; 0: off. states: a dataset without pictures. If given, the mlp's
     network predicts the action from joints and predicted state alone. It is trained on the true states of this dataset
     and of the frames with pictures, plus noise of the size of the prediction's error (the "independent" concept
     bottleneck of Koh et al., ICML 2020). All other options are the mlp's.
 
-    `use_amp` runs the convolutions in half precision while training, if the processor has bfloat16, which is twice as
-    fast. Acting is always in single precision.
+    If the processor has bfloat16, `use_amp` trains the convolutions in half precision, which is twice as fast. Acting
+    is always in single precision.
 
     Raises what `MLPConfig` raises, and `UsageError` for sizes and weights out of range.
     """

@@ -63,7 +63,7 @@ class Posterior:
 
     @property
     def pooled(self) -> F64:
-        """All chains' draws, (C N, K) [1/m]."""
+        """All chains' draws, (C * N, K) [1/m]."""
         return self.draws.reshape(-1, self.draws.shape[2])
 
     @property

@@ -152,7 +152,7 @@ class Robot:
     the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest torque [N m] and added inertia
     [kg m^2]. base: position of the root body [m]. fixed: positions of the joints that are neither the arm's nor the
     gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
-    costs: those of inverse kinematics. yaw: zero direction, along the world's x or straight ahead of the shoulder.
+    costs: those of inverse kinematics. yaw: zero direction: along the world's x, or away from the shoulder.
     wrist_camera: name of the model's camera on its hand, or position of an added one in the frame `ee` [m]. cameras:
     poses of the scene's cameras, front and side, that replace the default ones. table: the scene's.
     colours: red, green and blue of meshes without contacts, by patterns of their names; later patterns win. lerobot:
@@ -201,7 +201,7 @@ class Robot:
 
     @property
     def faces_ahead(self) -> bool:
-        """Whether the hand's yaw counts from straight ahead of the shoulder, not from the world's x."""
+        """Whether yaw 0 of the hand points away from the shoulder, rather than along the world's x."""
         return self.yaw != "world"
 
     @property

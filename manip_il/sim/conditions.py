@@ -134,9 +134,9 @@ def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
 
 
 def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> dict[str, Any]:
-    """Return what the episode of a seed draws from the condition whose turn it is.
+    """Return the values drawn for the episode of a seed, by name. `turn_of` returns its condition.
 
-    shape: the object's, as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn.
+    shape: as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn, too.
     """
     drawn = turn_of(conditions, seed).draw(seed)
     if not draws_shape(shape):

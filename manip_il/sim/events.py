@@ -195,8 +195,8 @@ class Events:
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; returns whether a perturbation changed it.
 
-        A perturbation that finds no place, or changes nothing (fingers already open), leaves the world as it
-        was, bit for bit.
+        A perturbation for which there is no place, or that changes nothing (fingers already open), leaves the world as
+        it was, bit for bit.
         """
         world = self._world
         if step == self._knock_step:

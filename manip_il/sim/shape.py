@@ -146,7 +146,7 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
 
 
 def draws_shape(text: str) -> bool:
-    """Return whether each episode draws the shape of the object in a text, as `Shape.parse` reads it."""
+    """Return whether `text`, as in `Shape.parse`, asks for a shape that is drawn anew in each episode."""
     return text.partition(":")[0] == ANY
 
 

@@ -268,7 +268,7 @@ class World:
     def neighbours(self, name: str) -> list[tuple[float, float]]:
         """Return the offsets (x, y) [m] from an object's centre to the nearest point of each neighbour within 8 cm.
 
-        Neighbours are furniture and other objects that a hand over the object could hit, as boxes along x and y.
+        Neighbours are furniture and other objects that a hand over the object could hit, taken as axis-aligned boxes.
         """
         others = self._standing[name]
         if not len(others):

@@ -25,7 +25,7 @@ _RISE = 0.10  # height of the hand over an object after release [m]
 
 
 def add_bin(spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour: tuple[float, ...] = WOOD) -> None:
-    """Add an open box, whose pose an episode's start sets. inside: half its inner length and width [m]."""
+    """Add an open box; its pose is set at the start of an episode. inside: half its inner length and width [m]."""
     box, high = add_furniture(spec, name), WALL / 2
     length, width = inside
     add_part(box, f"{name} floor", (length, width, THIN), (0, 0, THIN), colour)

@@ -19,7 +19,7 @@ from manip_il.tasks.table import get_task
 def scene_of(robot: str, task: str, shape: str = "") -> Scene:
     """Return the compiled scene of a robot and a task, given by name or file.
 
-    shape: the object's, as in `EnvConfig.object`. Raises `UnknownName`, `UsageError`.
+    shape: as in `EnvConfig.object`. Raises `UnknownName`, `UsageError`.
     """
     return build_scene(get_robot(robot), get_task(task, shape))
 

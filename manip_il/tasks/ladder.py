@@ -213,5 +213,5 @@ def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = CARRY) 
 
 
 def nearness(rest: float) -> float:
-    """Return 1 within `AT_GOAL` [m] of the goal, and less the more distance is left."""
+    """Return 1 if at most `AT_GOAL` [m] is left, else less, towards 0 for a long way. rest: distance left [m]."""
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))

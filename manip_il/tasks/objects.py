@@ -66,7 +66,7 @@ def add_object(
 
 
 def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
-    """Return a new mocap body for solid parts; an episode's start sets its pose."""
+    """Return a new mocap body for solid parts; its pose is set at the start of an episode."""
     return spec.worldbody.add_body(name=name, mocap=True, pos=[0.5, 0, 0])
 
 

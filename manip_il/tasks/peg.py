@@ -46,10 +46,11 @@ IN_AIR, BESIDE = 0.006, 0.045  # least height of a falling peg; largest distance
 
 
 class Grip(NamedTuple):
-    """Grip of the hand on the peg: pose of `ee`, position (3,) [m] and rotation (3, 3).
+    """Grip that the hand aims for: pose of `ee`, position (3,) [m] and rotation (3, 3).
 
-    off: misalignment of the hand, angle included [m]; angle: the hand's to that pose [rad]; height: over the grip, as
-    the misalignment requires [m]. open_enough: the fingers pass on both sides of the peg.
+    off: misalignment of the hand, angle included [m]; angle: between the hand's rotation and this one [rad]; height:
+    distance to keep above the grip, which grows with the misalignment [m]. open_enough: the fingers pass on both sides
+    of the peg.
     """
 
     position: F64
@@ -121,7 +122,7 @@ def is_aslant(world: World) -> bool:
 
 @once_per_state
 def grip_of(world: World) -> Grip:
-    """Return how the hand grips the peg as it lies or stands."""
+    """Return the grip that the hand aims for, given how the peg stands or lies."""
     ee, peg = world.ee, world.pose(PEG)
     width, _, length = world.extents(PEG)
     axis = upper_axis(world)

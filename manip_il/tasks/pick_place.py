@@ -27,7 +27,7 @@ ANY_SHAPE = Limits(horizon=200)  # small or rolling objects take more attempts t
 class PickPlace:
     """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace.
 
-    shape: the object's, a 5 cm cube unless `--task.object=` says otherwise.
+    shape: shape of the object, a 5 cm cube unless `--task.object=` says otherwise.
     """
 
     name: str = "pick_place"

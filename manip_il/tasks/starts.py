@@ -119,7 +119,7 @@ def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World
 def draw_together(
     draw: Callable[[str], F64], names: Iterable[str], fits: Callable[[F64, Sequence[F64]], bool], world: World
 ) -> list[F64]:
-    """Draw a place (3,) for each name that fits beside the earlier ones; start over if one finds none.
+    """Draw one place (3,) [m] per name, each beside the earlier ones; if one does not fit, draw all of them again.
 
     Raises `UsageError` after a thousand attempts.
     """

@@ -41,7 +41,7 @@ class Drift:
 
     @property
     def growth(self) -> float:
-        """Factor by which the distance grows per step, at the end."""
+        """Factor by which the distance grows per step, averaged over the last 10 steps."""
         return float((self.apart[-1] / self.apart[-1 - _LATE]) ** (1 / _LATE))
 
     def to_json(self) -> dict[str, Any]:

@@ -89,7 +89,7 @@ class StockEnv(StockBase):
         return self._env.goal
 
     def observe(self) -> Observation:
-        """Return gripper and opening, (4,), and the environment's own observation with the goal, (k,)."""
+        """Return the gripper's position and opening, (4,) [m], and the environment's own observation and goal, (k,)."""
         own = self._env._get_obs()
         state = np.append(own["observation"][:3], self.opening).astype(np.float32)
         return Observation(state, np.append(own["observation"], own["desired_goal"]).astype(np.float32))
@@ -101,7 +101,7 @@ class StockEnv(StockBase):
         )
 
     def set_state(self, state: State) -> None:
-        """Restore a state of the same task. Raises `MismatchError` for another one's."""
+        """Restore a state of the same task. Raises `MismatchError` for a state of another task."""
         size, nq = mujoco.mj_stateSize(self.model, WHOLE), self.model.nq
         if len(state.physics) != (expected := size + nq + self.model.nv) or len(state.variation) != 3:
             raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, expected)

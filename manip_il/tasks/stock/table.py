@@ -59,9 +59,9 @@ ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  #
 
 @dataclass(frozen=True)
 class Held:
-    """Half finger gaps for an object. open: the least that passes over it; thin: the least that can hold it [m].
+    """Half the gap between the fingers for one object [m]. open: least that clears it; thin: least that can hold it.
 
-    long: whether its own x is its long axis.
+    long: whether the object's own x axis is its long one.
     """
 
     open: float

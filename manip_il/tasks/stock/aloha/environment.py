@@ -71,11 +71,11 @@ class AlohaEnv(StockBase):
         return kind(self.task, self.model, self.data)
 
     def measured(self) -> F64:
-        """Return joints [rad] and grippers, 0 to 1, (14,)."""
+        """Return joint positions [rad] and gripper openings, 0 to 1, (14,)."""
         return self._env._env.task.get_qpos(self.physics)
 
     def observe(self) -> Observation:
-        """Return joints and grippers, (14,), the scene's `environment_state`, (k,), and pictures."""
+        """Return joint positions and gripper openings, (14,), the scene's `environment_state`, (k,), and pictures."""
         state, environment = self.measured().astype(np.float32), self.scene().observed().astype(np.float32)
         return Observation(state, environment, self._pictures() if self._cameras else {})
 
@@ -84,7 +84,7 @@ class AlohaEnv(StockBase):
         return State(self._physics(), np.empty(0), self._step, self._streak, self._ever)
 
     def set_state(self, state: State) -> None:
-        """Restore a state of the same task. Raises `MismatchError` for another one's."""
+        """Restore a state of the same task. Raises `MismatchError` for a state of another task."""
         if len(state.physics) != (expected := mujoco.mj_stateSize(self.model, WHOLE)):
             raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, expected)
         mujoco.mj_setState(self.model, self.data, state.physics, WHOLE)

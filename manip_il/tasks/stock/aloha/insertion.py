@@ -37,7 +37,7 @@ CARRIED = 0.04  # longest step of a joint while an object is carried [rad]
 
 
 class Insertion(AlohaScene):
-    """A state of the peg's insertion."""
+    """One state of the peg-insertion task."""
 
     @cached_property
     def has(self) -> dict[str, bool]:

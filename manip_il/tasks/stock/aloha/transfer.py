@@ -38,7 +38,7 @@ CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest joint steps: carrying, ha
 
 
 class Transfer(AlohaScene):
-    """A state of the cube's transfer."""
+    """One state of the cube-transfer task."""
 
     @cached_property
     def cube(self) -> F64:
