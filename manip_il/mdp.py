@@ -128,9 +128,9 @@ class Transition:
 class Episode:
     """A finished episode as columns, with the dataset's names (without LeRobot's own index columns).
 
-    columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required number of
-    consecutive steps at some time. success_at_end: the same at the last frame. instruction: the task in words, for
-    policies that read language; empty for the task's own text. drawn: how the episode's world differed from the nominal
+    columns: name -> array (T, ...). success: whether the goal was held, at some time, for the required number of
+    consecutive steps; success_at_end: whether it was so at the last frame. instruction: the task in words, for policies
+    that read language; empty for the task's own text. drawn: how the episode's world differed from the nominal
     one: range name -> plain JSON value.
     """
 

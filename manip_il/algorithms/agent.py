@@ -35,7 +35,7 @@ class Agent:
 
     number, simulated: iterations and control steps so far; metrics: those of the last iteration. validated_at: control
     steps at the last validation. Raises what `start_conversion` and `read_demonstrations` raise, and `UsageError` for
-    options that do not match them.
+    options that do not fit the demonstrations.
     """
 
     def __init__(self, config: LearningConfig, clock: Stopwatch):
@@ -62,7 +62,7 @@ class Agent:
         self._expert = demonstrations.padded(horizon, actions.normalised) if demonstrations else None
 
     def keep(self, make: Callable[[MLPNetwork], Discriminator]) -> Discriminator:
-        """Return `make(network)`, a discriminator that is saved with the agent. network: the actor's."""
+        """Return the discriminator that `make` builds from the actor's network; it is saved with the agent."""
         seed_generators(self._stream("discriminator"))
         self._modules["discriminator"] = made = make(self._policy.model)
         return made

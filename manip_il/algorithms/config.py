@@ -32,7 +32,7 @@ class BetaSchedule:
 
     @classmethod
     def parse(cls, text: str) -> BetaSchedule:
-        """Parse the format of `str`. Raises `UsageError` for anything else."""
+        """Parse `kind:parameter`, as written by `str`. Raises `UsageError` for anything else."""
         kind, _, parameter = text.partition(":")
         try:
             number = float(parameter)
@@ -71,7 +71,7 @@ _DEFAULTS = ("per_state", None, _LEARNER_ALONE)  # label, query, beta
 
 @dataclass(frozen=True)
 class RunConfig(Seeded):
-    """Options of `manip-il dagger`, by name. Round 0 records the expert's demonstrations unless `datasets` has some.
+    """Options of `manip-il dagger`. Round 0 records the expert's demonstrations unless `datasets` has some.
 
     datasets: recorded demonstrations that replace those of round 0. start: the `pretrained_model` folder of a policy
     that replaces cloning in round 0; without datasets, round 0 then has no demonstrations. Later rounds start from its
@@ -100,7 +100,7 @@ class RunConfig(Seeded):
     )
     query_rule: Query | None = None
     branch_steps: int | None = option(
-        None, "control steps of a branch; by default as many as the policy plans ahead", at_least=1
+        None, "control steps of a branch; by default just enough to learn one whole plan", at_least=1
     )
     ensemble: int = option(1, "policies fitted per round, for --query=ensemble:BOUND; the first one drives", at_least=1)
     refit: Literal["scratch", "warm"] = option("scratch", "each round's initial weights: random or the last round's")
@@ -119,7 +119,7 @@ class RunConfig(Seeded):
     cameras: CameraConfig | None = None
     redraw: int = option(
         0,
-        "redrawn scenes of round 0's states, for a policy on pictures; later rounds get as many per state",
+        "number of scenes redrawn from round 0's states, for picture policies; later rounds get as many per state",
         at_least=0,
     )
     conditions: tuple[Condition, ...] = ()
@@ -151,7 +151,10 @@ class RunConfig(Seeded):
         if self.start is not None and self.ensemble > 1:
             raise UsageError(f"ensemble is {self.ensemble}, but --policy.path gives one policy; expected 1")
         if (rule is not None and rule.kind == "ensemble") != (self.ensemble > 1):
-            raise UsageError(f"ensemble is {self.ensemble}, query '{rule or 'every'}'; ensemble:BOUND needs 2 or more")
+            raise UsageError(
+                f"ensemble is {self.ensemble} with query={rule or 'every'}; expected 2 or more with "
+                "query=ensemble:BOUND, else 1"
+            )
 
     @property
     def steps_of_branch(self) -> int:

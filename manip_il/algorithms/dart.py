@@ -29,7 +29,7 @@ def dart(run: Run, c: RunConfig) -> Iterator[Result]:
 
 
 def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tuple[float, ...], ...]:
-    """Return the covariance (n, n) of learner minus expert over an expert's dataset, the noise of the next round.
+    """Return the noise of the next round: the covariance (n, n) of the learner's errors on an expert's dataset.
 
     It is the maximum likelihood fit of a Gaussian with mean zero, as in the paper. Use data that the policy was not
     fitted to, or its errors are underestimated. trust: see `LearnedPolicy.load`. Raises `ManipError` if there is no

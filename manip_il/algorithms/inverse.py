@@ -125,7 +125,7 @@ class Inverse:
 
     @property
     def excess(self) -> float:
-        """By these weights, the demonstrations' cost beyond that of the re-planned paths, as a share of the latter."""
+        """Share by which the demonstrations cost more than the re-planned paths, by these weights."""
         shown, planned = self.means
         return float(shown @ self.weights / (planned @ self.weights) - 1)
 

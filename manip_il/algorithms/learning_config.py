@@ -29,7 +29,7 @@ class LearningConfig(Seeded):
     episodes: int = option(32, "episodes per iteration, run in lockstep", at_least=1)
     episode_steps: int = option(
         0,
-        "control steps of an episode while learning; 0: 1.5 times the longest demonstration, or the horizon",
+        "control steps of an episode while learning; 0: the horizon, or 1.5 times the longest demonstration if shorter",
         at_least=0,
     )
     action_space: str | None = option(
@@ -37,7 +37,7 @@ class LearningConfig(Seeded):
     )
     log_std: float | None = option(
         None,
-        "log of the initial action noise in deviations of the demonstrations; by default -0.5, or -1 with --init",
+        "log of the initial action noise in standard deviations of the demonstrations; by default -0.5, -1 with --init",
         at_least=-4,
         at_most=2,
     )

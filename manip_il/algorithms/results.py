@@ -72,14 +72,14 @@ class Result:
 
     @property
     def validation(self) -> EvalResult:
-        """Validation result. Raises `ManipError` if none was due."""
+        """Validation result. Raises `ManipError` if the policy was not validated."""
         if self.validated is None:
             raise ManipError(f"{self.unit} {self.number} was not validated")
         return self.validated
 
     @property
     def labels(self) -> int:
-        """Valid labels learnt from so far."""
+        """Number of valid labels that policies have learnt from so far."""
         return int(self.metrics["labels"])
 
     def to_json(self) -> dict[str, Any]:
@@ -98,7 +98,7 @@ class Result:
 
 
 def best_result(results: Iterable[Result]) -> Result:
-    """Return the result with the highest validation success; among equals the latest, which has seen the most data."""
+    """Return the result with the highest validation success; on a tie the latest, which has seen the most data."""
     return max(results, key=lambda result: (result.validation.success.rate, result.number))
 
 
@@ -108,7 +108,7 @@ def validations(folder: Path) -> dict[int, EvalResult]:
 
 
 def best_validation(found: dict[int, EvalResult]) -> int:
-    """Return the iteration with the highest validation success; among equals the latest."""
+    """Return the iteration with the highest validation success; on a tie the latest."""
     return max(found, key=lambda number: (found[number].success.rate, number))
 
 

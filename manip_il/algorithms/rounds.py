@@ -78,7 +78,7 @@ def round_folder(folder: Path, round_: int) -> Path:
 
 
 def mixture(policy: Fitted, beta: float) -> PolicyDriver:
-    """Execute the expert's label with probability beta in each step, else the learner's action (Ross et al. 2011)."""
+    """Return a driver: in each step the expert with probability beta, else the learner (Ross et al. 2011)."""
     return PolicyDriver(policy.members, beta, policy.trust)
 
 
@@ -144,7 +144,7 @@ def _count_labels(root: Path) -> int:
 def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
     """Return the scenes to redraw from the states of the last dataset.
 
-    There are as many per state as in round 0, and numbers continue after those of earlier rounds.
+    There are as many scenes per state as in round 0; their numbers continue those of earlier rounds.
     """
     assert config.cameras is not None
     states = [len(Dataset.open(dataset)) for dataset in datasets]

@@ -9,7 +9,7 @@ by running its loop again.
     checkpoints/last/    reinforcement learning: the last finished iteration, see `agent`
     validation/          reinforcement learning: every validated policy and its eval.json, by iteration
     metrics.jsonl        a line per round or iteration
-    best/                the policy with the highest validation success; among equals the latest
+    best/                the policy with the highest validation success; on a tie the latest
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Run:
         self._fitted: Fitted | None = None
 
     def results(self) -> Iterator[Result]:
-        """Run or resume the method's loop; the function and its module are named after the method."""
+        """Run or resume the method's loop: the function named like the method, in the module of that name."""
         name = self.config.method
         loop = getattr(importlib.import_module(f"manip_il.algorithms.{name}"), name)
         return self.follow(loop(self, self.config))
@@ -107,7 +107,7 @@ class Run:
             merge_rounds(made, self.folder / DATASET, f"local/{self.config.env.name}_dagger", best.number)
 
     def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
-        """Record a round with `count` successful expert episodes; datasets may replace round 0's, see `RunConfig`."""
+        """Record a round with `count` successful expert episodes; in round 0 `config.datasets` may replace them."""
         here, config = self._folder(round_), self.config
         if round_ == 0 and (config.datasets or config.start):
             with self._clock.timed("collect"):
@@ -166,7 +166,7 @@ class Run:
         return self._made[round_]
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
-        """Fit the policy, then the rest of an ensemble, to rollouts; it belongs to the round of the last rollouts."""
+        """Fit the policy, or all members of an ensemble, to rollouts; its round is that of the last rollouts."""
         config, before, round_ = self.config, self._fitted, data[-1].round
         here, members = self._folder(round_), list[Path]()
         if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
@@ -199,7 +199,7 @@ class Run:
             metrics={
                 "beta": here.beta,
                 "labels": sum(one.labels for one in so_far),
-                # More than the labels if not every answer becomes one (`safety`, the held-out episodes of `dart`).
+                # More than the labels if a query yields no label to learn from (`safety`, held-out episodes of `dart`).
                 "queries": sum(one.queries for one in so_far) + self._held_out_steps,
                 "rollout_success": here.successes / max(1, here.episodes),
             },
@@ -217,7 +217,7 @@ class Run:
     def begin(self, agent: Agent) -> Iterator[Result]:
         """Load the agent's last finished iteration and yield it; without one, yield the initial clone, if any.
 
-        So an iteration still gets its line if the run was killed before its metrics were written.
+        So an iteration gets its line in `metrics.jsonl` even if the run was killed right after saving its checkpoint.
         """
         checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
         if checkpoint is not None:

@@ -60,7 +60,7 @@ class RobotEpisode:
 
 @dataclass(frozen=True)
 class ActionRange:
-    """Mean, scale and range of raw targets, (n,) each. A normalised action y means mean + scale y, within the range."""
+    """Mean, scale and range of raw targets, (n,) each. A normalised action y is the target mean + scale y, clipped."""
 
     mean: F32
     scale: F32
@@ -96,8 +96,9 @@ class ActionRange:
 class Unending(gymnasium.Env[F32, Any]):
     """An episode that never terminates: once finished, it continues in an absorbing state.
 
-    Observations (d + 2,): inputs, whether absorbing, elapsed share of `horizon`. `step` takes actions, not targets.
-    episode: a `RobotEpisode` or an object with its methods. simulated: control steps since `reset`.
+    Observations (d + 2,): inputs, whether absorbing, elapsed share of `horizon`. `step` takes what `episode.advance`
+    takes, not normalised actions. episode: a `RobotEpisode` or an object with its methods. simulated: control steps
+    since `reset`.
     """
 
     def __init__(self, episode: Any, space: spaces.Box, horizon: int):
@@ -128,7 +129,7 @@ class Unending(gymnasium.Env[F32, Any]):
 
 
 class Lockstep(DummyVecEnv):
-    """Parallel episodes of equal length. `seed` sets the first one's seed at the next `reset`; the others count up.
+    """Parallel episodes of equal length. `seed(s)` gives them the seeds s, s + 1, ... at the next `reset`.
 
     conversion: from the policy's raw targets to actions; it needs the measured joints, which are the first inputs.
     executed: actions (T, B, n) since `reset`.

@@ -78,7 +78,7 @@ class EngineOptions:
     """Options of worker processes on this machine or a Ray cluster."""
 
     workers: int | None = option(
-        None, "processes, or concurrent tasks on Ray; none: one per core", at_least=1, free=True
+        None, "processes, or concurrent tasks on Ray; null (none) is one per core", at_least=1, free=True
     )
     engine: Literal["local", "ray"] = option(
         "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else started here)", free=True
@@ -93,7 +93,7 @@ class EngineOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Tested:
-    """Options of a command that tests under conditions."""
+    """Options of a command that runs episodes under test conditions."""
 
     suite: str = option(
         "nominal",

@@ -191,7 +191,7 @@ class StudyPlan(NamedTuple):
         runs = [(name, seed) for seed in range(self.file.training_seeds) for name in self.arms]
         for number, (name, seed) in enumerate(runs, start=1):
             output = ResumableOutput(root / name / f"seed_{seed}", resume=True)
-            if not (output.output_dir / REPORT_FILE).is_file():  # a run's last file
+            if not (output.output_dir / REPORT_FILE).is_file():  # the file that a run writes last
                 say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
                 options = self.arms[name]
                 replace(options, settings=options.settings | {"seed": seed}, output=output, engine=engine).run()

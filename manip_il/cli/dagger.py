@@ -50,7 +50,7 @@ class DaggerOptions(Varied, Trusting):
     query: str | None = option(
         None,
         "when the expert is queried: every, one, probability:P, ensemble:BOUND or safety:BOUND; "
-        "by default every, but one for takeover, and probability:1/STEPS for branch",
+        "by default every; with --label=takeover one, with --label=branch probability:1/STEPS",
     )
     fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
     image: Given = given(CameraConfig, **SMALL)
@@ -116,7 +116,7 @@ class DaggerOptions(Varied, Trusting):
         if best.number > 0:
             comparison = Comparison(names[0], names[best.number], ((results[0].validation, best.validation),))
             facts = (f"{comparison.verdict} The best round was chosen on these episodes, so its success is biased up.",)
-        chosen = f"{names[best.number]} is chosen of {len(results)}"
+        chosen = f"{names[best.number]}, best of {len(results)}"
         write_page(
             folder,
             folder,

@@ -93,8 +93,8 @@ class ScoreOptions(OfDataset):
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
     Writes scores.json and rabc.parquet: weights of frames, for manip-il train --weights= and for
-    lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, it also prints how well
-    the score finds them.
+    lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, also prints how well the
+    score detects them.
     """
 
     example: ClassVar[str] = "manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores"

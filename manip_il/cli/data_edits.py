@@ -140,7 +140,7 @@ class RelabelOptions(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class RedrawOptions(Edit, Varied, Seeded):
-    """Randomise goals, untouched objects and looks in visited states; label and render each scene.
+    """Randomise the goals, untouched objects and appearance of visited states; label and render each scene.
 
     TARGET is a LeRobot dataset for training policies on pictures; each frame is an episode. Scenes without a valid
     label are left out. --vary takes view, clutter, object (its colour), or YAML files of ranges.

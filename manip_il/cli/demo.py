@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.tables import PolicyRow
 
 RUN: Given = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # replace the defaults of dagger
-ENOUGH = 1.25  # demonstrations recorded for a number of labels, relative to what round 0 suggests
+ENOUGH = 1.25  # demonstrations to record, relative to the number that should give enough labels
 FIT: Given = {"steps": 3_000, "batch_size": 256}
 
 

@@ -40,7 +40,7 @@ class EvalGroup:
     """`--eval.*`: the episodes to run."""
 
     n_episodes: int | None = option(
-        None, "test episodes; none: 100, or up to 10,000 with --until_width", at_least=1, grows=True
+        None, "test episodes; by default 100, or up to 10,000 with --until_width", at_least=1, grows=True
     )
     first: int = option(0, "index of the first seed in the stream, to run a large evaluation in parts", at_least=0)
     hold: int | None = option(

@@ -73,8 +73,8 @@ def open_datasets(roots: Sequence[Path], *, pictures: bool, language: bool = Fal
 def differences(dataset: Dataset) -> list[str]:
     """Return a line for each difference in versions or model between a dataset and this machine.
 
-    Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm or task holds only its name,
-    and is not compared.
+    Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm or task is not compared,
+    because it holds only the name of that arm or task.
     """
     spec, name = dataset.spec, str(dataset.root)
     if not is_known(spec.robot, spec.task, spec.object):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Learning:
-    """Options, run, progress and report that these commands share."""
+    """What `rl gail`, `rl airl` and `rl ppo` share: options, run, progress and report."""
 
     method: ClassVar[str]
     first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"

@@ -34,9 +34,9 @@ def group(default: Any, prefix: str | None = None) -> Any:
 
 
 def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **own: Any) -> Any:
-    """Return a `Given` field: the options that `cls` declares.
+    """Return a field that holds, as a dict (`Given`), those options of the dataclass `cls` that the user gave.
 
-    only: names of fields, by default all. own: defaults that replace those of `cls`, always in the dict.
+    only: names of fields, by default all. own: defaults that replace those of `cls`; the dict always holds them.
     """
     metadata = {"given": cls, "only": only}
     names = {} if prefix is None else {"prefix": prefix}

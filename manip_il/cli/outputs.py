@@ -103,7 +103,7 @@ def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] =
     if source := next((one for one in sources if one.resolve().is_relative_to(folder.resolve())), None):
         raise UsageError(f"{folder} overlaps {source}; expected a separate folder")
     if folder.is_symlink():
-        raise UsageError(f"{folder} is a link; --overwrite=true follows no links, give {folder.resolve()} itself")
+        raise UsageError(f"{folder} is a link; --overwrite=true does not follow links, so give {folder.resolve()}")
     files = {folder / name: mark.encode() for name, mark in _MARKS.items() if (folder / name).is_file()}
     if not any(mark in path.read_bytes() for path, mark in files.items()):
         raise UsageError(

@@ -111,7 +111,7 @@ class Stages:
         self.check()
         how: dict[str, Any] = {"dynamic_ncols": True} if sys.stderr.isatty() else _PLAIN
         self._bar = tqdm(total=total, desc=description, disable=_quiet or total == 0, **how)
-        self._bar.delay = 0.0  # only its constructor must not write a line
+        self._bar.delay = 0.0  # the delay only keeps the constructor from writing a line
         self._solved = 0
 
     def close(self) -> None:

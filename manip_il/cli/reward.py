@@ -54,8 +54,8 @@ class IrlOptions(OfDataset, Seeded):
 class PairsOptions(Seeded):
     """Choose pairs of clips from datasets of one task, for comparison by people (ask) or simulated teachers (answer).
 
-    A SOURCE is a dataset or a run; each round of a DAgger run is one source. Every source is in equally many pairs.
-    Episodes shorter than --clip are left out.
+    A SOURCE is a dataset or a run; each round of a DAgger run is one source. Without --reward all sources appear
+    equally often. Episodes shorter than --clip are left out.
     """
 
     example: ClassVar[str] = "manip-il reward pairs runs/dagger --count=200 --output=pairs.json"
@@ -111,7 +111,7 @@ class AskOptions(OfPairs):
 class AnswerOptions(OfPairs, Seeded):
     """Let a simulated teacher answer pairs by the clips' true progress (B-Pref, Lee et al. 2021).
 
-    Teachers: perfect; boltzmann:TEMPERATURE, less certain if returns are close; mistaken:EPSILON, wrong on that share
+    Teachers: perfect; boltzmann:TEMPERATURE, less certain if returns are close; mistaken:SHARE, wrong on that share
     of the pairs. A clip's return is the sum of progress over its steps.
     """
 

@@ -25,9 +25,9 @@ PAGE = "check.html"
 class RobotNewOptions(Replacing):
     """Write a first YAML file for an arm's MJCF, with hand, fingers and workspace as suggested by the model.
 
-    A comment explains every line. Omitted values (joints, home, gains, the hand's frame) are taken from the model, and
-    can be added. Then checks the robot, like `robot check --episodes=0`, and prints what to change. Ends with an error
-    if the robot cannot do any task yet.
+    Comments in the file explain its values. Joints, home, gains and the hand's frame are not in it: they are taken from
+    the model unless you add them. Then checks the robot, like `robot check --episodes=0`, and prints what to change.
+    The exit code is 1 if the robot cannot do any task yet.
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"
@@ -60,15 +60,18 @@ class RobotNewOptions(Replacing):
 class RobotCheckOptions:
     """Measure what an arm can do, before recording; writes check.html and check.json.
 
-    Shows the arm with its frame and cameras, its reach, the expert's success at every task, also with a tenth of the
-    actions random, and what to change if something does not work. The exit code is 1 if a task cannot be done.
+    Shows the arm with its frame and cameras, its reach, the expert's success at every task with and without a tenth of
+    the actions random, and what to change if something does not work. The exit code is 1 if a task cannot be done.
     """
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
     robot: str = option(MISSING, "the robot's YAML file, or the name of a built-in robot", positional=True)
     tasks: list[str] = option(list, f"any of {', '.join(NAMES)}; by default all")
     episodes: int = option(
-        50, "expert episodes per task, and as many with random actions; 0 for none", at_least=0, at_most=1_000_000
+        50,
+        "expert episodes per task, and as many with a tenth of the actions random; 0 for none",
+        at_least=0,
+        at_most=1_000_000,
     )
     output: Output = group(Output(Path("runs/robot_check")), prefix="")
 

@@ -31,7 +31,7 @@ class WatchedPolicyGroup:
 
     path: Path | None = option(None, "a checkpoint or a run")
     type: Literal["expert", "random", "sliders"] | None = option(
-        None, "instead of a checkpoint, by default expert; sliders: you, with the sliders of the window"
+        None, "instead of a checkpoint, by default expert; sliders: you drive with the window's sliders"
     )
 
 

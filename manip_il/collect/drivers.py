@@ -1,7 +1,7 @@
 """Drivers of rollouts: the expert, the expert with noise, a policy, a mixture of policy and expert, random actions.
 
-A driver is a small picklable object that a job sends to its worker. There `start` returns a function that maps the
-turns of a step to an action (n,) and an actor for each turn.
+A driver is a small picklable object that a job sends to its worker. In the worker, `start` returns a function that maps
+the turns of a step to an action (n,) and an actor for each turn.
 """
 
 from __future__ import annotations

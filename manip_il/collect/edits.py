@@ -71,7 +71,7 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
     for what in ("robot", "task", "object"):
         if getattr(given, what) != getattr(spec, what):
             raise MismatchError(what, str(root), getattr(spec, what), "the given one", getattr(given, what))
-    lacks = given.sim_state_size - spec.sim_state_size  # states of older versions lack the last draws
+    lacks = given.sim_state_size - spec.sim_state_size  # states of older versions hold fewer drawn numbers
     if lacks not in (0, *OLDER):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", given.sim_state_size)
     here, there = env_fingerprint(env), dataset.fingerprint
@@ -141,7 +141,7 @@ def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget
 def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> Info:
     """Write a dataset of new scenes made from the states of `source`; each frame or branch is an episode.
 
-    The same seed gives the same scenes; with more frames, the first scenes are the same. Raises
+    The same seed gives the same scenes; a larger number of frames only adds scenes at the end. Raises
     `NothingToLearnError` if no scene has a valid label.
     """
     columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
@@ -178,7 +178,7 @@ def _write[T](
             empty = empty and not found
             target.on_piece()
         if empty:
-            raise NothingToLearnError("no scene has a sound label of the expert: there is nothing to learn from")
+            raise NothingToLearnError("no scene has a valid expert label, so there is nothing to learn from")
 
     about: dict[str, Any] = {"repo_id": local_id(target.root.name), "fingerprint": fingerprint}
     with closing(map_in_order(work, pieces, target.workers)) as made:
@@ -202,7 +202,7 @@ def label_episode(env: EnvConfig, episode: Episode) -> Columns:
 def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Columns:
     """Render states, rows of `sim_state` (T, m), to columns: pictures (T, height, width, 3), keypoints (T, 3 K).
 
-    An environment with these cameras gives the same bytes. Raises `RenderError` without OpenGL.
+    The values are bit-equal to what an environment with these cameras observes. Raises `RenderError` without OpenGL.
     """
     if env.robot in STOCK and not STOCK[env.robot].cameras:
         raise RenderError(f"{env.robot} has no cameras")

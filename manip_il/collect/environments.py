@@ -115,7 +115,7 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
     if config.robot not in STOCK:
         task = get_task(config.task, config.object)
         settings["task"], _, argument = task.name.partition(":")
-        settings |= {"reward": argument} if argument else {}  # the key in older fingerprints, which only carry had
+        settings |= {"reward": argument} if argument else {}  # as in older fingerprints, where only carry has it
         own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
         mesh = Shape.parse(config.object).mesh if config.object else None
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})

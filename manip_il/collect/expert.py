@@ -85,7 +85,10 @@ class Expert:
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
     def _step(self, q: F64, position: F64, rotation: F64, target: Target) -> tuple[F64, float] | None:
-        """Return a joint step [rad], for an `exact` target corrected by its miss, and the error's remaining share."""
+        """Return a joint step [rad] and the share of the error that it leaves.
+
+        If the target is `exact`, the step is solved again with the pose shifted by the error of the first solution.
+        """
         ik, most = self._ik, self._scene.robot.max_joint_step
         first = ik.step(position, rotation, most, target.lean)
         if first is None or not target.exact:

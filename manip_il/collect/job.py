@@ -119,7 +119,7 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     if wanted is None or job.cameras is None:
         return job.cameras or wanted
     if not set(wanted.names) <= set(job.cameras.names) or wanted.size != job.cameras.size:
-        raise MismatchError("cameras or their size", str(job.policy), wanted, "the recording", job.cameras)
+        raise MismatchError("choice or size of cameras", str(job.policy), wanted, "the recording", job.cameras)
     return job.cameras
 
 

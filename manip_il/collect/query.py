@@ -1,8 +1,9 @@
 """When the expert is queried, and what it returns.
 
-A rule is written `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`. `rollout` applies it in every
-step to the learner's actions; the expert is queried for labels nowhere else. Differences between actions are measured
-as multiples of each dimension's longest step, and the largest counts, so that a bound means the same for every robot.
+A rule is written `kind` or `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`. `rollout` applies it
+in every step to the learner's actions; the expert is queried for labels nowhere else. Differences between actions are
+divided by each dimension's longest step, and the largest quotient is compared with the bound, so that a bound means the
+same for every robot.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Query:
         return self.kind if self.bound is None else f"{self.kind}:{self.bound:g}"
 
     def start(self, setting: Setting) -> Gate:
-        """Return the rule as a function, for the episodes of one process. Raises `UsageError` if it lacks policies."""
+        """Return the rule as a function for one process. Raises `UsageError` if `setting` has too few policies."""
         rule, _ = RULES[self.kind]
         return rule(self.bound or 0.0, setting)
 
@@ -76,7 +77,7 @@ def _one(bound: float, setting: Setting) -> Gate:
 
 
 def _probability(bound: float, setting: Setting) -> Gate:
-    """Query at each step with the bound as probability."""
+    """Query at each step with a probability equal to the bound."""
     rngs = generators(_STREAM)
     return lambda turns, actions: [rngs(turn.seed).uniform() < bound for turn in turns]
 
@@ -165,5 +166,5 @@ def branch(env: Environment, expert: Labeller, first: State, seed: int, steps: i
 
 
 def drawn_step(seed: int, steps: int) -> int:
-    """Return a random step below `steps`, the same for the same episode."""
+    """Return a random step below `steps`, which depends only on `steps` and the episode's seed."""
     return int(rng_for(seed, _STREAM).integers(steps))

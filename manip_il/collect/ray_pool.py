@@ -116,7 +116,7 @@ def run_there(
     mesh: Files | None,
     *policies: Files,
 ) -> bytes:
-    """Run seeds on a node; return episodes and journal contents, packed. Raises `ManipError` for another version."""
+    """Run seeds on a node; return episodes and journal contents, packed. Raises `ManipError` unless versions agree."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")

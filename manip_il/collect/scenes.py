@@ -1,4 +1,4 @@
-"""New scenes of visited states: randomise goals, untouched objects and looks, then label and render.
+"""New scenes from visited states: randomise goals, untouched objects and looks, then label and render.
 
 The expert is a function of the state, so it can label scenes that were never visited.
 """
@@ -33,12 +33,12 @@ GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares: new goals, moved objects, moved 
 _UNTOUCHED = 0.04  # least distance of an untouched object's centre from the hand [m]
 _AROUND = 0.04  # standard deviation of an object's place near the hand, in x and y [m]
 _DEEP = 1e-3  # largest overlap of a moved object with another [m]
-_TRIES = 5  # scenes drawn for a state, before it is kept as visited
+_TRIES = 5  # scenes drawn for a state before the visited scene itself is used
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """How scenes are drawn from a dataset's states, and their cameras, None for scenes without pictures.
+    """How scenes are drawn from a dataset's states. cameras: None for scenes without pictures.
 
     anew: whether to also draw goals and objects, not only looks. conditions: what the looks are drawn from.
     branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
@@ -59,10 +59,10 @@ class Scenes:
         return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
     def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
-        """Yield the first number, the visited states and their leads of each `CHUNK` of scenes.
+        """Yield, for every `CHUNK` scenes, the number of the first scene, the visited states and their leads.
 
-        states: rows of `sim_state` (S, m), used in turn, in an order drawn from the seed. leads: added to the label of
-        each state, (S, n).
+        states: rows of `sim_state` (S, m), used in turn, in an order drawn from the seed. leads: what is added to the
+        label of each state, (S, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
         for at in range(0, self.frames, CHUNK):
@@ -79,10 +79,10 @@ class SceneDrawer:
         self._scenes = scenes
 
     def frames(self, visited: State, number: int, seed: int, lead: F64 | float = 0.0) -> list[Transition]:
-        """Return the scene of one visited state: one labelled frame, or those of a branch; [] without a valid label.
+        """Return the frames of a new scene: one labelled frame, or the frames of a branch; [] without a valid label.
 
-        number: scene number in the random stream. seed: value of the `seed` column. lead: added to a lone frame's
-        label, (n,).
+        visited: the state that the scene is drawn from. number: scene number in the random stream. seed: value of the
+        `seed` column. lead: added to the label of a single frame, (n,).
         """
         rng = rng_for(number, "redraw")
         visited = self._with_look(replace(visited, streak=0, ever=False), number)

@@ -21,7 +21,7 @@ _WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # never 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Generator[None]:
-    """Raise `ManipError` if the disk is full or read-only, naming the error's file, or `path` if it names none."""
+    """Raise `ManipError` if the disk is full or read-only. It names the file that failed, or `path` if unknown."""
     try:
         yield
     except OSError as error:  # errors of Arrow and FFmpeg are OSErrors, too

@@ -66,12 +66,12 @@ class Recording:
             return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
 
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
-        """Write rollouts in seed order as a dataset; return its info and the number of failed episodes left out.
+        """Write rollouts as a dataset; return its info and the number of failed episodes left out.
 
-        Every rollout is consumed, even after a limit is reached. Spec and fingerprint are the first rollout's; if
-        another fingerprint differs, a warning is logged. The selection depends on the rollouts alone, so that recording
-        directly and building later give the same bytes. Raises what `write_dataset` raises, `MismatchError` for a
-        rollout of another robot, task or cameras, `NothingToLearnError` if there is no episode.
+        rollouts: in seed order; all are consumed, even after a limit is reached. Spec and fingerprint are the first
+        rollout's; if another fingerprint differs, a warning is logged. The selection depends on the rollouts alone, so
+        that recording directly and building later give the same bytes. Raises what `write_dataset` raises,
+        `MismatchError` for a rollout of another robot, task or cameras, `NothingToLearnError` if there is no episode.
         """
         rollouts = iter(rollouts)
         if (first := next(rollouts, None)) is None:

@@ -73,8 +73,8 @@ class Camera:
     def of(cls, root: Path, info: Info, episodes: EpisodeTable, data_files: Sequence[Path], key: str) -> Camera:
         """Find a camera's pictures without decoding them.
 
-        Raises `UnknownName` for a column that is not a camera, `ManipError` for depth maps, and if the dataset's files
-        do not hold each frame once.
+        Raises `UnknownName` for a column that is not a camera, and `ManipError` for depth maps or if the dataset's
+        files do not hold each frame exactly once.
         """
         cameras = {feature.key: feature for feature in info.of_dtype(*PICTURES)}
         if key not in cameras:

@@ -38,7 +38,7 @@ UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
 
 @dataclass(frozen=True)
 class Own:
-    """Content of `meta/manip_il.json`: names and sizes, the environment's fingerprint, the episodes' origin."""
+    """Content of `meta/manip_il.json`: the spec, the environment's fingerprint, and the origin of the episodes."""
 
     spec: s.RobotTaskSpec
     fingerprint: Mapping[str, Any]
@@ -80,7 +80,7 @@ class Dataset:
 
     @cached_property
     def own(self) -> Own | None:
-        """Content of our own file; None in a dataset of another program."""
+        """Content of `meta/manip_il.json`; None in a dataset of another program."""
         path = self.root / layout.OURS
         if not path.exists():
             return None
@@ -245,7 +245,7 @@ class Dataset:
             row += len(index)
 
     def count_successes(self) -> int:
-        """Return how many episodes succeeded at some step; 0 without a column of successes."""
+        """Return how many episodes succeeded at some step; 0 if there is no success column."""
         if s.SUCCESS not in self.features:
             return 0
         columns = self.columns([layout.EPISODE_INDEX, s.SUCCESS])
@@ -254,7 +254,7 @@ class Dataset:
 
 
 def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read columns, (T,) or (T, d), of several datasets in sequence; frame and episode numbers continue.
+    """Read columns, (T,) or (T, d), of several datasets in sequence, numbering frames and episodes throughout.
 
     Raises what `Dataset.columns` raises.
     """

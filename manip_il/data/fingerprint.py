@@ -22,7 +22,7 @@ _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> dict[str, str]:
     """Return versions of packages, the processor, and SHA-256 hashes of the compiled model and the config.
 
-    Equal fingerprints mean equal bytes. No package is imported for it; a missing one is `absent`.
+    Environments with equal fingerprints compute equal bytes. The versions are read without importing the packages.
     """
     versions = {name: metadata.version(name) for name in _PACKAGES}
     return {

@@ -32,7 +32,7 @@ from manip_il.mdp import Episode
 
 U8 = NDArray[np.uint8]
 Times = Sequence[int]  # [ns], one per frame
-Messages = Iterator[Message | str]  # one per frame, of one class; JSON texts are scalars
+Messages = Iterator[Message | str]  # one per frame, all of one class; scalars are JSON texts
 
 NANOSECONDS = 1_000_000_000
 IMAGE_TOPICS = "/observation/images/"  # precedes a camera's name, as in LeRobot
@@ -82,7 +82,7 @@ def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
 
 
 def texts(name: str, lines: Iterable[str], times: Times) -> Messages:
-    """Yield log messages from `name`."""
+    """Yield one log message per line, with `name` as its source."""
     for time, line in zip(times, lines, strict=True):
         yield Log(timestamp=_stamp(time), level=Log.Level.INFO, name=name, message=line)
 
@@ -128,7 +128,7 @@ def _register_scalars(writer: Writer) -> int:
 def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8]:
     """Return the pictures that `images` wrote, by camera; a camera without pictures is left out.
 
-    chunks: those of one file, in order. shape: shape of each camera's pictures, (T, height, width, 3).
+    chunks: all chunks of one file, in order. shape: shape of each camera's pictures, (T, height, width, 3).
     """
     pictures: dict[str, U8] = {}
     cameras: dict[int, str] = {}  # by the id of their channel

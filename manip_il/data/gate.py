@@ -1,7 +1,7 @@
 """The gate for untrusted datasets: every file is opened once in a child process with limited memory and time.
 
-Other readers decode a column as the parquet file's metadata says (audio, PDF, any format that Pillow knows), and open
-the `path`, even a URL, of a picture's cell that has no bytes. Files that would make a reader do this are refused.
+Other readers decode a column as the parquet file's metadata says (audio, PDF, any format that Pillow knows). If a cell
+for a picture has no bytes, they open its `path`, even a URL. Files that would make a reader do either are refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _BATCH = 64  # rows in memory at once
 def check_arrived(root: Path, *, strict: bool = True) -> None:
     """Open every file of a dataset in a child process. Raises `ManipError` naming a file that is refused.
 
-    strict: refuse damaged files, too; otherwise only files that need too much memory or time or crash the process.
+    strict: refuse damaged files, too; otherwise only files that are not regular, crash the process, or need too much
+    memory or time.
     """
     checks.in_child(str(root), open_files, root, strict)
 
@@ -81,7 +82,7 @@ def _is_picture(column: pa.Field, pictures: Collection[str]) -> bool:
 
 
 def _check_types(schema: pa.Schema, pictures: int) -> None:
-    """Raise `ValueError` if readers would decode more than `pictures` columns, or one that is not of images."""
+    """Raise `ValueError` if readers would decode more than `pictures` columns, or any column as other than images."""
     about = (schema.metadata or {}).get(b"huggingface", b"").decode(errors="replace")
     decoded = [name for name in re.findall(r'"_type"\s*:\s*"(.*?)"', about) if name not in _PLAIN]
     if decoded != ["Image"] * len(decoded) or len(decoded) > pictures:
@@ -93,9 +94,9 @@ def _check_cells(key: str, cells: pa.Array, prefixes: tuple[bytes, ...], first: 
     kind = cells.type
     place = kind.get_field_index("bytes") if pa.types.is_struct(kind) else -1
     if place < 0 or not (pa.types.is_binary(kind[place].type) or pa.types.is_large_binary(kind[place].type)):
-        raise ValueError(f"column {key!r} of pictures holds {checks.shorten(str(kind))}; expected their bytes")
+        raise ValueError(f"column {key!r} should hold pictures as bytes; it holds {checks.shorten(str(kind))}")
     content: Any = pc.struct_field(cells, "bytes")  # pyright: ignore[reportAttributeAccessIssue]
     begins: list[bytes | None] = pc.binary_slice(content, 0, 8).to_pylist()  # pyright: ignore[reportAttributeAccessIssue]
     for row, found in enumerate(begins, first):
         if not (found or b"").startswith(prefixes):
-            raise ValueError(f"column {key!r} has no PNG or JPEG in row {row:,}; expected its bytes")
+            raise ValueError(f"column {key!r} has no PNG or JPEG in row {row:,}; expected the bytes of one")

@@ -43,7 +43,7 @@ class Feature:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for each value: from the file (a list, or lists by group), else `<column>.<place>`."""
+        """A name for each value: from the file (a list, or lists by group), else `<column>.<index>`."""
         names: Any = self.names
         groups = cast(dict[str, Any], names).values() if isinstance(names, dict) else [names]
         found = [str(name) for group in groups if isinstance(group, list) for name in cast(list[Any], group)]

@@ -28,7 +28,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def append_line(path: Path, record: Record) -> None:
-    """Append a record, replacing a truncated last line; non-finite numbers become null."""
+    """Append a record, replacing a truncated last line; non-finite numbers at its top level become null."""
     line = json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     with writing(path), open(path, "ab+", opener=checks.without_link) as file:

@@ -43,7 +43,7 @@ STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 def data_schema(features: Features) -> pa.Schema:
     """Return the Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
 
-    Its metadata holds the Hugging Face features that `datasets` reads.
+    Its metadata describes the columns in the form that Hugging Face's package `datasets` reads.
     """
     fields: list[pa.Field] = []
     hugging_face: dict[str, Any] = {}
@@ -70,7 +70,7 @@ def data_schema(features: Features) -> pa.Schema:
 
 
 def tasks_table(instructions: Sequence[str]) -> pa.Table:
-    """Return the table of tasks, written like pandas with `task` as index, by which LeRobot looks them up."""
+    """Return the table of tasks, with `task` as pandas' index, because LeRobot looks tasks up by this index."""
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
         for name, kind, numpy_type in ((TASK_INDEX, "int64", "int64"), ("task", "unicode", "object"))

@@ -192,7 +192,7 @@ class TableWriter:
         }
 
     def _write_rows(self) -> None:
-        """Write the waiting rows of meta/episodes."""
+        """Write the rows of meta/episodes that are still in memory."""
         if self._rows:
             table = pa.Table.from_pylist(self._rows, self._row_schema)
             self._meta.write(table)

@@ -1,7 +1,7 @@
 """Parquet files of datasets: write numbered files by row groups, read columns, tasks and the table of episodes.
 
 The random draws of an episode are a column of ours in `meta/episodes`, one JSON object per episode. LeRobot's merge
-keeps the column, its split and delete drop it; `sim_state` has the draws in any case.
+keeps the column, its split and delete drop it; the draws are also part of `sim_state`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class ParquetFiles:
     """Numbered parquet files, one open at a time; when it is full, the next one is started.
 
     group_rows: least number of rows in a row group, except a file's last. A writer keeps a description of every row
-    group in memory until the file is closed, so many small ones would need more memory than the rows.
+    group in memory until the file is closed, so many small groups would need more memory than the rows themselves.
     """
 
     def __init__(self, folder: Path, template: str, group_rows: int = 1):
@@ -117,7 +117,7 @@ def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Return a dataset's tasks by index; their texts are the pandas index, with or without a name."""
+    """Return a dataset's tasks by index. Their texts are in pandas' index column, which may have no name."""
     path = root / layout.TASKS
     with reading(path):
         table = read_file(path, pq.read_schema(path).names)

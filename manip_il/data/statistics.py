@@ -25,7 +25,10 @@ _LEVELS = np.arange(256)  # pixel values
 
 
 def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
-    """Return {column: {min, max, mean, std, count, q01, ...}}, (d,) each, of numbers or booleans, (T,) or (T, d)."""
+    """Return {column: {min, max, mean, std, count, q01, ...}} of numeric or boolean columns, (T,) or (T, d).
+
+    Every statistic is (d,), except that `count` is (1,).
+    """
     statistics: Statistics = {}
     for key, values in columns.items():
         rows = np.array(values.reshape(len(values), -1).T, np.float64, order="C")

@@ -123,8 +123,8 @@ class CameraFiles:
 def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Packet]:
     """Encode a frame, or None to flush; the first one opens the encoder.
 
-    If run by root, SVT-AV1 permanently makes the opening thread and its own threads real-time (SCHED_FIFO). These and
-    their child processes would starve all others.
+    If run by root, SVT-AV1 permanently gives real-time priority (SCHED_FIFO) to the calling thread and to its worker
+    threads, which with their child processes would starve all other processes. This undoes it.
     """
     opens = not encoder.is_open
     packets = encoder.encode(frame)

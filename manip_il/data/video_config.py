@@ -16,14 +16,15 @@ CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvt
 class VideoConfig:
     """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`, with its defaults for `libsvtav1`.
 
-    Raises `UnknownName` for the codec, `UsageError` for g; `try_encoder` checks the rest with the codec itself.
+    Raises `UnknownName` for an unknown codec, `UsageError` for an invalid g; the other settings are checked by
+    `try_encoder`, with the codec itself.
     """
 
     vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
     pix_fmt: str = option("yuv420p", "pixel format")
     g: int | None = option(2, "frames between key frames")  # most frames that are decoded to read one
-    crf: float | None = option(None, "quality; lower is better, with larger files; by default 23, for libsvtav1 30")
-    preset: int | str | None = option(None, "the codec's speed preset; by default ultrafast, for libsvtav1 12")
+    crf: float | None = option(None, "quality: lower is better, files larger; by default 23 (h264) or 30 (libsvtav1)")
+    preset: int | str | None = option(None, "the codec's speed preset; by default ultrafast (h264) or 12 (libsvtav1)")
 
     def __post_init__(self) -> None:
         if self.vcodec not in CODECS:

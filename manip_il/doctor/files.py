@@ -58,7 +58,7 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
-    """Check that episodes are contiguous and numbered from 0, and that rows match them and have times at the rate."""
+    """Check that episodes are contiguous and numbered from 0, and that rows have matching indices and timestamps."""
     table, tasks, info = dataset.episodes, dataset.tasks, dataset.info
     ends = np.cumsum(table.length)
     frame = np.concatenate([np.arange(length) for length in table.length])
@@ -150,7 +150,7 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_own(dataset: Dataset) -> Iterator[Finding]:
-    """Check our own columns and file: names, shapes, labels, drivers, seeds."""
+    """Check our own columns and `meta/manip_il.json`: names, shapes, labels, drivers, seeds."""
     own, features = dataset.own, dataset.features
     if own is None:
         if {s.SIM_STATE, s.EXECUTED_ACTION} <= features.keys():

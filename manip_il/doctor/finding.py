@@ -15,7 +15,7 @@ from manip_il.errors import ManipError
 class Finding:
     """One line of a report. Errors are wrong data, or data on which LeRobot cannot train; others are warnings.
 
-    place: a file in the dataset or next to it, or a column. remedy: what to do; by default `mend`.
+    place: a file in the dataset or next to it, or a column. remedy: what to do; if empty, what `mend` returns.
     """
 
     place: str
@@ -42,7 +42,7 @@ def journals_of(root: Path) -> Path:
 
 
 def mend(root: Path, finding: Finding) -> str:
-    """Return the remedy: to repair from journals or the dataset's own data, or else to get a new copy."""
+    """Return what to do about a finding: repair the dataset if that is possible, else pull or record it again."""
     if journals_of(root).is_dir() or not finding.is_error or finding.place.startswith((INFO, STATS)):
         return f"repair it: manip-il data repair {root}"
     return "there are no journals to repair it from: pull or record it again"
@@ -56,7 +56,7 @@ def of_episodes(root: Path, place: str, text: str, episodes: Collection[int]) ->
 
 
 def edit(root: Path, operation: str) -> str:
-    """Return the command of an operation of LeRobot's dataset editor."""
+    """Return the command that runs an operation of LeRobot's dataset editor."""
     return f"lerobot-edit-dataset --repo_id=local/{root.absolute().name} --root={root} --operation.type={operation}"
 
 

@@ -27,7 +27,7 @@ _IDLE, _CLIPPED = 0.1, 0.05  # tolerated shares of the frames
 _LEAD = 0.4  # tolerated lead of actions over the joints that follow them [s]
 _LEAST = 10  # least number of episodes for comparisons between them
 _EPISODES, _PICTURES, _SIDE = 100, 6, 16  # checked episodes, pictures of each, thumbnail size [pixels]
-_SAME, _DARK = 1.5, 10.0  # pixel values of 255: largest change in an unchanged thumbnail, mean of a black picture
+_SAME, _DARK = 1.5, 10.0  # pixel values, 0 to 255: largest change in an unchanged thumbnail, mean of a black picture
 _AGAIN = "correct the recorder, and record again"
 
 
@@ -108,7 +108,7 @@ def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: ND
 
 
 def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
-    """Return which numbers (E,) are outliers, separated by a gap of `least` and `times` the range of the others."""
+    """Return which numbers (E,) are outliers, by a gap wider than `least` and than `times` the range on either side."""
     ranked = np.sort(values)
     cut = int(np.argmax(np.diff(ranked)))
     gap, extent = ranked[cut + 1] - ranked[cut], max(ranked[cut] - ranked[0], ranked[-1] - ranked[cut + 1])
@@ -119,8 +119,8 @@ def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
 def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_], arm: Mask) -> Iterator[Finding]:
     """Find commands that are never reached, mostly of the gripper, and arm commands that are clipped at a limit.
 
-    A joint that moves by a small share of its command but correlates with it has other units: no finding. Nor is an
-    episode that starts or ends at a limit clipped.
+    A joint that moves by a small share of its command but correlates with it has other units: no finding. An episode
+    that starts or ends at a limit does not count as clipped.
     """
     for name, told, found, is_arm in zip(names, action.T, state.T, arm, strict=True):
         (low, high), (below, above) = np.quantile(told, [0.01, 0.99]), np.quantile(found, [0.01, 0.99])

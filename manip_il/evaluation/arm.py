@@ -99,7 +99,7 @@ class Arm:
 
 
 def select_rounds(rule: Rule, arms: Sequence[Arm]) -> tuple[Rule, tuple[Arm, ...]]:
-    """Return the rule with the cost limit of all runs, and the arms with the rounds that it chooses."""
+    """Return the rule with the cost limit that all runs share, and the arms with the rounds that it chooses."""
     rule = rule.limited({member.name: member.history for arm in arms for member in arm.members})
     return rule, tuple(replace(arm, members=tuple(one.select(rule) for one in arm.members)) for arm in arms)
 
@@ -115,7 +115,7 @@ def read_arm(path: Path) -> Arm:
 
 
 def require_pair(left: Arm, right: Arm) -> None:
-    """Raise `UsageError` unless two arms can be compared: both or neither already evaluated, the same training seeds.
+    """Raise `UsageError` unless two arms can be compared: both or neither evaluated, equal training seeds.
 
     Two single policies can be compared whatever their seeds.
     """
@@ -129,7 +129,10 @@ def require_pair(left: Arm, right: Arm) -> None:
 
 
 def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
-    """Return the environment that all share. envs: by arm or run. Raises `MismatchError` for the first difference."""
+    """Return the environment that all arms or runs share. Raises `MismatchError` for the first difference.
+
+    envs: name of an arm or run -> its environment.
+    """
     (first, env), *others = envs.items()
     for name, other in others:
         require_equal(first, env, name, other, *(field.name for field in fields(env)))

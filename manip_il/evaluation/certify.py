@@ -41,8 +41,8 @@ Group = Literal["start", "state", "action"]
 class Case(NamedTuple):
     """One episode. moment: the control step from which the expert is judged.
 
-    steps: control steps from there until solved; None if not solved within the horizon. undisturbed: the same without
-    the perturbation, if known.
+    steps: control steps from there until solved; None if not solved within the horizon. undisturbed: steps from
+    there until solved without the perturbation, if known.
     """
 
     seed: int
@@ -55,7 +55,8 @@ class Case(NamedTuple):
 class Row:
     """The cases of one kind. kind, words: short and full name; horizon: [control steps].
 
-    left_out: number of episodes without a case, because the perturbation could not be placed or changed nothing.
+    left_out: number of episodes without a case, because the undisturbed run failed, or the perturbation could not be
+    placed or changed nothing.
     """
 
     group: Group
@@ -88,7 +89,7 @@ class Row:
 class Certificate:
     """Recoverability of the expert on one robot and task, one row per kind of perturbation.
 
-    settings: cases per kind, and seed, horizon [control steps], rate, tolerance [m] and success_steps of the runs.
+    settings: cases (per kind), seed, horizon [control steps], control_hz, tolerance [m] and success_steps.
     """
 
     robot: str
@@ -103,7 +104,7 @@ class Certificate:
 
     @property
     def mu(self) -> int | None:
-        """The largest gap of all wrong actions [control steps]: the empirical u of Ross et al. (2011)."""
+        """The largest gap over all wrong actions [control steps]: the empirical u of Ross et al. (2011)."""
         return max((gap for row in self.of("action") for gap in row.gaps), default=None)
 
     def to_json(self) -> dict[str, Any]:

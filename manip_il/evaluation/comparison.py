@@ -88,7 +88,7 @@ class Comparison:
 
     @cached_property
     def p_value(self) -> float:
-        """Exact two-sided p over test episodes, each summed over training seeds; McNemar's for a single seed.
+        """Exact two-sided p of `sign_flip_exact` over test episodes; for one training seed, of McNemar's test.
 
         It holds for these trained policies; `interval` also covers other training seeds.
         """
@@ -195,7 +195,7 @@ class Study:
     def results_table(self) -> Table:
         """Return one row per arm: mean costs, validation, test success, difference.
 
-        In brackets are the values of each training seed, or, for a single seed, the interval.
+        Brackets hold the values of each training seed or, for a single seed, the interval.
         """
         rows: list[tuple[str, ...]] = []
         for arm in self.arms:

@@ -57,7 +57,7 @@ def run_report(
     curves: Sequence[Curve] = (),
     **parts: Any,
 ) -> Report:
-    """Return the report of a run's policies, one per row. parts: title, verdict and the like, see `Report`."""
+    """Return the report of a run's policies, one per row. parts: other fields of `Report`, such as the title."""
     note = f"Each policy ran {rows[0].result.success.n:,} episodes. Intervals are Wilson's score intervals."
     note += next((disturbed_note(row.disturbed) for row in rows if row.disturbed), "")
     bars = [Bar(row.name, (row.result.success,), row.colour) for row in rows]
@@ -147,7 +147,7 @@ def phase_table(policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: s
 
 
 def evaluation_verdict(result: EvalResult) -> str:
-    """Return the first sentence: success with its interval, and the phase in which most failures end."""
+    """Return the report's first sentence: success with its interval, and the phase in which most failures end."""
     success = result.success
     verdict = f"{result.policy} succeeds in {success} of {success.n:,} unseen episodes of {result.robot} {result.task}"
     phase, count = next(iter(result.failures.items()), ("", 0))
@@ -162,7 +162,8 @@ def _conditions(result: EvalResult) -> Section:
     successes = [result.success, *(part.success for part in result.by_condition.values())]
     bars = [
         Bar(row[0], (success,), colour)
-        for row, success, colour in zip(table.rows, successes, table.colours, strict=False)  # one condition: one row
+        # with a single condition, the table has one row
+        for row, success, colour in zip(table.rows, successes, table.colours, strict=False)
     ]
     hold = settings.hold
     ends = {None: "", 0: ", which ends the episode"}.get(hold, f"; an episode ends {hold} steps after it")

@@ -29,7 +29,7 @@ _COST_WORDS = {"labels": "expert labels", "steps": "simulated steps", "seconds":
 _DPI = 96
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same whatever fonts a machine has
-    "svg.hashsalt": "manip_il",  # makes equal figures equal bytes
+    "svg.hashsalt": "manip_il",  # so that equal figures have equal bytes
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib
     "font.size": 8.5,
@@ -86,7 +86,7 @@ def to_figure(drawn: Any, words: str) -> Figure:
 
 
 def plain(text: str) -> str:
-    """Return text without matplotlib's maths markup or characters that its font lacks."""
+    """Return text with matplotlib's maths markup escaped and unprintable characters replaced by `?`."""
     return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
 
 
@@ -128,7 +128,7 @@ def rates_figure(bars: Sequence[Bar]) -> Figure:
 
 @dataclass(frozen=True)
 class Curve:
-    """Validation success by round of one arm, one run per training seed. costs: those known for its rounds."""
+    """Validation success by round of one arm, one run per training seed. costs: which of its costs are known."""
 
     name: str
     runs: tuple[History, ...]

@@ -73,8 +73,8 @@ def confidence_sequence(successes: int, n: int) -> tuple[float, float]:
 
     A rate p is excluded once the likelihood of the outcomes, averaged over rates drawn from Beta(1/2, 1/2), is
     1 / (1 - confidence) times that of p: under the true rate this ratio is a martingale of mean 1, so with probability
-    `CONFIDENCE` it never exceeds that (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). Wider than Wilson's
-    interval, which is valid for an `n` fixed in advance.
+    `CONFIDENCE` it never exceeds that factor (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). The interval
+    is wider than Wilson's, which is valid for an `n` fixed in advance.
     """
     failures = n - successes
     mixture = special.betaln(successes + 0.5, failures + 0.5) - special.betaln(0.5, 0.5) + math.log1p(-CONFIDENCE)
@@ -130,8 +130,8 @@ class PairCounts:
     def interval(self) -> tuple[float, float]:
         """(low, high) of `difference`, inside [-1, 1].
 
-        Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: Wilson's limits of both rates, squared and
-        added, minus their correlation with a continuity correction.
+        Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: combines the distances of Wilson's limits
+        from both rates, allowing for the correlation of the outcomes, which has a continuity correction.
         """
         n, right, left = self.n, self.both + self.only_right, self.both + self.only_left
         (l1, u1), (l2, u2) = wilson_interval(right, n), wilson_interval(left, n)
@@ -152,9 +152,9 @@ class PairCounts:
 def sign_flip_exact(differences: Sequence[int]) -> float:
     """Return the two-sided p of the hypothesis that each difference, one per test episode, could have had either sign.
 
-    differences: right's successes minus left's in an episode, summed over training seeds. The seeds' signs are flipped
-    together, so training seeds that share an episode need not be independent in it. With one training seed this is
-    McNemar's exact test; in general it is Fisher's randomisation test (The Design of Experiments, 1935, section 21).
+    differences: right's successes minus left's in an episode, summed over training seeds. As it is the sum whose sign
+    is flipped, outcomes of different training seeds in one episode need not be independent. With one training seed this
+    is McNemar's exact test; in general it is Fisher's randomisation test (The Design of Experiments, 1935, section 21).
     """
     ways = np.array([1], dtype=object)  # counts of the sums -total, -total + 2, ..., total of signed differences
     for size, count in Counter(abs(d) for d in differences if d).items():

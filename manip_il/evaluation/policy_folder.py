@@ -28,7 +28,7 @@ def find_policy(path: Path) -> Path:
 
 
 def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull a path that looks like a repo on the Hub; empty for other paths. kind: `datasets/`."""
+    """Return a hint on pulling a path that looks like a Hub repository, else "". kind: `datasets/` for a dataset."""
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""
     return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"

@@ -50,7 +50,7 @@ class EpisodeResult:
 
     @property
     def start(self) -> list[float] | None:
-        """Where the object, or the hand if the task has none, starts: x, y, z [m]; None if unknown."""
+        """Start position of the object, or of the hand if the task has none: x, y, z [m]; None if unknown."""
         found = self.detail.get("start", {})
         return found.get("object", found.get("hand"))
 
@@ -62,7 +62,10 @@ class EpisodeResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
-        """Return the inverse of `to_json`. Raises `KeyError` or `TypeError` for a value that is missing or invalid."""
+        """Return the inverse of `to_json`.
+
+        Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
+        """
         known = {"success_at_end": data["success"], "phase_at_end": ""} | {
             key: data[key] for key in data if key in _KEYS
         }
@@ -123,7 +126,7 @@ class EvalResult:
     """One policy on one robot and task: every episode, and the statistics derived from them.
 
     policy_sha256: hash of its files, empty if it has none. until_width: the interval width at which the evaluation was
-    to stop, None if the number of episodes was fixed in advance; intervals then hold whenever it stops.
+    to stop, so that intervals hold whenever it stops; None if the number of episodes was fixed in advance.
 
     Raises `ManipError` on construction if there is no episode or a seed occurs twice.
     """
@@ -159,7 +162,7 @@ class EvalResult:
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
-        """The episodes of each condition, in the settings' order; those without a condition under an empty name."""
+        """Condition name -> its episodes, in the order of `settings`; "" for episodes without a condition."""
         parts: dict[str, list[EpisodeResult]] = {condition.name: [] for condition in self.settings.conditions}
         for episode in self.episodes:
             parts.setdefault(episode.condition, []).append(episode)
@@ -167,7 +170,7 @@ class EvalResult:
 
     @property
     def steps_to_success(self) -> float | None:
-        """Mean control steps until the first success, over successful episodes; None if none records it."""
+        """Mean control steps until the first success, over successful episodes; None if no episode records it."""
         steps = [episode.detail.get("steps_to_success") for episode in self.episodes if episode.success]
         known = [float(count) for count in steps if count is not None]
         return sum(known) / len(known) if known else None
@@ -208,7 +211,7 @@ class EvalResult:
         return cls(
             policy=data["policy"],
             robot=str(data["robot"]),
-            # Paths are refused because they would run code. The reward was once a separate setting.
+            # A path is refused, because its file would be run. Older files have the reward as a separate setting.
             task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
@@ -247,7 +250,7 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
         known = one.policy_sha256 or other.policy_sha256  # otherwise only the names show whether the policy is the same
         require_comparable(first, one, name, other, "policy_sha256" if known else "policy")
     if stopped := next((name for name, part in parts.items() if part.until_width is not None), None):
-        raise ManipError(f"{stopped} stopped by --until_width; only parts with a fixed number of episodes are merged")
+        raise ManipError(f"{stopped} was stopped by --until_width; merge only parts with a fixed number of episodes")
     episodes = [episode for part in parts.values() for episode in part.episodes]
     return replace(one, episodes=tuple(sorted(episodes, key=lambda episode: episode.seed)))
 
@@ -261,6 +264,6 @@ def require_equal(left: str, one: object, right: str, other: object, *names: str
 
 
 def require_comparable(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
-    """Raise `MismatchError` if two evaluations differ in one of `more`, robot, task, or a setting."""
+    """Raise `MismatchError` if two evaluations differ in robot, task, a setting, or an attribute named in `more`."""
     require_equal(left, one, right, other, *more, "robot", "task")
     require_equal(left, one.settings, right, other.settings, *(field.name for field in fields(EvalSettings)))

@@ -45,8 +45,8 @@ _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 class TaskCheck:
     """Result of one task with a robot.
 
-    starts: number drawn before one failed; refused: why there is no scene, or why the next start failed. clean, noisy:
-    evaluations of the expert, as it is and with a tenth of its actions random; None if not run.
+    starts: number of starts drawn before one failed. refused: why that one failed, or why there is no scene. clean,
+    noisy: evaluations of the expert, as it is and with a tenth of its actions random; None if not run.
     """
 
     name: str
@@ -71,8 +71,8 @@ class TaskCheck:
 class RobotCheck:
     """Measurements of a robot. name: as given by the user.
 
-    opening: largest opening of the gripper [m]. table: share of the points of the workspace on the table that the hand
-    reaches while pointing down.
+    opening: largest opening of the gripper [m]. table: share of the workspace, on the table, that the hand, pointing
+    down, reaches.
     """
 
     name: str
@@ -100,7 +100,7 @@ class RobotCheck:
 def check_robot(
     name: str, tasks: Sequence[str], episodes: int, engine: Engine, on_result: Callable[[EpisodeResult], object]
 ) -> RobotCheck:
-    """Measure a robot, given by name or YAML, on tasks. episodes: number per task, with and without random actions.
+    """Measure a robot, given by name or YAML, on tasks. episodes: number per task, run without and with random actions.
 
     on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
     """
@@ -119,7 +119,7 @@ def check_robot(
 
 
 def check_starts(name: str, task: str) -> TaskCheck:
-    """Draw a task's starts with a robot, as for episodes, until one has no valid placement."""
+    """Draw a task's starts with a robot, as episodes do, up to `STARTS` or until one has no valid placement."""
     the_task, starts = get_task(task), 0
     try:
         world = World(scene_of(name, task))
@@ -133,7 +133,7 @@ def check_starts(name: str, task: str) -> TaskCheck:
 
 
 def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
-    """Return whether the hand, pointing down, reaches each point of an n x n grid on the table, in rows along x."""
+    """Return whether the hand, pointing down, reaches each point of an n x n grid on the table, row by row along x."""
     reach, (x, y), steps = reach_of(robot), robot.workspace.centre, np.linspace(-half, half, n).tolist()
     return [[reach.has((x + dx, y + dy, LOW)) for dx in steps] for dy in steps]
 

@@ -19,7 +19,7 @@ METRICS_FILE = "metrics.jsonl"
 class Round:
     """One round of DAgger, or one validated iteration of reinforcement learning, and the run's costs up to its end.
 
-    steps: simulated control steps. seconds: for collecting and fitting; validation is not part of the method.
+    steps: simulated control steps. seconds: for collecting and fitting, without validation.
     """
 
     round: int
@@ -31,7 +31,7 @@ class Round:
     unit: Literal["round", "iteration"] = "round"
 
     def amount(self, cost: Cost) -> float:
-        """Return the labels, episodes, steps or seconds that the run had used."""
+        """Return the labels, episodes, steps or seconds that the run had used by the end of this round."""
         return getattr(self, cost)
 
     def to_json(self) -> dict[str, Any]:
@@ -77,8 +77,8 @@ def has_unlabelled_steps(rounds: History) -> bool:
 class Rule:
     """The rule that chooses the round of each run, fixed before any test episode.
 
-    checkpoint: the last round, or the one with the highest validation success (the later one if equal). at: only rounds
-    up to `limit` of this cost count, the largest amount that every run reached; with `end` all count.
+    checkpoint: the last round, or the one with the highest validation success (the later one if equal). at: `end`
+    allows all rounds, a cost only those that used at most `limit` of it, the largest amount that every run reached.
     """
 
     checkpoint: Literal["best", "last"] = "best"
@@ -100,7 +100,9 @@ class Rule:
             rounds = tuple(one for one in rounds if one.amount(self.at) <= self.limit)
             if not rounds:
                 reached, most = format_amount(self.at, first), format_amount(self.at, self.limit)
-                raise UsageError(f"--at={self.at}: the first round of {name} ends at {reached}, another run has {most}")
+                raise UsageError(
+                    f"--at={self.at}: the first round of {name} ends at {reached}, but another run ended at {most}"
+                )
         if self.checkpoint == "last":
             return rounds[-1]
         return max(rounds, key=lambda one: (one.validation.rate, one.round))

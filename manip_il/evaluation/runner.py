@@ -100,7 +100,10 @@ def evaluate(
 
 
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
-    """Return the control steps from success to an episode's end, None for no end; stock environments have their own."""
+    """Return the control steps after success at which an episode ends, None if it continues to the horizon.
+
+    `hold` does not apply to stock environments, which define this themselves.
+    """
     if env.robot not in STOCK:
         return hold
     return 0 if STOCK[env.robot].ends_solved else None
@@ -136,7 +139,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
 def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
     """Return the true positions [m] of the hand and the objects in one row of `sim_state` (m,): name -> [x, y, z].
 
-    The hand is named `hand`, the first object that the episode is about `object`.
+    The hand is named `hand`. The first object that the arm must reach is named `object`.
     """
     state = State.from_vector(sim_state)
     if env.robot in STOCK:
@@ -183,10 +186,10 @@ def measure(
 
 
 def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, EpisodeResult]:
-    """Return seed -> result of the episodes in `folder`; create their file, whose first line holds their common data.
+    """Return seed -> result of the episodes in `folder`. If their file is missing, write its first line.
 
-    Raises `MismatchError` if they are from another policy, environment or version of this program, `ManipError` for a
-    line that is not an episode.
+    The first line identifies policy, environment, versions and settings. Raises `MismatchError` if they differ from
+    those of `job`, `ManipError` for a line that is not an episode.
     """
     path = folder / EPISODES_FILE
     common: dict[str, Any] = {
@@ -231,12 +234,12 @@ class Trial:
 
     @classmethod
     def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path] = (), trust: bool = False) -> Trial:
-        """Return a trial under a suite's conditions, without those on cameras if no policy uses any."""
+        """Return a trial under a suite's conditions, except those on cameras if no policy uses cameras."""
         sees = any(Checkpoint.open(policy).pictures for policy in policies)
         return cls(env, seeds, suite, suite_conditions(suite, env, sees=sees), trust)
 
     def job(self, policy: Path | None) -> RolloutJob:
-        """Return the rollouts of one policy, or of the expert if it is None."""
+        """Return the job that runs a policy, or the expert if it is None."""
         driver = ExpertDriver() if policy is None else PolicyDriver((policy,), trust=self.trust)
         return RolloutJob(self.env, driver, episode_hold(self.env), label="last", conditions=self.conditions)
 

@@ -26,9 +26,9 @@ _YAML = (".yaml", ".yml")
 def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
     """Return the conditions of a suite, in the order in which seeds cycle through them.
 
-    Omits those without effect: on objects if the task has none, on cameras if `sees` is false; limits sizes to those
-    that the task allows. Raises `UnknownName` for an unknown suite, `UsageError` for an invalid file or if nothing is
-    left.
+    Omits conditions without effect: those on objects if the task has none, those on cameras if the policy does not use
+    them (`sees`). Limits the objects' sizes to those that the task allows. Raises `UnknownName` for an unknown suite,
+    `UsageError` for an invalid file or if no condition is left.
     """
     asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
     left = [one for condition in asked if (one := _for_task(condition, env, sees=sees)) is not None]
@@ -39,9 +39,9 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
 
 
 def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
-    """Return one condition merged from the names in `--vary`, which every episode samples; empty without names.
+    """Return the conditions in `--vary` merged into one, from which every episode samples; () if there are no names.
 
-    Raises `UnknownName` for another name, `UsageError` for a file that is no YAML of ranges, or if none has an effect.
+    Raises `UnknownName` for an unknown name, `UsageError` for an invalid file or if nothing has an effect.
     """
     if not names:
         return ()
@@ -69,7 +69,7 @@ def read_condition(name: str) -> Condition:
 
 def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
     """Return the part of a condition that affects an environment, see `Condition.for_world`."""
-    from manip_il.tasks.table import get_task  # imported here because a wrong name is found without the simulator
+    from manip_il.tasks.table import get_task  # imported here: a wrong name is reported before the simulator loads
 
     if env.robot in STOCK:  # stock environments take no ranges
         return None if condition.ranges else condition

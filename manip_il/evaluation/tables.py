@@ -15,7 +15,7 @@ from manip_il.evaluation.intervals import CONFIDENCE
 from manip_il.evaluation.results import EvalResult
 
 INTERVAL = f"[{CONFIDENCE:.0%} interval]".replace("%", " %")  # part of a column's header
-# Okabe and Ito's colours, distinguishable with every kind of colour blindness
+# after Okabe and Ito's palette, distinguishable with every kind of colour blindness
 DAGGER, CLONING, EXPERT, BASELINE = "#0072b2", "#d55e00", "#00835f", "#868e98"
 NO_CONDITION = "without a condition"
 _PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at

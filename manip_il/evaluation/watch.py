@@ -1,4 +1,4 @@
-"""Episodes as they happen: in a window, whose sliders may drive the robot, or in Rerun, live or written to a file."""
+"""Show running episodes in a window, whose sliders may drive the robot, or in Rerun, live or through a file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _JPEG_QUALITY = 90
 class WindowScreen:
     """MuJoCo's viewer for one environment, with its phase and progress; objects can be dragged with the mouse.
 
-    sliders: whether its control sliders drive the robot. Raises `RenderError` if there is no display.
+    sliders: whether the viewer's control sliders drive the robot. Raises `RenderError` if there is no display.
     """
 
     def __init__(self, env: ManipEnv, *, sliders: bool = False):
@@ -50,9 +50,9 @@ class WindowScreen:
 
 
 def slider_actions(window: Window, env: ManipEnv) -> Act:
-    """Return a driver that executes a window's control sliders: joint targets and gripper command (n,).
+    """Return a driver whose action (n,) is read from a window's control sliders: joint targets and gripper command.
 
-    An episode begins with the environment's initial controls.
+    In the first step of an episode, the action is the environment's initial controls.
     """
 
     def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
@@ -73,7 +73,7 @@ def outcome(step: Transition) -> str:
 class RerunLog:
     """Steps of episodes, written to a file, or sent in real time to viewers that open `address`.
 
-    address: URL of the viewer, for a browser; empty if a file is written. ports: those of the viewer and the stream.
+    address: URL of the viewer, for a browser; empty if a file is written. ports: of the viewer and of the stream.
     Raises `OSError` if the file cannot be written.
     """
 
@@ -98,7 +98,7 @@ class RerunLog:
             self._stream.log(name, rerun.SeriesLines(names=self._spec.joint_names), static=True)
 
     def add(self, step: Transition) -> bool:
-        """Send a step; if live, then wait for real time. Always returns True."""
+        """Send a step and, if live, wait to keep to real time. Always returns True."""
         stream = self._stream
         stream.set_time("time", duration=self._frames / self._hz)
         stream.set_time(FRAME, sequence=self._frames)

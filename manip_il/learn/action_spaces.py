@@ -63,7 +63,7 @@ class Conversion:
 
     robot: the arm, for `ee_delta` only. grippers: indices of the gripper openings, which are absolute in `joint_delta`.
 
-    Raises `UnknownName` for an unknown robot, `UsageError` for an arm with fewer joints than a pose has numbers.
+    Raises `UnknownName` for an unknown robot, `UsageError` for an arm with fewer than six joints.
     """
 
     space: str = JOINT_TARGET
@@ -138,7 +138,7 @@ def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = N
         needed = " or ".join(JOINT_TARGETS)
         raise MismatchError("meaning of the action", "the dataset", spec.action_meaning, space, needed)
     if space == EE_DELTA and (names := found._robot.joint_names) != spec.joint_names:
-        raise MismatchError("joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names)
+        raise MismatchError("list of joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names)
     return found
 
 

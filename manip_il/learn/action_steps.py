@@ -58,7 +58,7 @@ class MeasuredJointsStep(RelativeActionsProcessorStep):
 @ProcessorStepRegistry.register(DECODER)
 @dataclass
 class JointTargetsStep(AbsoluteActionsProcessorStep):
-    """Converts a policy's output (B, n) to joint targets and opening (B, n), relative to the joints measured now."""
+    """Converts a policy's output (B, n), relative to the joints measured now, to joint targets and opening (B, n)."""
 
     action_space: str = JOINT_TARGET
     robot: str = ""

@@ -196,7 +196,7 @@ class Checkpoint:
         return {"type": MLP, **kept, "sigma": self.config.get("sigma", 0.0)}
 
     def check_fits(self, spec: RobotTaskSpec) -> None:
-        """Raise `MismatchError` naming both sides unless environments of `spec` have all inputs and take the action."""
+        """Raise `MismatchError` naming both sides unless environments of `spec` have the policy's inputs and action."""
         if self.origin is not None:
             self.origin.check_fits(spec)
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)

@@ -36,7 +36,7 @@ _LIGHT, _COLOUR = 4.0, 16.0  # pictures vary far more in brightness than in colo
 _SHARPNESS = 3.0  # gain before the softmax
 _SPREAD, _STRENGTH = 4.0, 0.3  # scale spread and strength to about -2 to 2
 DRAWS = 16  # noisy true states per row of a batch, if `states` is given
-MOST_NOISE = 2.0  # largest noise of these states, as a multiple of the prediction's mean error in training
+MOST_NOISE = 2.0  # largest standard deviation of this noise, as a multiple of the prediction's mean error in training
 _MEMORY = 0.99  # weight of the previous value in the running mean of that error
 
 
@@ -162,7 +162,10 @@ class CNNPolicy(MLPPolicy):
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return joint state, keypoints, the predicted state, and offsets at each scale, (B, d)."""
+        """Return the action network's inputs, (B, d): given states, keypoints, predicted state, offsets at each scale.
+
+        If `states` is given, return only joint state and predicted state.
+        """
         keypoints = [
             encoder(self._at_size(key, batch)) for encoder, key in zip(self.encoders, self.cameras, strict=True)
         ]
@@ -207,7 +210,7 @@ class CNNPolicy(MLPPolicy):
             return losses
 
     def _losses_of_states(self, errors: Tensor) -> Tensor:
-        """Return the action network's mean losses on `DRAWS` noisy true states a row, (B,).
+        """Return the action network's mean loss on `DRAWS` noisy true states for each row, (B,).
 
         errors: absolute errors of the predicted state in this batch, (B, k), in the state's units.
         """
@@ -328,7 +331,7 @@ class KeypointEncoder(nn.Module):
     A keypoint learns only where its softmax is large, so some must start on every small thing of a distinct colour.
     Hence the picture is split into brightness and colour, and the weights start with variance 2 / inputs (He et al.,
     Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own initialisation
-    every softmax began as the picture's mean; a goal of 5 pixels was not found in 1,100 steps, but now in 300.
+    every softmax began as the picture's mean, and a goal of 5 pixels was not found in 1,100 steps; now 300 suffice.
 
     channels: those of the layers; the first two halve the picture's sides. keeps_maps: whether `maps` holds the
     logarithms of the last pictures' heat maps, (B, K, height, width), while training.

@@ -34,8 +34,8 @@ ROWS = 25  # rows per call; episodes in lockstep have consecutive numbers, so ea
 class EpisodePolicy:
     """A LeRobot policy with its processors and one memory per episode.
 
-    module: the policy without any episode's memory. task: instruction for a policy that reads language, in episodes
-    without one from `begin`.
+    module: the policy without any episode's memory. task: instruction for a policy that reads language, if
+    `begin` gives an episode no other.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class EpisodePolicy:
         shape = (config.horizon, *config.action_feature.shape)
         noise = [torch.randn(shape, generator=one, device=weight.device, dtype=weight.dtype) for one in generators]
         seen = model._prepare_global_conditioning(batch)
-        # each row's own generator also draws the noise of the steps; LeRobot's `generate_actions` does not allow that
+        # each row's generator also draws the noise of its denoising steps, which LeRobot's `generate_actions` cannot do
         plans = model.conditional_sample(ROWS, seen, generators, torch.stack(noise))
         start = config.n_obs_steps - 1
         plans = plans[:, start : start + config.n_action_steps]

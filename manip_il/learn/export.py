@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, GRIPPERS, IMAGES, OPENINGS, SERVOS, STATE, TWO_ARMS
 from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
 from manip_il.learn.checkpoint import policy_sha256
@@ -30,6 +30,7 @@ from manip_il.learn.policy import LearnedPolicy
 TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
 _OPSET = 17
 _ROWS = 64  # observations on which file and checkpoint are compared
+_JOINT_UNITS = {OPENINGS: ("rad", "m"), SERVOS: ("deg", "0 to 100"), TWO_ARMS: ("rad", "0 to 1")}  # joints, grippers
 _UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
 _UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
 
@@ -61,7 +62,7 @@ class PolicyFunction(nn.Module):
 
 
 def export_onnx(path: Path) -> tuple[bytes, float]:
-    """Return the policy in a `pretrained_model` folder as ONNX, and its largest difference from the actions there.
+    """Return the policy in a `pretrained_model` folder as ONNX, and the largest difference between their actions.
 
     Raises `ManipError` for a policy that cannot be exported or whose file would act differently from the checkpoint,
     and what `LearnedPolicy.load` raises.
@@ -72,7 +73,7 @@ def export_onnx(path: Path) -> tuple[bytes, float]:
     policy = LearnedPolicy.load(path)
     if policy.checkpoint.space == EE_DELTA:
         raise ManipError(
-            f"{path} learnt {EE_DELTA}, whose inverse kinematics cannot be exported; train with {JOINT_DELTA}"
+            f"{path} was trained with {EE_DELTA}, whose inverse kinematics cannot be exported; train with {JOINT_DELTA}"
         )
     function = PolicyFunction(policy)
     metadata = file_metadata(policy, function.inputs, policy_sha256(path))
@@ -134,7 +135,9 @@ def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
     names: list[str] = []
     if meta:
         names = list(meta.environment_state_names if key == ENVIRONMENT_STATE else meta.joint_names)
-    units = ["rad"] * (size - 1) + ["m"]  # the arm's joints, then the gripper's opening
+    meaning = meta.action_meaning if meta else OPENINGS
+    grippers = [place % size for place in GRIPPERS.get(meaning, (-1,))]
+    units = [_JOINT_UNITS[meaning][place in grippers] for place in range(size)] if meaning in _JOINT_UNITS else []
     if key == ENVIRONMENT_STATE:
         units = ["1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2]) for name in names]
     meanings = {name: values for name, values in (("names", names), ("units", units)) if values}

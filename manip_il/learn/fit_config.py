@@ -12,7 +12,7 @@ from manip_il.errors import UsageError
 from manip_il.learn.names import CNN, CONVERTED, JOINT_TARGET, MLP
 from manip_il.option import check_bounds, option
 
-if TYPE_CHECKING:  # it imports numpy
+if TYPE_CHECKING:  # `checkpoint` imports numpy
     from manip_il.learn.checkpoint import Checkpoint
 
 

@@ -86,7 +86,10 @@ def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
 
 
 def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
-    """Return a LeRobot dataclass from options by name. Raises `UsageError` if it refuses them. source: their origin."""
+    """Return a LeRobot dataclass from options by name. source: their origin, which errors name.
+
+    Raises `UnknownName` for an unknown option, `UsageError` for a value that LeRobot refuses.
+    """
     known = [field.name for field in dataclasses.fields(cls) if field.init and field.name not in NOT_OURS]
     for name in settings:
         if name not in known:

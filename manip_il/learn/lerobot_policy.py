@@ -54,7 +54,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
 def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion | None = None) -> tuple[Any, Any]:
     """Return new LeRobot pre- and postprocessors with the dataset's statistics.
 
-    conversion: the one that the processors are to do, if any; the statistics are those of the converted actions.
+    conversion: done by the processors, if given; the statistics must then be those of the converted actions.
     """
     before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
     if conversion is not None:
@@ -94,7 +94,7 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 
 
 def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tuple[PreTrainedPolicy, Any, Any]:
-    """Return the policy of a checkpoint and its processors; downloads nothing unless LeRobot needs to.
+    """Return the policy of a checkpoint and its processors; downloads only what a trusted policy names.
 
     Raises `UnknownName` for an unknown type, `ManipError` if packages are missing, if the policy names models that are
     not trusted, or if LeRobot cannot load the folder.

@@ -153,7 +153,7 @@ class CategoricalHead(Head):
         return -((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
 
     def smeared(self, target: Tensor) -> Tensor:
-        """Return each bin's share of targets (B, n), (B, n, bins and padding): `sigma`'s Gaussian over the bin."""
+        """Return the share of each target (B, n) in each bin, (B, n, bins + 2 pad), under its Gaussian."""
         edges = torch.arange(self.total + 1, dtype=target.dtype, device=target.device) - 0.5
         below = torch.special.ndtr((edges - self._place(target).unsqueeze(-1)) / self.sigma)
         # The ends are at least 3 sigma from any target, so the sum is never 0.

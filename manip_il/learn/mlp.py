@@ -192,7 +192,7 @@ class MLPPolicy(PreTrainedPolicy):
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
-    """Return which numbers of the environment state are offsets between things. Raises `UsageError` if none are."""
+    """Return the indices of the environment state's offsets between two things; `UsageError` if there are none."""
     names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
     found = tuple(i for i, name in enumerate(names) if "_from_" in name)
     if not found:

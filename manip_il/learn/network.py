@@ -26,7 +26,7 @@ from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
 from manip_il.option import check_bounds, option
 
 # The order of summation in a matrix product depends on the number of rows. Acting always
-# multiplies this many, padded with zeros.
+# multiplies this many rows, padded with zeros.
 ROWS = 64
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
 SIGMA = 3.0  # [bins]
@@ -190,7 +190,7 @@ class MLPNetwork(nn.Module):
         return torch.cat([self.actions(block) for block in padded.split(ROWS)])[:rows]
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """Return actions, (B, n), for all rows in one product; the last bits depend on the number of rows."""
+        """Return actions, (B, n), for all rows at once; the last bits depend on the number of rows."""
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so the learner's must not either.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
@@ -209,7 +209,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
-    """Return weights (n, d) and statistics (n,) by name from a `pretrained_model` folder. Raises `ManipError`."""
+    """Return weights (n, d) and statistics (n,) by name from a folder; `ManipError` if they cannot be read."""
     path = Path(pretrained_model) / WEIGHTS
     with in_one_line(f"{path} cannot be read"):
         return {name.removeprefix("model."): tensor for name, tensor in load_file(path).items()}

@@ -19,7 +19,7 @@ from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
 from manip_il.mdp import F32, F64, Images
 
-if TYPE_CHECKING:  # it imports LeRobot, which takes seconds
+if TYPE_CHECKING:  # `episode_policy` imports LeRobot, which takes seconds
     from manip_il.learn.episode_policy import EpisodePolicy
 
 Batch = dict[str, torch.Tensor]
@@ -70,8 +70,9 @@ class LearnedPolicy:
 
         states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row, by
         default its index; the policy's memory of an episode and its random draws depend on that number. An episode that
-        is left out has ended. An action is bit-identical whatever the other rows are. Raises `NotFiniteError` naming
-        the row for an action that is not finite, `MismatchError` for pictures that are missing or of another size.
+        is not in `episodes` has ended. An action is bit-identical whatever the other rows are. Raises `NotFiniteError`
+        naming the row for an action that is not finite, `MismatchError` for pictures that are missing or of another
+        size.
         """
         if not len(states):
             return np.empty((0, self.checkpoint.action))
@@ -87,7 +88,7 @@ class LearnedPolicy:
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Reset the memory of episodes that begin.
 
-        instructions: episode number -> text for a policy that reads language; an empty one stands for the `task` of
+        instructions: episode number -> text for a policy that reads language; an empty text stands for the `task` of
         `load`.
         """
         self._policy.begin(instructions)
@@ -114,9 +115,9 @@ class LearnedPolicy:
 
 
 def actions_along(policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]) -> Iterator[tuple[NDArray[np.int64], F64]]:
-    """Yield rows (B,) and a policy's actions (B, n) along whole recorded episodes, in order of time.
+    """Yield row numbers (B,) and a policy's actions (B, n) for each time step of whole recorded episodes.
 
-    table: their `observation.state`, `observation.environment_state` and `episode_index`, one episode after the other.
+    table: columns `observation.state`, `observation.environment_state` and `episode_index`, one episode after another.
     """
     episodes = table[EPISODE_INDEX].reshape(-1)
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))

@@ -51,8 +51,8 @@ _METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/ex
 class ActorCritic(ActorCriticPolicy):
     """Actor and critic. Observations (B, d + 2): raw inputs, flag of the absorbing state, elapsed share of the episode.
 
-    The actor sees only the inputs, so that it is the policy that is saved; the critic sees all, as the return that is
-    left depends on the time to the end of the episode. In the absorbing state actions do nothing, so their density is 1
+    The actor sees only the inputs, because it is saved as the policy; the critic sees all, because the return still to
+    come depends on the time to the end of the episode. In the absorbing state actions do nothing, so their density is 1
     there and the actor learns nothing from it. The same holds for action dimensions that the demonstrations never vary.
     """
 
@@ -88,7 +88,7 @@ class ActorCritic(ActorCriticPolicy):
         return self.predict_values(obs), *self.log_prob(obs, actions)
 
     def log_prob(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return log-densities of actions (B, n) and entropies, (B,) both [nats]."""
+        """Return log-densities of actions (B, n), and entropies, both (B,) [nats]."""
         gaussian, live = self._gaussian(obs), 1.0 - obs[:, -EXTRA]
         log_prob, entropy = gaussian.log_prob(actions) * self._free, gaussian.entropy() * self._free
         return log_prob.sum(1) * live, entropy.sum(1) * live
@@ -182,8 +182,8 @@ class Learner:
     def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
         """Take an iteration's gradient steps on what `collect` returned; rewards: (N,) in its order. Returns metrics.
 
-        actor: whether to update the actor as well as the critic. remaining: share of the run that is left, by which the
-        learning rate is scaled.
+        actor: whether to update the actor as well as the critic. remaining: share of the run that is left; the
+        learning rate is multiplied by it, but by no less than `LAST_LR`.
         """
         buffer = self.ppo.rollout_buffer
         buffer.rewards[:] = rewards.reshape(buffer.rewards.shape)

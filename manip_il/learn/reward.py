@@ -34,7 +34,7 @@ from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one
 from manip_il.learn.network import read_weights, threads
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
-PREFERENCE = "preference"  # type of such a reward in config.json
+PREFERENCE = "preference"  # type of a learnt reward in config.json
 _KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # LeRobot's types of the inputs
 _ROWS = 16_384  # rows evaluated at a time
 BY_CHANCE = 0.1  # E, the share of random answers
@@ -92,7 +92,7 @@ class RewardNetwork(nn.Module):
     """M perceptrons from (state, environment state, action) to a reward.
 
     Inputs are standardised and clamped to `CLAMP` standard deviations, so that states far from the data have the reward
-    at the bound. `low`, `high`: rewards of the mean network that `forward` maps to 0 and 1.
+    at the bound. `low`, `high`: mean rewards of the M perceptrons that `forward` maps to 0 and 1.
     """
 
     CLAMP = 5.0
@@ -125,14 +125,14 @@ class RewardNetwork(nn.Module):
                 weight.copy_(spread * torch.randn(weight.shape, generator=generator))
 
     def features(self, inputs: Tensor) -> Tensor:
-        """Return the used columns of the inputs (B, d), then the lengths of the offsets, (B, up to d + K)."""
+        """Return the used columns of the inputs (B, d), then the lengths of the K offsets, (B, up to d + K)."""
         lengths = [inputs[:, way].norm(dim=-1, keepdim=True) for way in self.ways]
         if self.logarithms:
             lengths = [(one + self.NEAR).log() for one in lengths]
         return torch.cat([inputs[:, self.read], *lengths], dim=-1)
 
     def members(self, inputs: Tensor) -> Tensor:
-        """Return each network's reward, (M, B), for inputs (B, d), in units in which preferences are log-odds."""
+        """Return each network's reward, (M, B), for inputs (B, d), in log-odds per step."""
         x = ((self.features(inputs) - self.mean) / self.std).clamp(-self.CLAMP, self.CLAMP)
         hidden = x.expand(len(self.weights[0]), *x.shape)
         for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -143,7 +143,7 @@ class RewardNetwork(nn.Module):
 
     @override
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the mean network's reward, (B,), for inputs (B, d): 0 at `low`, 1 at `high`."""
+        """Return the mean of the M rewards, (B,), for inputs (B, d), scaled to be 0 at `low` and 1 at `high`."""
         return (self.members(inputs).mean(0) - self.low) / (self.high - self.low)
 
 
@@ -160,7 +160,7 @@ class LearnedReward:
     def load(cls, path: Path) -> LearnedReward:
         """Load a folder written by `manip-il reward fit`, only from JSON and safetensors.
 
-        Raises `ManipError` for a folder that is incomplete or not such a reward.
+        Raises `ManipError` for a folder that is incomplete or holds something else.
         """
         config, origin = read_config(path), read_origin(path)
         if config["type"] != PREFERENCE or origin is None:
@@ -291,10 +291,10 @@ def deal(pair: I64, folds: int, seed: int) -> I64:
 def _train(
     network: RewardNetwork, inputs: Tensor, compared: Compared, folds: I64, seed: int, on_epoch: Callable[[], None]
 ) -> int:
-    """Train all networks at once, each on its own folds; return the epoch with the lowest loss, its weights restored.
+    """Train all networks at once; restore the weights of the epoch with the lowest held-out loss and return its number.
 
-    That loss is over every network's held-out fold, so it covers every answer once: one number for all networks, as a
-    choice by a single fold of some 25 answers would be mostly noise.
+    Each network is evaluated on the fold that it holds out, so the mean loss covers every answer once. All stop at
+    the same epoch: a choice by a single fold of some 25 answers would be mostly noise.
     """
     member = np.arange(len(network.weights[0]))[:, None]
     left_out = torch.from_numpy(folds == member)

@@ -66,10 +66,10 @@ class Windows:
         return inside, {f"{key}_is_pad": torch.from_numpy(inside != wanted)}
 
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
-        """Return the samples to train on, (S,): all labels in the window valid, without the last `drop_last` frames.
+        """Return the samples to train on, (S,): those with valid labels in the whole window.
 
-        valid: whether each frame's label is valid, (N,). drop_last: LeRobot's `drop_n_last_frames`. Raises
-        `ManipError` if nothing is left.
+        valid: whether each frame's label is valid, (N,). drop_last: number of unused frames at the end of each
+        episode, LeRobot's `drop_n_last_frames`. Raises `ManipError` if nothing is left.
         """
         samples = np.flatnonzero(np.arange(len(valid)) + drop_last <= self._last)
         sound = valid[self.rows(samples, ACTION)[0]]
@@ -169,9 +169,9 @@ def valid_frames(table: Table) -> NDArray[np.bool_]:
 
 
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
-    """Return the rows (of N) to train on and to hold out: whole episodes (N,), about `fraction` of them held out.
+    """Return the rows to train on and to hold out; whole episodes are held out, about `fraction` of them.
 
-    Nothing is held out if that would be less than half an episode or all of them.
+    episodes: the episode of every row, (N,). Nothing is held out if `fraction` rounds to none or all of the episodes.
     """
     names = np.unique(episodes)
     count = round(fraction * len(names))
@@ -189,7 +189,7 @@ def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
     losses by them; here samples are drawn in proportion: the same gradient, without computing what has no weight.
 
     episodes: the dataset's `episode_index`, (N,). ahead: number of frames that an action spans. Raises `ManipError` if
-    the file is not such a table or every frame weighs 0, `MismatchError` if it is for another dataset.
+    the file cannot be read or every frame weighs 0, `MismatchError` if it is for another dataset.
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 
@@ -197,7 +197,7 @@ def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
         found = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
     if found.episode_lookup != dict(enumerate(episodes.tolist())):
         frames = f"{len(found.episode_lookup)} frames"
-        raise MismatchError("episodes", str(path), frames, "the dataset", f"{len(episodes)} frames")
+        raise MismatchError("division into episodes", str(path), frames, "the dataset", f"{len(episodes)} frames")
     weights, _ = found.compute_batch_weights({"index": np.arange(len(episodes))})
     if not weights.any():
         raise ManipError(

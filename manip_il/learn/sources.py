@@ -37,8 +37,8 @@ def check_same_sources(
 ) -> None:
     """Raise `MismatchError` naming both sides unless datasets can be used as one.
 
-    pictures: whether the policy takes them, so that cameras and sizes must agree, too. language: whether it reads its
-    task; for any other the task must be the same.
+    pictures: whether the policy takes them, so that cameras and sizes must agree, too. language: whether the policy
+    reads an instruction; if not, the task must be the same.
     """
     what = (*(("cameras", "image_size") if pictures else ()), *(() if language else ("task",)))
     for root, spec in zip(roots[1:], specs[1:], strict=True):

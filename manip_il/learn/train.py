@@ -53,7 +53,7 @@ from manip_il.learn.training_state import (
     write_own_files,
 )
 
-_METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # those that LeRobot's update sets
+_METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # metrics that LeRobot's `update_policy` sets
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
@@ -148,10 +148,10 @@ class Trainer:
         self.unwrapped = self.accelerator.unwrap_model(self.policy)  # without the wrapper of distributed training
 
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
-        """Take the remaining steps, with metrics and checkpoints; return the last one's `pretrained_model`.
+        """Take the remaining steps, with metrics and checkpoints; return the last checkpoint's `pretrained_model`.
 
         on_step: called after every step, with the metrics if there are any, else with {}; an exception from it ends
-        the fit, `KeyboardInterrupt` after a checkpoint. Raises `NotFiniteError` for a loss that is not finite.
+        the fit, `KeyboardInterrupt` once a checkpoint is saved. Raises `NotFiniteError` for a loss that is not finite.
         """
         main = self.accelerator.is_main_process
         metrics = metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
@@ -173,7 +173,7 @@ class Trainer:
         return self.output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
 
     def run(self) -> Iterator[dict[str, Any]]:
-        """Take the remaining steps; yield the metrics every `log_freq` steps and at the last, else {}."""
+        """Take the remaining steps; yield metrics after every `log_freq`-th and the last step, {} after the others."""
         preset, since, started = self.pipeline.optimizer, self.step, time.perf_counter()
         assert preset is not None
         metrics = MetricsTracker(1, 1, 1, {name: AverageMeter(name) for name in _METRICS})

@@ -84,7 +84,7 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
     """Yield the functions to call with each record: for the metrics file, and for the other requested outputs.
 
     step: where the fit resumes. curves: whether to write to TensorBoard. pipeline: has the options for Weights &
-    Biases. Raises `UsageError` if one of them is not installed.
+    Biases. Raises `UsageError` if a requested output's package is not installed.
     """
     with ExitStack() as stack:
         writers = [json_lines(output_dir / METRICS_FILE, step)]
@@ -97,7 +97,7 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
 
 
 def json_lines(path: Path, step: int) -> Writer:
-    """Return a function that appends a line, with null for non-finite numbers; drop the lines after `step` first."""
+    """Drop the lines after `step`; return a function that appends a line, with null for non-finite numbers."""
     kept = [record for record in read_lines(path) if record["step"] <= step] if step > 0 else []
     write_file(path, "".join(f"{json.dumps(record)}\n" for record in kept).encode())
     return functools.partial(append_line, path)

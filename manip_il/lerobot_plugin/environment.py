@@ -44,7 +44,7 @@ class ManipILEnv(EnvConfig):
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras:
     comma-separated names. observation_height, observation_width: size of their pictures [pixels]. fps, episode_length,
     tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
-    render_mode: with `none` the films of lerobot-eval are black, which needs neither OpenGL nor time.
+    render_mode: with `none` lerobot-eval's films are black; rendering them takes no OpenGL and hardly any time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
     """

@@ -29,7 +29,7 @@ Frame = dict[str, Any]  # column -> array or text, and `task`
 
 
 def list_files(source: Path) -> list[Path]:
-    """Return the MCAP file, or those of a folder in order of names. Raises `ManipError` if there are none."""
+    """Return the MCAP file, or all those in a folder, sorted by name. Raises `ManipError` if there are none."""
     paths = sorted(path for path in source.glob("*.mcap") if not path.name.startswith("."))
     if not paths and not source.is_file():
         raise ManipError(f"{source} is not a file, and holds no *.mcap files")
@@ -56,7 +56,7 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
 
 
 def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
-    """Yield a file's frames in the form of LeRobot's writer; pictures are read on demand.
+    """Yield a file's frames, resampled to the dataset's rate; pictures are read on demand.
 
     Raises `ManipError` naming file and topic if the file lacks something that the mapping names.
     """

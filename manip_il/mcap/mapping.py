@@ -23,9 +23,10 @@ TASK = "task"  # key of a frame's task text
 class TopicSource:
     """The topic of a column, and which message a frame takes. tolerance: largest time between frame and message [s].
 
-    resample: `nearest` in time (of two, the earlier one), or `previous`, the last one that is not later. Numbers or
-    text are the values at all paths in `field`, in order; shape: by default (values,). Pictures have `video` instead:
-    whether to encode video, with loss, or PNG. Raises `UsageError` for options that contradict each other.
+    resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one that is not later.
+    Numbers or text are the values at all paths in `field`, in order; shape: by default (values,). Pictures have `video`
+    instead of `field`: true is video, with loss, false is PNG. Raises `UsageError` for options that contradict each
+    other.
     """
 
     topic: str
@@ -68,7 +69,7 @@ class TopicSource:
 
 @dataclass(frozen=True)
 class Mapping:
-    """How topics become a dataset. task: one text for all frames, or the source of texts."""
+    """How topics become a dataset. task: one text for all frames, or the topic that holds the texts."""
 
     fps: float
     task: str | TopicSource
@@ -102,7 +103,7 @@ def load_mapping(path: Path) -> Mapping:
         task = _source("task", task | {"dtype": TEXT}) if isinstance(task, dict) else checks.text("task", task)
         given: dict[str, Any] = {**tree, "features": features, "task": task}
         return Mapping(**given)
-    except (ManipError, TypeError) as error:  # the latter names an unknown or missing key
+    except (ManipError, TypeError) as error:  # a TypeError names an unknown or missing key
         raise UsageError(f"{path}: {error}") from error
 
 

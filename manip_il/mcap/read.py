@@ -39,7 +39,7 @@ def read_topics(path: Path) -> list[str]:
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, log time [ns] and decoded content of the messages of some topics, in order of time.
 
-    Raises `ManipError` naming the file for every error of the library.
+    Raises `ManipError` naming the file for any error of the MCAP library or a decoder.
     """
     factories: list[DecoderFactory] = [ProtobufFactory(), _OtherFactory()]
     if find_spec(_ROS2):

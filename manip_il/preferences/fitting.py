@@ -22,8 +22,8 @@ TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 class FittedReward:
     """A fit, and its agreement on held-out pairs; each network of the ensemble holds out some.
 
-    answered: agreement with the answers left and right; true: agreement with true progress, without pairs that differ
-    by less than `TIE`; None if there is no progress.
+    answered: agreement with the answers that are not `equal`; true: agreement with true progress, without pairs that
+    differ by less than `TIE`; None if there is no progress.
     """
 
     fit: Fit

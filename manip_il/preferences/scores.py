@@ -39,7 +39,7 @@ _METADATA = b"reward_model_path"  # the key that LeRobot's own scripts write
 class Scores:
     """Scores of a dataset. frames: score of each frame, (N,), 0 to 1; reward: the reward's name.
 
-    An episode's score is the mean over its last second: how far it got and stayed.
+    An episode's score is the mean over its last second: how close to success it ended.
     """
 
     root: str
@@ -54,7 +54,7 @@ class Scores:
 
     @property
     def bar(self) -> float:
-        """Score below which an episode's frames have no weight: the upper quartile minus `BELOW`."""
+        """Score up to which an episode's frames have no weight: the episodes' upper quartile minus `BELOW`."""
         return float(np.quantile(self.episodes, BEST)) - BELOW
 
     @property

@@ -33,7 +33,7 @@ _STEP = 2.38  # random walk's step in deviations, before division by sqrt(dimens
 class Choices:
     """The paths that the demonstrators chose among, for all demonstrations in order.
 
-    excess: a path's features minus those of the demonstration, (m, K) [m]; the demonstration itself, 0, comes first.
+    excess: a path's features minus those of the demonstration, (m, K) [m]; first a row of zeros, the demonstration's.
     starts: first row of each demonstration, (D,).
     """
 
@@ -97,7 +97,7 @@ def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: flo
 
 
 def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
-    """Return the posterior, given each demonstration's choice among the paths that are cheapest for some taste."""
+    """Return the posterior; each demonstration was chosen among itself and the cheapest paths for sampled weights."""
     features = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
     for _ in range(_ROUNDS):

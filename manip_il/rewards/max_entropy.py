@@ -73,10 +73,10 @@ class SoftPlan:
 
 
 def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
-    """Return the distribution of paths for weights (K,); the larger they are, the likelier is the cheapest path.
+    """Return the distribution of paths for weights (K,); larger weights make the cheapest path more likely.
 
     Raises `ManipError` if the sum over all paths is infinite, because their number grows faster than exp(cost) (the
-    spectral radius of M is 1 or more).
+    spectral radius of the module's M is 1 or more).
     """
     costs, edges = problem.costs(weights), problem.edges
     hard = plan(problem, weights).costs
@@ -135,7 +135,7 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
     """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: see `PRIOR` [1/m].
 
-    The search starts at twice the least weights on a few of the demonstrations, then continues on all of them.
+    The search starts above `least_weights`, first on some of the demonstrations, and continues on all of them.
     """
     least = least_weights(demonstrations)
     weights = np.maximum(2 * least, least.max() / 2)

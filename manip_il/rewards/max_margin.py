@@ -25,7 +25,7 @@ def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) 
     """Return the margin violation of a demonstration for weights (K,), and a subgradient (K,).
 
     The margin of a path is `margin` times the length of its edges that end off the demonstration (Ratliff et al. 2006,
-    with the maximum over paths as in their eq. 7). Costs minus margins are positive if length's weight is 1 or more.
+    with the maximum over paths as in their eq. 7). Costs minus margins are positive if length has weight 1 or more.
     """
     problem = demonstration.problem
     off = np.ones(problem.nodes, bool)
@@ -39,8 +39,8 @@ def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) 
 def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> F64:
     """Return the weights (K,) of maximum margin planning: the mean over the second half of projected subgradient steps.
 
-    Every weight is at least 0, and length's at least 1, which sets the scale. The steps are AdaGrad's, first on a few
-    of the demonstrations, then on all.
+    Every weight is at least 0; that of length is at least 1, which sets the scale. The step sizes are AdaGrad's. The
+    first steps use some of the demonstrations, the others all.
     """
     least = np.eye(demonstrations[0].problem.features.shape[1])[LENGTH]
     weights = least

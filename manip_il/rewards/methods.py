@@ -47,6 +47,6 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
 
 
 def prior_interval(level: float = LEVEL) -> tuple[float, float]:
-    """Return the prior interval of one weight over another; for two exponentials P(ratio < r) = r / (1 + r)."""
+    """Return the prior interval of the ratio of two weights; for exponentials P(ratio < r) = r / (1 + r)."""
     low, high = (1 - level) / 2, (1 + level) / 2
     return low / (1 - low), high / (1 - high)

@@ -30,8 +30,8 @@ _SAME = 1e-6  # largest difference between equal feature sums [m]
 class PathProblem:
     """S nodes, E edges with K features each, one goal.
 
-    edges: (E, 2), from and to, each pair once, without self-loops. features: (E, K), 0 or more, such as metres of the
-    edge above a thing; the first one is the edge's length and positive.
+    edges: (E, 2), from and to, each pair once, without self-loops. features: (E, K), 0 or more; the first one is the
+    edge's length [m], above 0; another may be, for example, its length above a thing on the table [m].
     """
 
     edges: I64

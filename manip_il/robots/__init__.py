@@ -1,4 +1,4 @@
-"""Robots, each a YAML beside an MJCF."""
+"""The robots that ship with the package, each described by a YAML."""
 
 from pathlib import Path
 

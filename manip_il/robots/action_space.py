@@ -14,20 +14,20 @@ from manip_il.mdp import F64
 
 @dataclass(frozen=True, eq=False)
 class ServoUnits:
-    """Conversion between [rad] and [m], and the units of servos: degrees, and 0 to 100 for the gripper.
+    """Conversion between joints [rad] with an opening [m] and servo units: degrees, 0 to 100 for the gripper.
 
-    openings: gripper openings [m], rising, (c,). percents: its servo's positions there, 0 to 100, (c,).
+    openings: gripper openings [m], rising, (c,). percents: the gripper servo's positions at these, 0 to 100, (c,).
     """
 
     openings: F64
     percents: F64
 
     def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Return degrees (n - 1,) and the gripper's position, 0 to 100, of joints (n - 1,) [rad] and an opening [m]."""
+        """Return degrees (n - 1,) and gripper position, 0 to 100, for joints (n - 1,) [rad] and an opening [m]."""
         return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
 
     def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and the gripper's position, 0 to 100."""
+        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and gripper position, 0 to 100."""
         order = slice(None, None, 1 if self.percents[0] < self.percents[-1] else -1)  # rising, as `interp` needs them
         return np.radians(arm), float(np.interp(percent, self.percents[order], self.openings[order]))
 
@@ -36,10 +36,10 @@ class ServoUnits:
 class ActionSpace:
     """Names and bounds of an action (n,): joint targets [rad] and, last in `names`, the gripper's opening [m].
 
-    low, high: what commands are clipped to, infinite for a joint that turns freely. scale: the longest step of a joint
-    target from the measured joint [rad], the whole opening of the gripper [m]. relative: whether a learner's target is
-    relative to the measured joint; the gripper's is not. units: set for a robot with servos; all of these, actions and
-    measured states are then in degrees, the gripper's from 0 to 100.
+    low, high: what commands are clipped to, infinite for a joint that turns freely. scale: for a joint the largest step
+    of its target from its measured position [rad], for the gripper its whole opening [m]. relative: whether a learner's
+    target is relative to the measured position: true except for the gripper. units: set for a robot with servos;
+    low, high, scale, actions and measured states are then in degrees, the gripper's from 0 to 100.
     """
 
     names: tuple[str, ...]
@@ -78,7 +78,7 @@ class ActionSpace:
         return action
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
-        """Clip `action` (n,) to the bounds. Raises `MismatchError` for its shape, `NotFiniteError` naming `step`."""
+        """Clip `action` (n,) to the bounds. Raises `MismatchError` for a wrong shape, `NotFiniteError` for NaN."""
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.low.shape:
             raise MismatchError("action shape", "the policy", action.shape, "the robot", self.low.shape)
@@ -87,7 +87,7 @@ class ActionSpace:
         return np.clip(action, self.low, self.high)
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw joint targets within the longest step of the measured joints in `state` (n,), the gripper anywhere."""
+        """Draw an action (n,): joint targets within `scale` of the measured `state` (n,), and any gripper opening."""
         drawn = rng.uniform(-1, 1, len(self.arm)) * self.scale[self.arm]
         gripper = rng.uniform(self.low[self.gripper], self.high[self.gripper])
         return self._together(np.asarray(state, dtype=np.float64)[self.arm] + drawn, gripper)

@@ -1,4 +1,4 @@
-"""Parts of a robot's YAML as typed values, and files of a MuJoCo model, patched as the YAML says."""
+"""Typed values read from a robot's YAML, and a MuJoCo model's files, patched as the YAML says."""
 
 from __future__ import annotations
 
@@ -79,11 +79,12 @@ def _included(model: bytes, home: Path) -> set[str]:
 
 
 def read(what: str, kind: Any, value: Any) -> Any:
-    """Return a YAML's value as a `kind`: a dataclass, whose fields are the keys, a tuple, a mapping, a number or text.
+    """Convert a YAML's value to the type `kind`: a dataclass (keys are its fields), tuple, mapping, number or text.
 
-    Raises `UnknownName` for an unknown key, `ManipError` for a value that is missing, of the wrong type or invalid.
+    what: the value's name in messages. Raises `UnknownName` for an unknown key, `ManipError` for a value that is
+    missing, of the wrong type or invalid.
     """
-    import draccus  # imported here: names of robots do not need it
+    import draccus  # imported here, as listing the robots does not need it
 
     if is_dataclass(kind):
         known = [one.name for one in fields(kind)]
@@ -101,7 +102,7 @@ def read(what: str, kind: Any, value: Any) -> Any:
 
 
 def require_lengths(one: Any, **counts: int) -> None:
-    """Raise `ManipError` for a field with the wrong number of values."""
+    """Raise `ManipError` if a field of `one` does not have the number of values that `counts` gives for it."""
     for name, count in counts.items():
         if len(getattr(one, name)) != count:
             raise ManipError(f"{name} has {len(getattr(one, name))} numbers; expected {count}")

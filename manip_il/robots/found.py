@@ -1,4 +1,4 @@
-"""Find on a robot's model what its YAML may omit: motors, the hand's frame, a posture to start from."""
+"""Find in a robot's model what its YAML may omit: gains and limits of motors, the hand's frame, the home posture."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from manip_il.robots.spec import arm_spec, bare_spec, require
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
 FREQUENCY = 2 * math.pi * 6.0  # natural frequency of a joint with its motor as a spring [rad/s]
-_AT_OBJECT = 0.7  # share of the way from closed to open at which turning fingers stand as if around an object
+_AT_OBJECT = 0.7  # share of the way from closed to open at which `ee` is found: roughly that around an object
 _SETTLE, _STEP = 1000, 0.002  # physics steps, and their length [s]
-FROM_TIP = 0.012  # distance of the frame from the fingertips [m]
-_CLEAR = 0.006  # clearance of the fingertips over the table with the frame at its lowest [m]
+FROM_TIP = 0.012  # distance of the frame `ee` from the fingertips [m]
+_CLEAR = 0.006  # clearance of the fingertips over the table with `ee` at its lowest [m]
 _SQUARE = 0.95  # cosine of the largest angle from a body axis at which the fingers' motion counts as parallel to it
-_LEAST_GAP = 1e-4  # least gap between half-closed fingers [m]
+_LEAST_GAP = 1e-4  # least gap between the fingers at `_AT_OBJECT` [m]
 _METRES, _TURN = 4, 6  # decimals of positions [m] and of quaternions
 _STARTS, _STEPS = 40, 150  # inverse kinematics: number of random postures, and of steps from each
 _LONGEST = 0.2  # longest step of a joint [rad]
@@ -40,7 +40,7 @@ _DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: Mapping[str, Any]) -> Robot:
-    """Return the robot of a YAML's fields, missing ones found on the model. Raises `UsageError` if one is not found."""
+    """Return the robot of a YAML's fields, the others found in its model. Raises `UsageError` if one is not found."""
     files, names = said["files"], said["joints"]
     spec = bare_spec(said["name"], files, said["hand"], said["gripper"])
     require(said["name"], "joint", names, spec.joints)
@@ -76,7 +76,7 @@ def _greatest_torque(motor: mujoco._specs.MjsActuator | None, joint: mujoco._spe
 
 
 def find_gains(robot: Robot) -> tuple[float, ...]:
-    """Return kp of each joint [N m/rad], which gives it a natural frequency of 6 Hz with the inertia at home."""
+    """Return each joint's kp [N m/rad] for a natural frequency of 6 Hz with its inertia in the home posture."""
     model = arm_spec(robot).compile()
     data = mujoco.MjData(model)
     for name, value in zip(robot.joints, robot.home, strict=True):
@@ -91,8 +91,8 @@ def find_gains(robot: Robot) -> tuple[float, ...]:
 def find_ee(robot: Robot) -> EndEffector:
     """Return the frame between the fingertips: z from the hand to them, y along the fingers' motion.
 
-    z is the nearest axis of the hand's body, and so is y if it nearly agrees with one. Raises `UsageError` if the
-    fingers do not come apart.
+    z is snapped to the nearest axis of the hand's body; y, too, if it is nearly parallel to one. Raises `UsageError` if
+    the fingers do not come apart.
     """
     model, data = _settled(robot, _AT_OBJECT)
     hand = model.body(robot.hand).id
@@ -122,7 +122,7 @@ def find_ee(robot: Robot) -> EndEffector:
 
 
 def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The robot, its arm as in the model, its fingers at rest at a share of the way from closed to open."""
+    """Compile the robot and let its fingers settle at a share of the way from closed to open; the arm stays still."""
     alone = replace(robot, joints=(), home=(), gains=(), forces=(), armature=())
     spec = arm_spec(alone)
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -145,7 +145,7 @@ def _tip(robot: Robot, z: F64) -> float:
 
 
 def _along_axis(vector: F64, least: float = 0.0) -> F64:
-    """The unit vector (3,) of the axis nearest to a vector; the vector itself if its part along it is below `least`."""
+    """The unit vector (3,) of the axis nearest to `vector`; `vector` itself if its component there is below `least`."""
     axis = int(np.argmax(np.abs(vector)))
     if abs(float(vector[axis])) < least:
         return vector
@@ -155,7 +155,7 @@ def _along_axis(vector: F64, least: float = 0.0) -> F64:
 
 
 def find_home(robot: Robot, turns: bool) -> Robot:
-    """Return the robot with its best posture for a hand that points down over the workspace's middle.
+    """Return the robot with `home` set to its best posture for a hand that points down over the workspace's middle.
 
     turns: whether `ee` may be turned by half a turn about z if that suits the arm better. Raises `UsageError` if
     inverse kinematics converges from none of forty random postures.
@@ -185,7 +185,7 @@ def _rounded(values: F64, digits: int) -> Any:
 
 
 def _best(robot: Robot, height: float) -> tuple[float, Robot]:
-    """Rating of the best posture for the hand's frame, minus infinity if there is none, and the robot with it."""
+    """The best posture's rating, minus infinity if there is none, and the robot with that posture as `home`."""
     soft = robot.leans
     middle = replace(robot, home=tuple(_counted(ArmIK(robot).limits).mean(axis=1)))
     ik, body = ArmIK(middle), Body(middle)
@@ -204,7 +204,7 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
 
 
 def _counted(limits: F64) -> F64:
-    """Limits of joints, (arm, 2) [rad]; a joint without limits, or free for a whole turn or more, has -pi and pi."""
+    """Limits of joints, (arm, 2) [rad]; -pi and pi for a joint without limits or with a range of a turn or more."""
     free = ~np.isfinite(limits).all(axis=1) | (limits[:, 1] - limits[:, 0] >= 2 * np.pi - 1e-3)
     return np.where(free[:, None], np.array([-np.pi, np.pi]), limits)
 

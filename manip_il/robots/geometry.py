@@ -14,7 +14,7 @@ from manip_il.robots.spec import arm_spec
 
 _AT_TIP = 0.025  # distance from a fingertip beyond which a geom is no pad [m]
 _FAR = 1.0  # longest distance that is measured [m]
-_NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # [m]
+_NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # shifts of a geom, tried in order until the distance is not 0 [m]
 CLEARANCE = 0.02  # parts nearer than this count as colliding [m]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
@@ -23,14 +23,14 @@ def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
     """Return points around a geom in the world, (n, 3) [m]: its mesh's vertices, or its box's corners."""
     mesh, middle, half = int(model.geom_dataid[geom]), model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
     points = middle + half * _CORNERS
-    if mesh >= 0:  # the box of a mesh that is rotated in its geom is too large
+    if mesh >= 0:  # the corners of its box would be too far out, as a mesh may be rotated in its geom
         start = model.mesh_vertadr[mesh]
         points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
     return data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T
 
 
 def at_tip(model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], along: F64) -> list[int]:
-    """Return the geoms of a finger that reach near its tip, along a direction (3,) of the world."""
+    """Return the geoms of a finger that extend nearly to its tip. along: the finger's direction in the world, (3,)."""
     ends = {geom: float((outline(model, data, geom) @ along).max()) for geom in finger}
     return [geom for geom in finger if ends[geom] > max(ends.values()) - _AT_TIP]
 
@@ -38,7 +38,7 @@ def at_tip(model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], al
 def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, ends: F64 | None = None) -> float:
     """Return the distance between two geoms [m], at most 1 m, and put their nearest points (6,) [m] into `ends`.
 
-    For two separate geoms MuJoCo sometimes returns exactly 0, but not once one is moved slightly.
+    MuJoCo sometimes returns exactly 0 for two separate geoms: `one` is then shifted slightly and measured again.
     """
     place = data.geom_xpos[one].copy()
     apart = 0.0
@@ -52,7 +52,7 @@ def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, e
 
 
 def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequence[int]]) -> tuple[tuple[int, int], F64]:
-    """Return the nearest pair of a geom in the first group and one in another; and their nearest points, (2, 3) [m]."""
+    """Return the nearest pair of a geom in the first group and one in another, with their nearest points (2, 3) [m]."""
     first, *rest = groups
     least, pair, points, ends = np.inf, (first[0], rest[0][0]), np.zeros(6), np.empty(6)
     for one, other in itertools.product(first, [geom for group in rest for geom in group]):
@@ -63,7 +63,7 @@ def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequenc
 
 
 class Body:
-    """The whole robot, to detect self-collisions that it does not have at home."""
+    """A robot with its gripper open, to detect self-collisions other than those in its home posture."""
 
     def __init__(self, robot: Robot):
         self._model = arm_spec(robot).compile()

@@ -1,7 +1,7 @@
-"""A gripper as its opening [m] between the pads, whatever drives the fingers and however they move.
+"""A gripper, described by the opening [m] between its pads, whatever drives the fingers and however they move.
 
-A sweep relates command and opening: when a robot is first used, its actuators are moved from closed to open and the
-gap is measured at which the fingers come to rest. Parallel, hinged and linked fingers are thus treated alike.
+A sweep relates command and opening: when a robot is first used, its gripper is moved from closed to open in steps, and
+the gap between the fingers is measured once they rest. Parallel, hinged and linked fingers are thus treated alike.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 class Sweep:
     """Measured relation of command and opening.
 
-    shares: positions between closed, 0, and open, 1, as commanded and as measured, rising, (c,). openings: gaps between
-    the pads at rest [m], rising, (c,). middles: positions of the middle between the pads along the hand's y [m], (c,);
-    all 0 if both sides move alike. pads: for each finger the indices of its pads among its geoms, nearest to the other
-    finger first; holding: the same for the geoms that may hold an object.
+    shares: how far the fingers are from closed, 0, to open, 1, for commands and measured positions alike; rising, (c,).
+    openings: gaps between the pads there [m], rising, (c,). middles: offsets along the hand's y of the midpoint between
+    the pads [m], (c,); all 0 if both sides move alike. pads: for each finger the indices of its pads among its geoms,
+    nearest to the other finger first; holding: the same for the geoms that may hold an object.
     """
 
     shares: F64
@@ -48,7 +48,7 @@ class Sweep:
 
 
 class Gripper:
-    """A robot's gripper within a compiled model. prefix: prefix of the robot's names there."""
+    """A robot's gripper within a compiled model. prefix: prefix of the robot's names in the model."""
 
     def __init__(self, robot: Robot, model: mujoco.MjModel, prefix: str = ""):
         config, self._sweep = robot.gripper, sweep(robot)
@@ -56,7 +56,7 @@ class Gripper:
         self.ctrl = np.array([model.actuator(prefix + name).id for name in config.joints], dtype=np.int64)
         self._closed, self._open = np.asarray(config.closed), np.asarray(config.open)
         self._travel = self._open - self._closed
-        weights = 1 / (self._travel * len(self._travel))  # joints' weights in the share of the way
+        weights = 1 / (self._travel * len(self._travel))  # of each joint in the share of the way to open
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
         self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()
@@ -86,18 +86,18 @@ class Gripper:
 
     @property
     def driven(self) -> tuple[F64, F64]:
-        """Openings [m], rising, and the first driven joint's positions at these [rad or m]; (c,) both."""
+        """Openings [m], rising, and the first driven joint's positions at these [rad or m]; both (c,)."""
         return self._sweep.openings, self._closed[0] + self._sweep.shares * self._travel[0]
 
     def middle(self, opening: float) -> float:
-        """Return the middle between the pads along the hand's y, at an opening [m]; 0 if all fingers move.
+        """Return the offset [m] of the pads' midpoint along the hand's y at an opening [m]; 0 if all fingers move.
 
         If one jaw is fixed and the other turns or slides, a held object ends up beside the fixed one.
         """
         return float(np.interp(opening, self._sweep.openings, self._sweep.middles)) if self.lopsided else 0.0
 
     def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] that commands (g,) ask for, by the actuator that they move farthest from `before`."""
+        """Return the opening [m] for `commands` (g,), judged by the actuator that moves farthest from `before` (g,)."""
         shares = (commands - self._closed) / self._travel
         moved = np.abs(shares - (before - self._closed) / self._travel)
         return float(np.interp(shares[moved.argmax()], self._sweep.shares, self._sweep.openings))
@@ -120,7 +120,7 @@ def sweep(robot: Robot) -> Sweep:
     model, data, fingers, shares, poses = _at_rest(robot)
 
     def gaps_at(pose: F64, groups: Geoms) -> list[F64]:
-        """For each group of geoms, how far each of them is from the other groups [m]."""
+        """For each group, the distances [m] from its geoms to the nearest geom of another group."""
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
         others = [[geom for other in groups if other is not one for geom in other] for one in groups]
@@ -187,14 +187,15 @@ def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[f
 
 
 def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
-    """The geoms whose gap is at most `_PAD` more than the least at the tip, nearest first."""
+    """The geoms whose gap exceeds `least` by at most `_PAD`, nearest first."""
     return [geoms[i] for i in np.argsort(gaps, kind="stable") if gaps[i] <= least + _PAD]
 
 
 def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = "") -> list[tuple[int, ...]]:
-    """Return for each finger the ids of its solid geoms, including those of child bodies that are no other finger's.
+    """Return for each finger the ids of the geoms with contacts on its body and that body's descendants.
 
-    prefix: prefix of the bodies' names. Raises `UsageError` for a finger without such a geom.
+    A descendant that is another finger is left out. prefix: prefix of the bodies' names. Raises `UsageError` for a
+    finger without such a geom.
     """
     roots = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
     owners, touching = dict(roots), (model.geom_contype != 0) | (model.geom_conaffinity != 0)

@@ -27,10 +27,10 @@ _LARGEST = 0.5  # largest step of a joint in `moved` [rad]
 
 
 class PoseProgram:
-    """mink's quadratic program for a site's pose [m] and [rad] and a posture, within the joints' limits.
+    """mink's quadratic program that moves a site to a pose and the joints towards `home`, within their limits.
 
-    Stateless: a solution depends only on the posture in `data`, after `update`, and on a fixed `home` (n,). costs: of
-    the rotation [1/rad], relative to 1 [1/m] for the position, and of joints away from `home` [1/rad].
+    Stateless: a solution depends only on the posture in `data`, after `update`, and on `home` (n,) [rad]. costs: of the
+    rotation error [1/rad], relative to 1 [1/m] for the position error, and of a joint's distance from `home` [1/rad].
     """
 
     def __init__(self, model: mujoco.MjModel, site: str, home: F64, costs: tuple[float, float]):
@@ -39,7 +39,7 @@ class PoseProgram:
         orientation, posture = costs
         self.frame = mink.FrameTask(site, "site", _POSITION_COST, orientation, lm_damping=_LM_DAMPING)
         self._target = self.frame.transform_target_to_world = mink.SE3.identity()
-        self.posture = mink.PostureTask(model, posture)  # otherwise a label would depend on the path to the posture
+        self.posture = mink.PostureTask(model, posture)  # without it a label would depend on the path to the posture
         self.posture.set_target(home)
         limit = mink.ConfigurationLimit(model)
         self._bounded, self._gain = limit.indices.astype(int), limit.gain
@@ -54,7 +54,7 @@ class PoseProgram:
         mujoco.mj_comPos(self.model, self.data)
 
     def solve(self, position: F64, rotation: F64) -> F64 | None:
-        """Return the joints' displacement (n,) [rad] towards a pose, (3,) [m] and (3, 3); None without a solution."""
+        """Return a joint displacement (n,) [rad] towards a pose, (3,) [m] and (3, 3), or None if none is found."""
         mujoco.mju_mat2Quat(self._target.wxyz_xyz[:4], rotation.ravel())
         self._target.wxyz_xyz[4:] = position
         program: Any = mink.build_ik(self._configuration, [self.frame, self.posture], 1.0, _DAMPING, [])
@@ -66,7 +66,7 @@ class PoseProgram:
 
 
 class ArmIK:
-    """Stateless use of mink: every call starts from the measured `q` and a fixed posture target."""
+    """Inverse kinematics of an arm: a step depends only on the posture last given to `ee_pose` and on `home`."""
 
     def __init__(self, robot: Robot):
         model = arm_model(robot)
@@ -87,16 +87,16 @@ class ArmIK:
         self._links = [int(model.jnt_bodyid[joint.id]) for joint in joints[2:]]
 
     def ahead(self, position: F64) -> float:
-        """Return the zero direction of the yaw of a hand at a position (3,) [m], as a yaw in the world [rad]."""
+        """Return the world yaw [rad] that counts as zero for a hand at a position (3,) [m]."""
         return yaw_ahead(self._robot, self._data.xanchor[self._shoulder], position)
 
     def smallest_singular_value(self, q: F64) -> float:
-        """Return the Jacobian's smallest singular value in a posture (arm,) [rad]: 0 in a singular one."""
+        """Return the Jacobian's smallest singular value in a posture (arm,) [rad]: 0 if it is singular."""
         self.ee_pose(q)
         return float(np.linalg.svd(self._site_jacobian(), compute_uv=False)[-1])
 
     def lowest_link(self, q: F64) -> float:
-        """Return the height of the lowest joint beyond the shoulder in a posture (arm,) [rad]; [m]."""
+        """Return the height [m] of the lowest link beyond the shoulder in a posture (arm,) [rad]."""
         self.ee_pose(q)
         return float(self._data.xpos[self._links, 2].min()) if self._links else 0.0
 
@@ -107,7 +107,7 @@ class ArmIK:
         return self._ee.copy(), self._ee_rotation.copy()
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
-        """Return only the displacement of `step`, (arm,) [rad]; weight: rotation cost, by default an upright hand's."""
+        """Return only the displacement of `step`, (arm,) [rad]. weight: rotation cost, by default an upright hand's."""
         self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(position, rotation)
         if x is None:
@@ -117,11 +117,11 @@ class ArmIK:
         return dq * (largest / longest) if longest > largest else dq
 
     def step(self, position: F64, rotation: F64, largest: float, lean: float = 0.0) -> tuple[F64, float] | None:
-        """Return one step from the last `ee_pose` posture towards a pose of `ee`; `largest`: longest joint step [rad].
+        """Return one step towards a pose of `ee`, from the posture of the `ee_pose` call that must precede each step.
 
-        lean: how far the hand may lean from the rotation to reach the position, 0 to 1.
-        Returns the joint displacement [rad] (arm,), scaled down as a whole if one joint's is too long, and the share of
-        the weighted pose error that it leaves; None if the quadratic program has no solution.
+        largest: longest joint step [rad]. lean: from 0 to 1, how far the hand may lean from the rotation to reach the
+        position. Returns the joint displacement [rad] (arm,), scaled down as a whole if one joint exceeds `largest`,
+        and the share of the weighted pose error that remains; None if the quadratic program has no solution.
         """
         costs = self._costs
         weight = costs.orientation + lean * (costs.leaning - costs.orientation)
@@ -138,10 +138,9 @@ class ArmIK:
     def moved(self, q: F64, motions: F64) -> F64:
         """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), that move `ee` by `motions`.
 
-        motions: its translations [m] and rotation vectors [rad] in the world's axes, (B, 6). The first step is
-        `displacement`, which resolves redundancy (the elbow of an arm with seven joints) as for the expert; the
-        corrections after it are the shortest of the linearised kinematics (damped least squares). A pose out of reach
-        is approached.
+        motions: translations [m] and rotation vectors [rad] of `ee` in the world's axes, (B, 6). The first step
+        is `displacement`, which resolves redundancy (the elbow of an arm with seven joints) as for the expert; the
+        corrections after it are damped least-squares steps. A pose out of reach is only approached.
         """
         return np.array([self._moved(*row) for row in zip(q, motions, strict=True)]).reshape(q.shape)
 
@@ -161,7 +160,7 @@ class ArmIK:
         return q
 
     def _site_jacobian(self) -> F64:
-        """Jacobian of `ee`, position over rotation, by the arm's joints at the last `ee_pose`, (6, arm)."""
+        """Jacobian of `ee` by the arm's joints, rows for position first, in the last `ee_pose` posture; (6, arm)."""
         jacobian = self._jacobian
         mujoco.mj_jacSite(self._program.model, self._data, jacobian[:3], jacobian[3:], self._site)
         return jacobian[:, self._dofs]

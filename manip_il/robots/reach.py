@@ -1,7 +1,7 @@
 """A map of the points that a robot's downward hand reaches by inverse kinematics.
 
-It is computed once per robot and stored: beside the YAML of a robot that ships, else in the user's cache, under a hash
-of what it depends on: the compiled model and the rest of the YAML.
+It is computed once per robot and stored. A robot that ships with the package has it beside its YAML; any other has it
+in the user's cache, under a hash of the compiled model and the rest of the YAML.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 _CELL = 0.05  # grid spacing [m]
 _BEYOND = 0.3  # how far the map extends around the workspace [m]
-_ABOVE = 0.05  # how far it extends above the workspace [m]
+_ABOVE = 0.05  # how far the map extends above the workspace [m]
 _VERSION = 2  # version of the map's computation
 _STEPS = 80  # most steps of inverse kinematics
-_NEAR, _ANGLE = 1e-3, 0.05  # error at which it has converged [m], and what a radian adds to that [m/rad]
+_NEAR, _ANGLE = 1e-3, 0.05  # pose error that counts as converged [m]; what a radian adds to it [m/rad]
 ARRIVES = 0.004  # pose error up to which the hand arrives [m]
-STRETCH = 0.02  # pose error up to which it gets near [m]
+STRETCH = 0.02  # pose error up to which the hand gets near [m]
 _LEAN = 0.13  # how much farther sideways a leaning hand reaches [m]
 _MOST_LEAN = 1.0  # largest lean of a hand that the arm cannot hold upright [rad]
 _BLOCKED = 0.1  # error added for a posture in which the robot collides with itself [m]
@@ -47,9 +47,9 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Errors on a grid: how far from each point the downward hand ends [m], (x, y, z).
+    """A grid of points and an error for each: how far from it the downward hand ends up.
 
-    origin: the grid's origin [m], (3,).
+    origin: the grid's first point, (3,) [m]. errors: (x, y, z) [m].
     """
 
     origin: F64
@@ -72,7 +72,7 @@ class Reach:
         return self.origin.tolist()
 
     def error(self, position: Sequence[float] | F64) -> float:
-        """Return how far from `position` (3,) [m] the hand ends [m]; outside the map, plus the distance from it."""
+        """Return how far from `position` (3,) [m] the hand ends up [m], plus its distance from the map if outside."""
         place = (np.asarray(position) - self.origin) / _CELL
         last = np.array(self.errors.shape) - 1
         inside = np.minimum(np.maximum(place, 0.0), last)
@@ -84,7 +84,7 @@ class Reach:
         return float(block[0] + fz * (block[1] - block[0])) + _CELL * float(np.abs(place - inside).max())
 
     def has(self, position: Sequence[float] | F64) -> bool:
-        """Return whether the hand reaches `position` [m], (3,), and the rest of its cell of the map."""
+        """Return whether the hand reaches all corners of the map's cell that contains `position` (3,) [m]."""
         cells, (x, y, z), (first_x, first_y, first_z) = self._arrives, position, self._corner
         x, y, z = (math.floor(at / _CELL) for at in (x - first_x, y - first_y, z - first_z))
         if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
@@ -92,7 +92,7 @@ class Reach:
         return cells[x][y][z]
 
     def has_each(self, points: F64) -> NDArray[np.bool_]:
-        """Return `has` of points (N, 3) [m], (N,)."""
+        """Return `has` for each of N points, (N, 3) [m]; (N,)."""
         index = np.floor((points - self.origin) / _CELL).astype(np.int64)
         last = np.array(self.arrives.shape) - 1
         inside = ((index >= 0) & (index <= last)).all(axis=1)
@@ -109,7 +109,10 @@ class Reach:
         return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
 
     def leaning(self, position: Sequence[float] | F64) -> bool:
-        """Return whether a hand that may lean gets near `position` (3,) [m]: an upright one does farther in."""
+        """Return whether a leaning hand gets near `position` (3,) [m].
+
+        It does if an upright one gets near it, or near the point 13 cm farther in towards the map's middle.
+        """
         if self.nearly(position):
             return True
         (x, y, z), (in_x, in_y, _) = position, (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist()
@@ -166,9 +169,9 @@ def _solve(robot: Robot) -> Reach:
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
-    """Return the pose error at which inverse kinematics ends from home [m], and the joints there, (arm,) [rad].
+    """Return the pose error [m] with which inverse kinematics from home ends, and the joints there, (arm,) [rad].
 
-    The error includes the angle as a length.
+    The error includes the angle, converted to a length.
     """
     yaw, q, (low, high) = ik.ahead(position), np.asarray(robot.home, dtype=np.float64), ik.limits.T
     down, miss = hand_down(yaw), np.inf
@@ -185,7 +188,7 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
 
 
 def _angle_off(robot: Robot, hand: F64, yaw: float, down: F64) -> float:
-    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; if the arm leans, up to `_MOST_LEAN` is free."""
+    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; if the arm leans, it may by `_MOST_LEAN`."""
     if robot.leans:
         return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
     return angle_between(down, hand)

@@ -1,4 +1,4 @@
-"""A robot, an arm with a gripper: its YAML's sections, which use the names in its MJCF."""
+"""A robot, an arm with a gripper, as dataclasses: one per section of its YAML, with the names of its MJCF."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from manip_il.robots.files import ModelFiles, require_lengths
 TABLE_BEYOND = 0.08  # offset of the table's middle from the workspace's middle, away from the robot [m]
 RATE = 20  # default control steps per second
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
-JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
-FOUND = ("home", "gains", "forces", "armature", "ee")  # found on the model if the YAML does not give them
+JOINT_STEP = 0.1  # largest step of a joint target from the measured position [rad]
+FOUND = ("home", "gains", "forces", "armature", "ee")  # found in the model if the YAML does not give them
 YAWS = ("world", "shoulder")
 WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, in the frame `ee` [m]
 
@@ -38,11 +38,11 @@ class EndEffector:
 
 @dataclass(frozen=True)
 class GripperConfig:
-    """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch objects.
+    """The driven joints, their positions when the gripper is closed and open, and the bodies that touch objects.
 
-    finger_mass: replaces every finger's mass [kg]. force: limit of a driven joint, by default 40 N if it slides and
-    10 N m if it turns [N or N m]. files: those of a gripper with a model of its own, whose names begin with `gripper/`;
-    position [m] and quaternion (wxyz): of that model in the hand's body.
+    closed, open: [m] if a joint slides, [rad] if it turns. finger_mass: replaces every finger's mass [kg]. force: limit
+    of a driven joint, by default 40 N if it slides and 10 N m if it turns. files: of the gripper's own model, if it has
+    one, whose names then begin with `gripper/`; position [m] and quaternion (wxyz): where it is in the hand's body.
     """
 
     joints: tuple[str, ...]
@@ -110,7 +110,7 @@ class Costs:
     """Costs of inverse kinematics, relative to 1 per metre of position error.
 
     orientation: per radian of rotation error; leaning: the same for a hand that leans to reach farther; posture: per
-    radian of a joint from home.
+    radian of a joint's distance from home.
     """
 
     orientation: float = 0.2
@@ -135,7 +135,7 @@ class LeRobotConfig:
         checks.name("robot_type", self.robot_type)
 
     def percent(self, joint: F64) -> F64:
-        """Return the gripper's positions, 0 to 100, for those of its driven joint, `joint` [rad]."""
+        """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint [rad]."""
         at_0, at_100 = self.gripper
         return 100 * (joint - at_0) / (at_100 - at_0)
 
@@ -151,8 +151,8 @@ class Robot:
     hand: body that carries the gripper. joints: the arm's, base to hand. home: a posture over the workspace with
     the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest torque [N m] and added inertia
     [kg m^2]. base: position of the root body [m]. fixed: positions of the joints that are neither the arm's nor the
-    gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad].
-    costs: those of inverse kinematics. yaw: zero direction: along the world's x, or away from the shoulder.
+    gripper's [rad or m]. max_joint_step: largest step of a joint target from the measured position [rad]. costs:
+    of inverse kinematics. yaw: where zero yaw points: along the world's x (world) or away from the shoulder (shoulder).
     wrist_camera: name of the model's camera on its hand, or position of an added one in the frame `ee` [m]. cameras:
     poses of the scene's cameras, front and side, that replace the default ones. table: the scene's.
     colours: red, green and blue of meshes without contacts, by patterns of their names; later patterns win. lerobot:

@@ -12,7 +12,7 @@ from manip_il.robots.robot import Robot
 
 
 def rotation_vector(rotation: F64) -> F64:
-    """Return axis times angle [rad], at most pi long, of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,), axis times angle [rad], at most pi long, of a rotation matrix (3, 3)."""
     quaternion, vector = np.empty(4), np.empty(3)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
     mujoco.mju_quat2Vel(vector, quaternion, 1.0)
@@ -34,7 +34,7 @@ def hand_down(yaw: float) -> F64:
 
 
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
-    """Return the zero direction of a hand's yaw, as a yaw in the world [rad]. position, shoulder: (3,) [m]."""
+    """Return the world yaw [rad] that counts as zero for a hand at `position`; shoulder, position: (3,) [m]."""
     return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.faces_ahead else 0.0
 
 
@@ -44,17 +44,17 @@ def angle_ahead(rotation: F64) -> float:
 
 
 def angle_across(rotation: F64) -> float:
-    """Return the yaw of a hand (3, 3) by its fingers' motion, however it leans [rad]."""
+    """Return the yaw [rad] of a hand (3, 3), from its fingers' direction of motion; it may lean."""
     return math.atan2(rotation[0, 1], -rotation[1, 1])
 
 
 def off_yaw(rotation: F64, yaw: float) -> float:
-    """Return how far a hand (3, 3) is from a yaw, however it leans [rad]."""
+    """Return the angle [rad] between `yaw` and the yaw of a hand (3, 3), as in `angle_across`."""
     return abs(math.remainder(angle_across(rotation) - yaw, 2 * math.pi))
 
 
 def angle_off_vertical(rotation: F64) -> float:
-    """Return how far a hand (3, 3) leans from pointing down [rad]."""
+    """Return the angle [rad] by which a hand (3, 3) leans from pointing down."""
     return math.acos(min(1.0, max(-1.0, -float(rotation[2, 2]))))
 
 
@@ -71,13 +71,13 @@ def angle_between(a: F64, b: F64) -> float:
 
 
 def turned_towards(rotation: F64, target: F64, largest: float) -> F64:
-    """Return the rotation (3, 3) at most `largest` [rad] from `rotation` on the shortest way to `target`."""
+    """Return `rotation` (3, 3) turned towards `target` on the shortest way, by at most `largest` [rad]."""
     if angle_between(rotation, target) <= largest:
         return target
     (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation.T.dot(target).tolist()
     axis = zy - yz, xz - zx, yx - xy
     length = math.hypot(*axis)
-    if length < 1e-6:  # half a turn: every axis is equally near
+    if length < 1e-6:  # half a turn, for which this difference is 0: turn about the hand's z
         axis, length = (0.0, 0.0, 1.0), 1.0
     x, y, z = axis
     turn = largest / length

@@ -24,7 +24,7 @@ _FINGER_ARMATURE, _FINGER_DAMPING = 0.2, 10.0  # [kg], [N s/m]
 _LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # for a linkage's joint [kg m^2], [N m s/rad]
 _HINGE_ARMATURE, _HINGE_DAMPING = 0.005, 0.1  # [kg m^2], [N m s/rad]
 WRIST = "wrist"  # the camera on the hand
-_TILT, _FOVY = 0.45, 70.0  # added wrist camera: tilt to the fingertips [rad], vertical field of view [deg]
+_TILT, _FOVY = 0.45, 70.0  # added wrist camera: tilt towards the fingertips [rad], vertical field of view [deg]
 _OF_A_SCENE = ("fusestatic", "discardvisual", "settotalmass", "alignfree", "saveinertial")  # compiler options
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -57,7 +57,7 @@ def _to_radians(spec: mujoco.MjSpec) -> None:
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
-    """Return a robot's model with its gripper's attached to its hand, without what belongs to a scene.
+    """Return a robot's model without what belongs to a scene; a gripper with its own model is attached to the hand.
 
     robot: its name. camera: name of the camera on the hand, kept as `wrist`.
     Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is missing.
@@ -95,9 +95,9 @@ def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig)
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
-    """Return the arm as a spec: position-controlled, with the site `ee`, and nothing else.
+    """Return the arm and gripper as a spec: position-controlled, with the site `ee`, and nothing else.
 
-    Raises `UsageError` naming a joint, body or file that is missing, and those that exist.
+    Raises `UsageError` naming the joint, body or file that is missing, and those that exist.
     """
     camera = robot.wrist_camera if isinstance(robot.wrist_camera, str) else ""
     spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, camera)
@@ -122,11 +122,11 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
 
 
 def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence[float]) -> None:
-    """Add the camera `wrist` to an arm, at a place (3,) [m] in the frame `ee`, tilted to the fingertips.
+    """Add the camera `wrist` to an arm, at a place (3,) [m] in the frame `ee`, tilted towards the fingertips.
 
-    model: the compiled arm. The camera looks along its -z, and its x is the hand's y.
+    model: the compiled arm. The camera looks along its -z, and its x is parallel to the hand's y.
     """
-    rotation, quat, side, site = np.zeros(9), np.zeros(4), np.sign(place[0]), model.site("ee")
+    rotation, quat, side, site = np.zeros(9), np.zeros(4), np.sign(place[0]) or 1.0, model.site("ee")
     mujoco.mju_quat2Mat(rotation, site.quat)
     back = np.array([side * np.sin(_TILT), 0, -np.cos(_TILT)])
     right = np.array([0.0, side, 0.0])
@@ -160,7 +160,7 @@ def model_bytes(model: mujoco.MjModel) -> bytes:
 
 
 def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
-    """Raise `UnknownName` for a name that a model does not have; kind: what it names."""
+    """Raise `UnknownName` for a name that none of the elements `there` has. kind: what they are, such as joint."""
     known = [one.name for one in there if one.name and one.name != "world"]
     for name in names:
         if name not in known:
@@ -203,19 +203,19 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
-    """Move the bodies of joints to where they are if the joints stand at `fixed` [rad or m]."""
+    """Move bodies to where they are when their joints stand at `fixed` [rad or m]."""
     twin = spec.copy()
     model = twin.compile()
     data = mujoco.MjData(model)
     for name, value in fixed.items():
         data.joint(name).qpos[0] = value
-    model.body_parentid[:] = 0  # so that a pose in the world is one in the parent
+    model.body_parentid[:] = 0  # so that kinematics gives poses in the parent's frame
     mujoco.mj_kinematics(model, data)
     for body, there in zip(spec.bodies, twin.bodies, strict=True):
         if not fixed.keys() & {joint.name for joint in body.joints}:
             continue
         place, turn = data.xpos[there.id], data.xmat[there.id].reshape(3, 3)
-        for joint, own in zip(body.joints, there.joints, strict=True):  # kept joints turn about their present place
+        for joint, own in zip(body.joints, there.joints, strict=True):  # kept joints keep axis and anchor
             joint.axis, joint.pos = data.xaxis[own.id] @ turn, (data.xanchor[own.id] - place) @ turn
         body.set_frame(body.parent.add_frame())
         body.pos, body.quat = place, data.xquat[there.id]
@@ -225,7 +225,7 @@ def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
 def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
     """Delete what belongs to a scene: motors, mocap bodies, sky, cameras, gravity and time step.
 
-    hand: what is not in that body's tree also belongs to the scene: a floor, a table, what lies on it.
+    hand: if given, all that is not in this body's tree also belongs to the scene: a floor, a table, what lies on it.
     """
     for one in _foreign(spec, hand, kept):
         spec.delete(one)
@@ -235,13 +235,13 @@ def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
 
 
 def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
-    """Copy physics options from one spec to another; MuJoCo warns if two that it joins differ."""
+    """Copy physics options from one spec to another: MuJoCo warns if two specs that it joins have different ones."""
     for name in [name for name in dir(origin.option) if not name.startswith("_")]:
         setattr(spec.option, name, getattr(origin.option, name))
 
 
 def _foreign(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
-    """Yield what to delete, looked up again after every kind, as MuJoCo also deletes what depends on it."""
+    """Yield what to delete, each kind looked up only in its turn, as MuJoCo also deletes what depends on it."""
     yield from list(spec.keys)
     mocaps = {body.name for body in spec.bodies if body.mocap}
     yield from [equality for equality in spec.equalities if {equality.name1, equality.name2} & mocaps]

@@ -19,10 +19,10 @@ from manip_il.robots.geometry import nearest
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.spec import load
 
-_ARM_GOES_ON = 3  # joints in series, more than a finger has
+_ARM_GOES_ON = 3  # a branch with this many joints in series belongs to the arm: a finger has fewer
 _JAWS = ("jaw", "finger", "grip", "claw")  # words in the name of a single jaw's body or joint
 _HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # words in the name of a gripper's mount
-_REACHES, _HALF = 0.5, 0.18  # the workspace's centre and half width, in lengths of the arm
+_REACHES, _HALF = 0.5, 0.18  # distance of the workspace's centre from the base, and its half width, in arm lengths
 _WIDEST, _HIGHEST = 0.15, 0.45  # largest half width and height of a workspace [m]
 _ROUND = 0.01  # what lengths are rounded to [m]
 _FIRST_LINE = (
@@ -38,9 +38,9 @@ _NOTES = {
 
 
 def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
-    """Inspect an MJCF, and its gripper's if that has one of its own; return a YAML's content without the paths.
+    """Inspect a robot's MJCF, and its gripper's if there is one; return a YAML's content without the paths.
 
-    Raises `UsageError` if MuJoCo cannot read or compile them, or no hand or no fingers are found.
+    Raises `UsageError` if MuJoCo cannot read or compile them, or if no hand or no fingers are found.
     """
     files = [ModelFiles(path.absolute()) for path in (model, gripper) if path is not None]
     spec, with_jaws = load(files[0], model.stem), load(files[-1], model.stem)
@@ -68,7 +68,7 @@ def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
 
 
 def _depth(body: Any) -> int:
-    """Largest number of joints in series from a body on."""
+    """Largest number of joints in series from a body outwards."""
     return len(body.joints) + max((_depth(child) for child in body.bodies), default=0)
 
 
@@ -87,7 +87,7 @@ def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
         return body.parent, [body]
     raise UsageError(
         f"{path}: its joints do not branch into fingers, and its last body, {body.name!r}, is not named like a jaw;"
-        " a gripper with a model of its own is given by --gripper=PATH"
+        " if the gripper has a model of its own, give it with --gripper=PATH"
     )
 
 
@@ -176,7 +176,7 @@ def _rounded(length: float) -> float:
 
 
 def yaml_of(found: Mapping[str, Any], model: str, gripper: str = "") -> str:
-    """Return the YAML of a suggestion, with explanatory comments. model, gripper: paths as the YAML has them."""
+    """Return what `suggest` found as YAML text, with comments. model, gripper: their paths, as written to the YAML."""
     own = {"model": gripper} if gripper else {}
     tree = {"model": model, **found, "gripper": own | found["gripper"]}
     text = yaml.safe_dump(tree, default_flow_style=None, width=math.inf, sort_keys=False)

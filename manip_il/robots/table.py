@@ -1,4 +1,4 @@
-"""Robots by name, from their YAML; what the YAML omits is found on the model."""
+"""Robots by name, from their YAML; what the YAML omits is found in the model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from manip_il.robots.spec import arm_joints
 SUFFIXES = (".yaml", ".yml")
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
 _UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
-GROUP = "manip_il.robots"  # entry points: a name, and the path of a YAML
+GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its YAML
 
 
 def get_robot(name: str) -> Robot:
@@ -51,7 +51,7 @@ def read_robot(path: Path) -> Robot:
         said = _said(path, read_yaml(path, "a robot's YAML"))
         if all(name in said for name in FOUND):
             return Robot(**said)
-        from manip_il.robots.found import complete  # here: shipped YAMLs are complete, and mink is slow to import
+        from manip_il.robots.found import complete  # here: mink is slow to import; shipped YAMLs are complete
 
         return complete(said)
     except ValueError as error:  # MuJoCo's, for a model that it reads but cannot compile

@@ -137,7 +137,7 @@ class Bus:
         while not self._closing.is_set():
             if select.select([self._master], [], [], 0.1)[0]:
                 os.write(self._master, self.feed(os.read(self._master, 4096)))
-            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # except for root
+            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # does not stop root
 
     @property
     def _is_in_use(self) -> bool:

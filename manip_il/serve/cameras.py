@@ -63,7 +63,7 @@ class Cameras:
 
     def _send(self) -> None:
         env = self._station.env
-        self._data.qpos[:], self._data.mocap_pos[:] = self._station.seen
+        self._data.qpos[:], self._data.mocap_pos[:], self._data.mocap_quat[:] = self._station.seen
         self.images = render.pictures(env.scene, self._data, self.config, env.world.variation)
         # RGB is encoded without swapping and the client's `imdecode` does not swap either, so red stays red.
         texts = {name: encode_image(image, _QUALITY) for name, image in self.images.items()}

@@ -66,7 +66,7 @@ class SessionConfig(Seeded):
     servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
-        "solved", "when to draw a new world without a COMMAND: on Enter, or also one second after the task is solved"
+        "solved", "without a COMMAND, when to draw a new world: on Enter, or also one second after the task is solved"
     )
     intervene: float = option(
         0.15,

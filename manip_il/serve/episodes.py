@@ -24,8 +24,8 @@ from manip_il.tasks.envs import env_of
 class ServedEpisodes:
     """Episodes of a station; those to keep are written as journals to a folder, for `manip-il data build`.
 
-    folder: None to write none. seed: of the stream of worlds, as `--seed`; worlds that have a journal there are not
-    drawn again. leader: the function that moves the leader. driver: who moves the follower now.
+    folder: None to write none. seed: of the stream of worlds, as `--seed`; worlds that have a journal in the folder are
+    not drawn again. leader: the function that moves the leader. driver: who moves the follower now.
     """
 
     def __init__(self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover):

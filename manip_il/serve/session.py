@@ -49,8 +49,8 @@ def serve(
     """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
 
     cameras: those to serve; None for none. conditions: how worlds vary. policy: folder of the policy that moves the
-    leader, if any; it must fit the environment and the cameras. trust: whether its models and code may be loaded. say:
-    called with lines for the user. Raises `UsageError` for a robot without Feetech servos or a port that is taken,
+    leader, if any; it must fit environment and cameras. trust: whether the policy's models and code may be loaded.
+    say: called with lines for the user. Raises `UsageError` for a robot without Feetech servos or a port that is taken,
     `MismatchError` for a policy that does not fit, `RenderError` for a window without a display, `ManipError` if the
     program failed.
     """

@@ -110,7 +110,7 @@ class Station:
     def expert(self) -> F64 | None:
         """Return the joints [rad], (n,), to which the expert moves the leader; None if the state has no valid label.
 
-        They exceed the label by the follower's sag and by the offset of its servos.
+        They are the label's joints plus the follower's sag and the offset of its servos.
         """
         label = self._expert.label(self.env.get_state(), self.env.world)
         return self.to_joints(label.action) + self.follower.sag() + self.follower.offset if label.valid else None
@@ -164,7 +164,7 @@ class Station:
     def _show(self) -> None:
         """Update what clients and cameras see."""
         data, state = self.env.data, self.env.get_state()
-        self.seen = data.qpos.copy(), data.mocap_pos.copy()
+        self.seen = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
         with self.buses["follower"].lock:
             self.follower.show()
             self._shown, self._sag = state, self.follower.sag()

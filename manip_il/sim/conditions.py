@@ -1,4 +1,4 @@
-"""Conditions: named ranges of how episodes differ from the nominal world; an episode's seed alone decides its values.
+"""Conditions: named ranges of what may differ from the nominal world; an episode's seed alone decides its values.
 
 The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
 `env.py`, and during the episode by `events.py`.
@@ -57,7 +57,7 @@ _SEEN = (*PICTURED, "picture_delay")
 
 @dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high), both ends included, or single numbers; quantities without a range are nominal.
+    """Ranges (low, high) of the quantities below, both ends included, or single numbers; those not named are nominal.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of its full range.
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
@@ -65,14 +65,14 @@ class Condition:
     joint_noise [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position
     in a policy's observations. delay: control steps by which observations are late. mass [kg], size (edge or width [m])
     and sliding friction of the object. colour: red, green and blue of the object, each from the range; table: the same
-    of the table. joint_damping: factor on the damping of every arm joint; actuator_gain: factor on kp of the arm's
-    actuators, whose kv changes by its square root. posture: largest offset of every joint from home at the start [rad].
+    for the table. joint_damping: factor on the damping of every arm joint; actuator_gain: factor on kp of the arm's
+    actuators, and its square root on kv. posture: largest offset of every joint from home at the start [rad].
     camera_shift [m], camera_turn [deg]: shift and rotation of every camera, in a random direction. brightness: factor
     on every lamp; light_turn: rotation of the lamps about the vertical [deg]. clutter: number of visual objects around
     the workspace. picture_delay: control steps by which only pictures are late.
 
     Raises `UnknownName` for an unknown range, `UsageError` for a range that is empty or out of bounds, `ManipError` for
-    a name that cannot be a file's.
+    a name that cannot be a file name.
     """
 
     name: str
@@ -89,8 +89,8 @@ class Condition:
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
         """Return the condition without the ranges that have no effect; None if none is left.
 
-        has_object, sees: whether the task has an object, the policy has cameras. sizes: object sizes that the task can
-        take [m]; None: only its own.
+        has_object: whether the task has an object. sees: whether the policy has cameras. sizes: object sizes that the
+        task can take [m]; None: only its own.
         Raises `UsageError` if none of the condition's sizes is among them.
         """
         dropped = {*(() if has_object else _OBJECT), *(() if sees else _SEEN), *(() if sizes else ("size",))}
@@ -123,7 +123,7 @@ class Condition:
 
 
 def merged(conditions: Sequence[Condition]) -> Condition:
-    """Return the condition that has the ranges of all, named after them; later ranges override earlier ones."""
+    """Return one condition with the ranges of all, named after all; later ranges override earlier ones."""
     ranges = {name: range_ for condition in conditions for name, range_ in condition.ranges.items()}
     return Condition("_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges)
 

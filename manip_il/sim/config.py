@@ -1,4 +1,4 @@
-"""Settings of episodes and their pictures, without the simulator."""
+"""Settings of episodes and their pictures; importing this module loads no simulator."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 
-DT_SIM = 0.002  # longest step of physics [s]
+DT_SIM = 0.002  # longest physics step [s]
 MOST_HZ = round(1 / DT_SIM)
 
 
@@ -34,7 +34,7 @@ class Episodes:
 
 
 CAMERAS = ("front", "side", "wrist")
-OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # gym-aloha's
+OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # of gym-aloha
 MIN_SIDE, MAX_SIDE = 16, 2048  # sides of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 

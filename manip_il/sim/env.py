@@ -39,7 +39,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends only at the horizon (truncated), so that
     "solved once" and "solved at the end" can both be measured. conditions: how episodes differ from the nominal world;
-    seeds take them in turn, and `drawn` has the current episode's values. `get_state` returns the true state, without
+    they take turns by seed, and `drawn` has the current episode's values. `get_state` returns the true state, without
     the noise and delay of observations.
     render_mode: `rgb_array`, or `human`: `reset` and `step` then update MuJoCo's viewer, in real time.
     Raises `UnknownName` for an unknown camera or render_mode, `UsageError` if the scene cannot be built,
@@ -77,7 +77,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.task = task.name
         limits = np.vstack([self.scene.actions.low, self.scene.actions.high])
         turn = 2 * np.pi if robot.lerobot is None else 360.0
-        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * turn)  # a joint that turns freely
+        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * turn)  # a turn each way for an unlimited joint
         self.action_space = gymnasium.spaces.Box(*limits.astype(np.float32), dtype=np.float32)
         self.observation_space = self._observation_space()
 
@@ -98,7 +98,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def scene(self) -> Scene:
-        """Compiled scene, shared by all environments of a robot and a task."""
+        """Compiled scene, shared by all environments with the same robot, task and physics step."""
         return self.world.scene
 
     @property
@@ -151,9 +151,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             self._streak = 0
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (n,) for one control step; returns it with the events' noise, before clipping.
+        """Apply one action (n,) for one control step; return it as changed by events, before clipping.
 
-        Raises `NotFiniteError`, `MismatchError`.
+        Raises `NotFiniteError` for NaN or infinity, `MismatchError` for a wrong shape.
         """
         world, scene = self.world, self.scene
         executed = self._events.action(action, self._step)
@@ -174,7 +174,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def solved(self) -> bool:
-        """Whether the task is solved: it has been within the tolerance for the required steps in a row."""
+        """Whether the task is solved: it has been within the tolerance for the required number of steps in a row."""
         return self._streak >= self.config.success_steps
 
     @property
@@ -192,11 +192,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return min(1.0, max(0.0, self._task.progress(self.world)))
 
     def get_state(self) -> State:
-        """Return the world's state and the step counts, which `set_state` restores bit for bit; no noise or delays."""
+        """Return the true state of the world and the step counts, which `set_state` restores bit for bit."""
         return State(self.world.physics(), self.world.variation.copy(), self._step, self._streak, self._ever)
 
     def set_state(self, state: State) -> None:
-        """Restore a state of the same scene. Raises `MismatchError` for another scene's."""
+        """Restore a state of the same scene. Raises `MismatchError` for a state of another scene."""
         self.world.restore(state.physics, state.variation)
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
         self._observed.clear()
@@ -278,7 +278,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
 
 def environment_state(world: World) -> F32:
-    """Return the numbers that the task observes, float32 (k,)."""
+    """Return the numbers that the task observes, float32 (k,); lengths in [m]."""
     numbers: list[float] = []  # for few entries a list is faster than numpy
     for value in world.scene.task.observe(world).values():
         numbers += value.tolist() if isinstance(value, np.ndarray) and value.ndim else [float(value)]
@@ -287,7 +287,7 @@ def environment_state(world: World) -> F32:
 
 @once_per_scene
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
-    """Return the names of the k entries of `environment_state`; lengths in [m]."""
+    """Return the names of the k entries of `environment_state`."""
     world, names = World(scene), list[str]()
     world.update()
     for name, value in scene.task.observe(world).items():

@@ -1,6 +1,6 @@
 """Events of an episode: knocks, noise on actions, and one perturbation at a given step.
 
-Functions that change the world do it in place, and draw from the generator that they are given.
+Functions that change the world do so in place, and draw from the generator that they are given.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Kind:
 def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> F64:
     """Return `action` (n,) with Gaussian noise, as in Meta-World's tests of its experts.
 
-    share: the noise's standard deviation as a share of each entry's range: twice the longest step of a joint, the whole
-    opening of the gripper.
+    share: the noise's standard deviation as a share of each entry's range, which is twice the longest step for a joint,
+    and the whole opening for the gripper.
     """
     actions = world.scene.actions
     spread = np.where(actions.relative, 2, 1) * actions.scale
@@ -51,12 +51,12 @@ def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> 
 
 
 def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
-    """Draw an action within one longest joint step of the measured joints, with any gripper opening; (n,)."""
+    """Draw an action (n,): each joint within its longest step from the measured position, any gripper opening."""
     return world.scene.actions.random_near(world.measured, rng)
 
 
 def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
-    """Return the joint step of `action` (n,) mirrored about the measured joints, and the opposite gripper command."""
+    """Return `action` (n,) with each joint's step reversed and the gripper command at the opposite end."""
     actions = world.scene.actions
     low, high = actions.low[actions.gripper], actions.high[actions.gripper]
     opposite = high if action[actions.gripper] < (low + high) / 2 else low
@@ -64,7 +64,7 @@ def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
-    """Put the task's first object at rest at a place within reach, a random distance sideways.
+    """Move the task's first object a random distance sideways, to a place within reach, with zero velocity.
 
     distance: least and greatest [m]. height: how far up it is moved [m]; above 0 it is also turned at random, and
     falls. A place where it overlaps something is drawn again; nothing moves if there is no object or no free place.
@@ -112,7 +112,7 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
 
 
 def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
-    """Return the pairs of geoms that touch, one being the robot's, with False, and again with True if they overlap."""
+    """Return (geom, geom, False) for each contact of the robot, and (geom, geom, True), too, if the geoms overlap."""
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
     roots = model.body_rootid[model.geom_bodyid]
@@ -157,7 +157,7 @@ class Perturbation(Condition):
         vars(self).update(moments=moments)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return the step at which it happens."""
+        """Return kind -> the control step at which it happens in the episode of a seed."""
         return {self.name: self.moments[seed]}
 
 

@@ -21,10 +21,10 @@ _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A closed mesh about its centre of mass: vertices (n, 3) [m], faces (m, 3), volume [m^3].
+    """A closed mesh with its centre of mass at the origin: vertices (n, 3) [m], faces (m, 3), volume [m^3].
 
-    sha256: hash of the file. text: the option's value, with the file's path; stored: the same with the file's name and
-    hash instead, as in datasets.
+    sha256: hash of the file. text: the option's value, with the file's path; stored: the value with the file's name
+    and hash instead, as in datasets.
     """
 
     text: str
@@ -55,13 +55,13 @@ def parse_mesh(text: str) -> Mesh:
 
 
 def mesh_path(text: str) -> str | None:
-    """Return the path in a mesh's text, None for another text."""
+    """Return the path in the text of a mesh, as in `parse_mesh`; None for any other text."""
     found = _TEXT.fullmatch(text)
     return found["path"] if found else None
 
 
 def is_stored(text: str) -> bool:
-    """Return whether a text has a mesh's name and hash, as in datasets, and not its file's path."""
+    """Return whether a text has a mesh file's name and hash, as in datasets, instead of its path."""
     found = _TEXT.fullmatch(text)
     return bool(found and found["hash"])
 

@@ -1,4 +1,4 @@
-"""Named keypoints of a scene: the positions that its task observes, and corners of its boxes."""
+"""Named keypoints of a scene: the positions that its task observes, and the upper corners of its boxes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _CORNERS = 4  # a box's upper corners, which cameras see
 
 
 def points_in(world: World) -> dict[str, F64]:
-    """Return name -> position (3,) [m].
+    """Return the keypoints: name -> position (3,) [m].
 
-    A vector that the task observes is a keypoint if it has the name of a body, geom or site. Corners of a box are
-    numbered by their direction from its centre.
+    A vector that the task observes is a keypoint if it has the name of a body, geom or site. The upper corners of a box
+    are numbered by their direction from its centre, seen from above.
     """
     model = world.scene.model
     found = {

@@ -25,7 +25,7 @@ _ACROSS = (
 )  # rotations that turn z along x, and along y
 _STAND = (0.10, 0.55, 0.28, 1.0)  # the stand's colour
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
-_HALF = (0.012, 0.04)  # range of half a clutter object's lengths, for a workspace as large as Panda's [m]
+_HALF = (0.012, 0.04)  # range of a clutter object's half lengths, for a workspace as large as Panda's [m]
 _USUAL = 0.15  # half width of Panda's workspace [m]
 _BESIDE, _WITHIN = 0.06, 0.24  # least and greatest distance of clutter from the workspace's edge [m]
 _FROM_BASE = 0.18  # least horizontal distance of clutter from the robot's first joint [m]
@@ -42,7 +42,7 @@ class Prop(NamedTuple):
     colour: tuple[float, float, float, float]
 
     def add_to(self, scene: Any) -> None:
-        """Add it to the geoms that MuJoCo draws next."""
+        """Add it to `scene`, MuJoCo's list of geoms to draw next."""
         geom, colour = scene.geoms[scene.ngeom], np.array(self.colour, np.float32)
         mujoco.mjv_initGeom(geom, self.kind, self.size, self.position, self.rotation.ravel(), colour)
         geom.category = mujoco.mjtCatBit.mjCAT_STATIC

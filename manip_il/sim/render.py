@@ -36,8 +36,8 @@ def pictures(
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    variation: the world's (v,), by default the scene's own. A picture's bytes depend only on that, `qpos` and mocap
-    bodies, not on earlier pictures.
+    variation: the world's (v,), by default the scene's own. A picture's bytes depend only on the variation, `qpos`
+    and mocap poses, not on earlier pictures.
     Raises `RenderError`, which says what to unset or install, if there is no off-screen OpenGL.
     """
     renderer = _renderer(scene, cameras.look)
@@ -48,8 +48,8 @@ def pictures(
 def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
     """Return where points (K, 3) of the world [m] are in this process's last `pictures`: name -> (K, 3).
 
-    Columns: position across and down, each from 0 to 1, and 1; all three are 0 for a point outside the picture. A point
-    may be occluded. Raises what `pictures` raises.
+    Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside the picture; one
+    inside may be occluded. Raises what `pictures` raises.
     """
     renderer = _renderer(scene, cameras.look)
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
@@ -58,7 +58,7 @@ def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]
 def framed_picture(
     scene: Scene, data: mujoco.MjData, camera: str | mujoco.MjvCamera, size: tuple[int, int], look: Look
 ) -> Picture:
-    """Return what a scene's or a free camera sees of the physics in `data`, with the axes of `ee` drawn in.
+    """Return what a camera of the scene or a free one sees of the physics in `data`, with the axes of `ee` drawn in.
 
     x is red, y green, z blue. size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures`
     raises.
@@ -120,12 +120,13 @@ class _Renderer:
         self._context: Any = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
-            raise RuntimeError("it has no off-screen buffers")
+            raise RuntimeError("the context has no off-screen buffers")
 
     def pose(self, data: mujoco.MjData, variation: F64) -> None:
         """Take the poses from `data`, and apply the look of a variation (v,)."""
         self._view.apply(variation)
-        self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
+        self._data.qpos[:] = data.qpos
+        self._data.mocap_pos[:], self._data.mocap_quat[:] = data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._props = props(self._of, self._data, part(variation, "clutter"))

@@ -20,11 +20,11 @@ F64 = NDArray[np.float64]
 DEEPEST = 0.035  # depth of the ee site below an object's top at which the palm just clears it [m]
 LEAST_HEIGHT = 0.012  # least height of an object on the table: fingers slip over lower ones [m]
 LEAST_ROOM = 0.002  # least clearance of an open gripper around an object [m]
-_DIRECTIONS = 500  # directions whose outermost points are kept of a finer hull
+_DIRECTIONS = 500  # of a hull with more points, only the outermost in this many directions are kept
 _ALIKE, _COPLANAR = 0.2, 0.01  # angles between sides that count as one, and between faces of one side [rad]
 _FINGER = 0.012  # half a finger's width plus its sideways error [m]
 _LEVEL = 0.004  # spacing of the heights at which widths are measured [m]
-_TIP = 0.001  # height of the lowest of these over the fingertips [m]
+_TIP = 0.001  # height of the lowest of those levels over the fingertips [m]
 _APART = math.radians(25)  # least angle between two grasps [rad]
 _SLOPE = 0.1  # slope of the sides at the fingertips above which the object is grasped as low as possible
 _STEEP = 0.2  # grasps whose slope at the fingertips exceeds the smallest by more than this are dropped
@@ -35,10 +35,10 @@ _ROUND = 0.03  # largest variation of a round object's width, as a share of it
 class Rest(NamedTuple):
     """A side on which an object rests.
 
-    down: unit vector that then points down, (3,). height: of the body's origin over the table [m]; tall: of the object
-    [m]; above: of its top over the grasp [m]. For each of w grasps: across (w, 3), unit vector along the fingers'
-    motion; centre (w, 3), middle between the fingers [m]; sizes: width between them and length across them [m]. fits:
-    the fingers go around it, and it is not too low for them. round: any yaw will do.
+    down: unit vector (3,), in the object's frame, that then points down. Heights [m]: `height` of the body's origin
+    over the table, `tall` of the object, `above` of its top over the grasp. For each of w grasps: across (w, 3), unit
+    vector along the fingers' motion; centre (w, 3), middle between the fingers [m]; sizes: width between them and
+    length across them [m]. fits: whether the fingers go around it, and it is high enough. round: any yaw will do.
     """
 
     down: F64
@@ -55,8 +55,8 @@ class Rest(NamedTuple):
 class Hull:
     """An object's convex hull, and the sides on which it rests, for one gripper.
 
-    extents: lengths of the box about the body's origin that holds it [m]. downs: unit vectors (n, 3) that point down
-    when it rests, one per side; the first is the nearest to down in its modelled orientation.
+    extents: lengths of the box around it, centred on the body's origin [m]. downs: for each side the unit vector that
+    points down when it rests there, (n, 3); the first is the nearest to down in its modelled orientation.
     """
 
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
@@ -69,7 +69,7 @@ class Hull:
         self.extents: tuple[float, float, float] = x, y, z
 
     def rest(self, number: int) -> Rest:
-        """Return how it lies on one of its sides, computed on first use."""
+        """Return how the object rests on the side `downs[number]`, computed on first use."""
         if number not in self._rests:
             self._rests[number] = _rest(self._hull, self._centre, self.downs[number], *self._gripper)
         return self._rests[number]

@@ -30,8 +30,8 @@ _THICK = 0.04  # thickness of the table's top [m]
 SCENES_KEPT = 4  # compiled scenes cached per process: the finest meshes take 64 MB
 _TURN, _SPARE_TURN = 0.1, 0.1  # test rotation of the last joint, to find its direction; margin to its limits [rad]
 SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of the workspace for which `_CAMERAS` are placed [m]
-# Positions from the workspace's middle on the table, height of the point above it that the cameras look at, and
-# vertical field of view.
+# Camera positions, from the workspace's middle on the table; height above it of the point that they look at; vertical
+# field of view.
 _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
 _LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
 _ON_TABLE = 0.02  # a robot stands on the table only if its lowest point is this near to the table's top [m]
@@ -156,7 +156,7 @@ def _check_objects(
     for name in task.grasped:
         if name in hulls:
             width = min(width for width, _ in hulls[name].rest(0).sizes)
-        else:  # the greatest width between fingers from above, on whichever side it lies
+        else:  # the width to grasp from above if it lies on its worst side
             kind, size = int(model.geom_type[objects[name].geom]), model.geom_size[objects[name].geom]
             lengths = variation.extents(kind, size)
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])

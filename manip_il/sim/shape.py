@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 SHORTEST, LONGEST = 0.02, 0.12  # range of an object's lengths [m]
 DEFAULT_WIDTH = 0.05  # if none is given [m]
 LIGHTEST = 0.05  # [kg]: contact with less is soft, and a held object creeps out of the hand
-DENSITY = 800.0  # [kg/m^3]: a cube of 5 cm has 0.1 kg
+DENSITY = 800.0  # [kg/m^3]: a cube of 5 cm weighs 0.1 kg
 _CAPSULE = 1.5  # default length of a capsule, in diameters
 _SIZES = {
     "box": "EDGE or LENGTHxWIDTHxHEIGHT",
@@ -127,7 +127,7 @@ class Shape:
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Range of its greatest length in which it can be grasped however it lies [m]; None if there is none."""
+        """Range of its greatest length [m], when scaled, in which it can be grasped however it lies; None if empty."""
         if self.mesh is not None:
             return None
         least, between, most = sorted(self.lengths)
@@ -161,7 +161,7 @@ ROLLING_MESH = 0.001  # rolling friction of a mesh, which with more would balanc
 
 
 def contact(kind: str) -> tuple[int, float]:
-    """Return MuJoCo's `condim` of an object and its rolling friction [m]."""
+    """Return MuJoCo's `condim` and rolling friction [m] for an object of a kind."""
     if kind == MESH:
         return 6, ROLLING_MESH
     return (4, 0.0001) if kind in ("box", ANY) else (6, ROLLING)

@@ -21,8 +21,8 @@ Observed = Mapping[str, "F64 | float"]
 class Target(NamedTuple):
     """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
 
-    max_step: how far ahead of the hand its target may run [m]; max_turn: the same for its rotation [rad]. exact: do not
-    let the posture cost of inverse kinematics pull the hand off its target by a millimetre, for tighter fits.
+    max_step, max_turn: at most how far towards the pose a single step aims, [m] and [rad]. exact: do not let the
+    posture cost of inverse kinematics pull the hand off its target by a millimetre, for tighter fits.
     lean: how far the hand may lean from its rotation to reach its position, 0 to 1.
     """
 
@@ -37,7 +37,7 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class Rung:
-    """One rung of a ladder. name: the phase; holds: whether the world is in it."""
+    """One rung of a task's ladder. name: the phase; holds: whether the world is in it; target: where to move then."""
 
     name: str
     holds: Callable[[World], bool]
@@ -67,8 +67,8 @@ class Task(Protocol):
     """A task, independent of the arm.
 
     objects: what the arm moves and must reach; events move the first. grasped: those that the gripper must go around.
-    rungs: latest first, the last one holding everywhere; each is a function of the world alone, so that the expert can
-    label any state.
+    rungs: latest phase first; the last rung listed always holds. Each is a function of the world alone, so that the
+    expert can label any state.
     """
 
     @property
@@ -98,12 +98,12 @@ class Task(Protocol):
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Range of an object's longest edge that the task can take [m]; None if only its own."""
+        """Range of an object's longest edge that the task can take [m]; None if it takes only its own object."""
         ...
 
     @property
     def rungs(self) -> tuple[Rung, ...]:
-        """The ladder."""
+        """Rungs of the ladder, latest phase first."""
         ...
 
     def build(self, spec: mujoco.MjSpec) -> None:
@@ -123,30 +123,30 @@ class Task(Protocol):
         ...
 
     def progress(self, world: World) -> float:
-        """Return how much is done, 0 to 1; it never falls while the task is done correctly."""
+        """Return how much of the task is done, 0 to 1; this never falls while the task is done correctly."""
         ...
 
 
 @runtime_checkable
 class Instructing(Protocol):
-    """A task whose text differs between episodes; a mocap body's pose in the state says which text it is."""
+    """A task whose text differs between episodes; a mocap body's pose in the state encodes the text."""
 
     def objects_in(self, world: World) -> tuple[str, ...]:
-        """Return the objects that the text of a world's episode is about, which the arm must reach."""
+        """Return the objects that the text of the world's episode names, which the arm must reach."""
         ...
 
     def instruction_in(self, world: World) -> str:
-        """Return the text of a world's episode."""
+        """Return the text of the world's present episode."""
         ...
 
 
 def instruction_in(task: Task, world: World) -> str:
-    """Return the text of a world's episode: the task's instruction, unless it differs between episodes."""
+    """Return the text of the world's present episode: the task's instruction, unless texts differ between episodes."""
     return task.instruction_in(world) if _instructs(task) else task.instruction
 
 
 def objects_in(task: Task, world: World) -> tuple[str, ...]:
-    """Return the objects that the arm must reach in a world's episode."""
+    """Return the objects that the arm must reach in the world's present episode."""
     return task.objects_in(world) if _instructs(task) else task.objects
 
 
@@ -169,12 +169,12 @@ class TakesArgument(Protocol):
     """A task with variants, called `NAME:ARGUMENT`; the state holds an episode's variant."""
 
     def with_argument(self, text: str) -> Task:
-        """Return the variant that a text describes, named by its numbers: `NAME`, or `NAME:A=NUMBER,B=NUMBER`."""
+        """Return the variant that a text describes; its name is `NAME` or `NAME:A=NUMBER,B=NUMBER`."""
         ...
 
     @property
     def argument_bodies(self) -> tuple[str, ...]:
-        """Mocap bodies whose places encode the variant; they stay when a scene is redrawn."""
+        """Mocap bodies whose places encode the variant; they stay when other places in a scene are drawn anew."""
         ...
 
 
@@ -189,7 +189,7 @@ class Fitting(Protocol):
 
 @runtime_checkable
 class Refusing(Protocol):
-    """A task with states that the expert has no sound label for, besides objects out of reach."""
+    """A task in which, even with the objects within reach, the expert has no sound label for some states."""
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label; empty if there is one."""
@@ -197,7 +197,7 @@ class Refusing(Protocol):
 
 
 def phases(task: Task) -> tuple[str, ...]:
-    """Return the names of a task's phases by number in `expert_phase`: `none`, then the rungs, earliest first."""
+    """Return the names of a task's phases, in the order of `expert_phase`: `none`, then the rungs, earliest first."""
     return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
 
 

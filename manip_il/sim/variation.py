@@ -48,7 +48,7 @@ _STARTS = np.cumsum([0, *map(len, _WORLD.values())]).tolist()
 _PLACES = {name: slice(*ends) for name, *ends in zip(_WORLD, _STARTS[:-1], _STARTS[1:], strict=True)}
 NOTHING_DRAWN = np.concatenate(list(_WORLD.values()))  # the world's numbers, (w,)
 WORLD_SIZE = len(NOTHING_DRAWN)
-# How many numbers older states lack: from before the side camera, and from when only objects were drawn.
+# How many numbers older states lack: those from before the side camera, and those from when only objects were drawn.
 OLDER = (WORLD_SIZE - _PLACES["camera_shift.side"].start, WORLD_SIZE)
 _NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # numbers for how the episode began and how it looks
 
@@ -68,7 +68,7 @@ class Object:
 
 
 def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
-    """Return the variation that a compiled model has, (v,)."""
+    """Return the variation of a model as compiled, (v,)."""
     parts = [
         np.concatenate([model.geom_size[one.geom], [model.body_mass[one.body], model.geom_friction[one.geom, 0]]])
         for one in objects.values()
@@ -84,8 +84,8 @@ def part(variation: F64, name: str) -> F64:
 def completed(variation: F64, like: F64) -> F64:
     """Return a variation (v,) in the current format. like: the scene's own, (v,).
 
-    Older states lack numbers at the end; these were not drawn, or only the data's provenance records them. Raises
-    `MismatchError` for a variation of another length.
+    Older states lack numbers at the end. These get the values of nothing drawn; if something was, only the data's
+    provenance records it. Raises `MismatchError` for a variation of any other length.
     """
     if (lacks := len(like) - len(variation)) in OLDER:
         return np.concatenate([variation, NOTHING_DRAWN[-lacks:]])
@@ -100,10 +100,10 @@ def same_physics(variation: F64, other: F64) -> bool:
 
 
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
-    """Return a variation (v,) with drawn values by the names of `Condition`, in its units; other names change nothing.
+    """Return `base` (v,) with the values in `drawn`, whose names and units are those of `Condition`.
 
-    size is the edge or width [m]; an object of a drawn shape is wooden. camera_shift and camera_turn have a value per
-    camera.
+    Other names change nothing. size is the edge or width [m]; an object of a drawn shape is wooden. camera_shift and
+    camera_turn have a vector (3,) per camera.
     """
     varied = base.copy()
     rows = varied[: len(base) - WORLD_SIZE].reshape(-1, PER_OBJECT)
@@ -125,7 +125,7 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of a variation's objects, (o, 3) [m], and MuJoCo's type of their geoms; None: their own."""
+    """Return `geom_size` of a variation's objects, (o, 3) [m], and the drawn MuJoCo type of their geoms, or None."""
     shape = float(part(variation, "shape")[0])
     sizes = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)[:, _SIZE]
     return sizes, None if shape == _OWN else int(shape)
@@ -183,7 +183,7 @@ def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, sh
 
 
 def extents(kind: int, size: F64) -> F64:
-    """Return the lengths of a geom along its own axes [m], (3,), from MuJoCo's `geom_size`; for a mesh, its box's."""
+    """Return a geom's lengths along its own axes [m], (3,), from MuJoCo's `geom_size`; for a mesh, those of its box."""
     geom = mujoco.mjtGeom
     if kind in (int(geom.mjGEOM_BOX), _MESH):
         return 2 * size

@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
 _CELLS = 22  # grid cells along a mesh's diagonal: enough to look right at 480 x 640 pixels
 _LEAST_CELL = 0.008  # width of a pixel at 128 x 128; less if the cameras are nearer [m]
-_PLAIN_FACES = 1_600  # meshes with up to this many are not simplified
+_PLAIN_FACES = 1_600  # meshes with up to this many faces are not simplified
 _PULL = 0.01  # weight of a cell's mean in its vertex, against that of its faces' planes
 _LEAST_PULL = 1e-12  # [m^2] if a cell has no faces
 _LAMPS = ("light_ambient", "light_diffuse", "light_specular")
@@ -116,7 +116,7 @@ def _with_few_faces(scene: Scene) -> mujoco.MjModel:
 
 
 def simplify_meshes(model: mujoco.MjModel, finest: float) -> None:
-    """Reduce the faces of large meshes in a model that is only drawn. finest: least size of a cell [m]."""
+    """Reduce the faces of large meshes in a model that is only drawn. finest: as in `cluster` [m]."""
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:
             _simplify(model, mesh, finest)
@@ -139,10 +139,10 @@ def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
 
 
 def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple[F64, Indices, Indices]:
-    """Merge vertices (v, 3) that share a cell of a grid into positions (c, 3), original vertices (c,), faces (f, 3).
+    """Merge vertices (v, 3) in each grid cell; return positions (c, 3), indices of originals (c,) and faces (f, 3).
 
-    finest: least size of a cell [m]. The original of a cell is the vertex nearest to its mean; its normal shades a
-    coarse mesh like the fine one.
+    finest: least size of a cell [m]. The original of a cell is the vertex nearest to the mean of its vertices; the
+    original's normal shades the coarse mesh like the fine one.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = max(float(np.linalg.norm(high - low)) / _CELLS, finest)

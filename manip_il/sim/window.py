@@ -24,12 +24,12 @@ from manip_il.sim.world import STATE_KIND, Scene
 
 F64 = NDArray[np.float64]
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
-_LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # initial camera: height [m], [m], [deg]
-_CLOSING = 5.0  # longest time that closing takes [s]
+_LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # initial camera: target's height [m], [m], [deg]
+_CLOSING = 5.0  # longest wait for each of the viewer's threads [s]
 
 
 def has_display() -> bool:
-    """Return whether the environment names a display."""
+    """Return whether an environment variable names a display."""
     return any(os.environ.get(name) for name in DISPLAYS)
 
 
@@ -48,7 +48,7 @@ class Clock:
         self._step, self._due = 1 / hz, 0.0
 
     def wait(self) -> None:
-        """Wait until a control step has passed since the last call returned; not at all if it is late."""
+        """Wait until a control step has passed since the last call returned; return at once if it already has."""
         now = time.monotonic()
         self._due = max(self._due + self._step, now)
         time.sleep(self._due - now)
@@ -81,11 +81,11 @@ class Window:
 
     @property
     def is_open(self) -> bool:
-        """False once the user has closed it."""
+        """Whether the window is open: false once the user has closed it."""
         return self._handle.is_running()
 
     def show(self, data: mujoco.MjData, variation: F64, text: str = "") -> None:
-        """Show `data` in a world of a variation (v,), then wait for real time. text: in the upper left."""
+        """Show `data` in the look of `variation` (v,), then wait for real time. text: shown in the upper left."""
         if not self.is_open:
             return
         with self._handle.lock():

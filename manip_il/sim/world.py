@@ -99,7 +99,7 @@ def once_per_scene[T](compute: Callable[[Scene], T]) -> Callable[[Scene], T]:
 class World:
     """One scene's physics, and what can be read from it by name.
 
-    model and data are replaced as the variation changes: the shared model as compiled, or one of this world's own.
+    model, data: replaced as the variation changes; the model is the scene's shared one or this world's own copy.
     ee: the frame between the fingertips, z out of the hand, y along the fingers' motion. Poses need up-to-date
     kinematics (`update`).
     """
@@ -205,11 +205,11 @@ class World:
         return self.remember("opening", lambda: self.gripper.opening(self.data.qpos))
 
     def ahead(self, position: F64) -> float:
-        """Return the zero direction of the yaw of a hand at a position (3,) [m], as a yaw in the world [rad]."""
+        """Return the world yaw [rad] that counts as zero for a hand at a position (3,) [m]."""
         return yaw_ahead(self.robot, self.data.xanchor[self.scene.shoulder], position)
 
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
-        """Return the turns from `ahead` [rad] that give a hand at a position (3,) [m] a yaw [rad], or one like it.
+        """Return the yaws relative to `ahead` [rad] that bring a hand at a position (3,) [m] to `yaw` or an equivalent.
 
         alike: turn after which the grasp looks the same [rad]. If none is within the arm's range, return the smallest.
         """
@@ -219,7 +219,7 @@ class World:
         return [way for way in ways if low <= way <= high] or [off]
 
     def turned(self, position: F64) -> float:
-        """Return how far the hand is turned from `ahead` at a position (3,) [m]; [rad]."""
+        """Return the hand's yaw [rad] relative to `ahead` at a position (3,) [m]."""
         low, high = self.scene.yaws
         middle = (low + high) / 2 if math.isfinite(low) else 0.0
         return middle + math.remainder(self.hand_yaw - self.ahead(position) - middle, 2 * math.pi)
@@ -231,12 +231,12 @@ class World:
         return angle_across(hand) if self.robot.leans else angle_ahead(hand)
 
     def off_down(self, yaw: float) -> float:
-        """Return the angle from the hand to one that points down at a yaw [rad]; for an arm that leans, in yaw only."""
+        """Return the angle [rad] between the hand and `hand_down(yaw)`; for an arm that leans, in yaw only."""
         hand = self.ee.rotation
         return off_yaw(hand, yaw) if self.robot.leans else angle_from_down(hand, yaw)
 
     def extents(self, name: str) -> tuple[float, ...]:
-        """Return lengths of an object along its own axes x, y and z; a mesh's are those of a box about its origin."""
+        """Return an object's lengths along its own x, y and z [m]; for a mesh, those of a box centred on its origin."""
         return self._shape(name)[1]
 
     def kind(self, name: str) -> int:

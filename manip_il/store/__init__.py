@@ -10,7 +10,7 @@ guarantees, and the tests in `tests/store` for them:
     a pull verifies every hash                               test_bytes_that_differ_are_refused
     nothing is written outside the target folder             test_a_hostile_manifest_is_refused_and_nothing_is_written
     a dataset is checked first, links are not followed       test_a_dataset_is_examined_before_its_push_and_...
-    only known hosts; a mistake is one line                  test_a_mistake_is_one_line
+    unknown hosts are refused; an error is one line          test_a_mistake_is_one_line
     secrets are never printed                                test_no_token_is_said, tests/cli/test_secrets.py
     a card makes no claims about others' work                test_a_datasets_card_says_what_the_hub_reads_and_...
 """

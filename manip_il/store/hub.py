@@ -1,7 +1,8 @@
 """A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
 
-Files keep their paths, so that LeRobot reads them. A push is one commit on top of the one that it read; then the tag
-`v3.0`, by which LeRobot finds datasets, is moved there. The Hub provides sizes and hashes of all files of a commit.
+Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that it compared with;
+then the tag `v3.0`, by which LeRobot finds datasets, is moved there. The Hub provides sizes and hashes of all files of
+a commit.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 class Hub:
-    """A repository at a branch, tag or commit. quiet: show no progress of transfers."""
+    """A repository at a branch, tag or commit. quiet: show no progress bars."""
 
     def __init__(self, address: str, revision: str | None = None, *, private: bool = False, quiet: bool = False):
         """address: the part after `hf://`. Raises `UsageError` if it is invalid."""
@@ -65,7 +66,7 @@ class Hub:
             return Manifest(self.kind, files, head, copies=frozenset(copies if are_equal else ()))
 
     def additions(self, source: Path, local: Mapping[str, Path], folder: Path) -> dict[str, Path]:
-        """Write the card and its picture into `folder`; return them and a run's policy, by paths at the root."""
+        """Write the card and its picture into `folder`; return both, and a run's policy, by path in the repository."""
         from manip_il.store.cards import write_cards  # imported here because no other remote needs matplotlib
 
         added = write_cards(source, self.kind, self._place, folder)
@@ -118,7 +119,7 @@ class Hub:
 
 
 def root_copies(paths: Collection[str]) -> dict[str, str]:
-    """Return the files of a run's policy, name at the root -> path; {} for a policy without a run."""
+    """Return the files of a run's policy to repeat at the root, name -> path; {} for a policy without a run."""
     folder = policy_folder(path for path in paths if path != CONFIG)
     inside = {path.removeprefix(f"{folder}/"): path for path in paths if folder and path.startswith(f"{folder}/")}
     return {name: path for name, path in inside.items() if "/" not in name and name != CARD}

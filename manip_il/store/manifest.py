@@ -61,7 +61,10 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Files by path. version: its id on the remote. copies: a run's policy repeated at the root, not pulled."""
+    """Files by path. version: its id on the remote.
+
+    copies: paths at the root that repeat the files of a run's policy; they are not pulled.
+    """
 
     kind: Kind
     files: Mapping[str, File]
@@ -80,7 +83,7 @@ class Manifest:
 
     @classmethod
     def from_json(cls, data: bytes, version: str) -> Manifest:
-        """Read a manifest that `to_json` wrote. Raises `RemoteError` for anything else."""
+        """Read a manifest that `to_json` wrote. Raises `ManipError` for anything else."""
         table = checks.parse_json("the manifest", data)
         try:
             if table["version"] != 1 or table["kind"] not in ("dataset", "policy"):

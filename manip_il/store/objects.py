@@ -42,7 +42,7 @@ class Sftp(SFTPFileSystem):
     """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only; fsspec's class accepts any host key."""
 
     cachable = False
-    put: Any = fsspec.AbstractFileSystem.put  # fsspec's SFTP class has one that takes only a single file
+    put: Any = fsspec.AbstractFileSystem.put  # that of fsspec's SFTP class takes only a single file
 
     def _connect(self) -> None:
         logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # paramiko also raises the errors that it logs
@@ -72,12 +72,12 @@ class Sftp(SFTPFileSystem):
 
 
 class Objects:
-    """A folder in any file system that fsspec supports. quiet: show no progress."""
+    """A folder in any file system that fsspec supports. quiet: show no progress bars."""
 
     kind: Kind | None = None  # the address does not say which
 
     def __init__(self, scheme: str, url: str, *, quiet: bool = False):
-        """Raises `UsageError` for a scheme without a package, and for an invalid address."""
+        """Raises `UsageError` for an unknown scheme, one whose package is not installed, or an invalid address."""
         self._scheme, self._quiet = scheme, quiet
         self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
         try:
@@ -119,7 +119,7 @@ class Objects:
             self._fs.put(sources, [self._object(key) for key in missing], **how)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
-                    raise RemoteError(f"{plan.local[path]} was modified during the push; push again after that")
+                    raise RemoteError(f"{plan.local[path]} was modified during the push; push again")
             if files != before:
                 self._switch(plan.manifest, plan.before)
                 named = {one.sha256 for one in (*files.values(), *before.values())}

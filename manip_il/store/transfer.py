@@ -53,8 +53,8 @@ def open_remote(url: str, *, revision: str | None = None, private: bool = False,
 def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> PushPlan:
     """Push a folder, or with `dry_run` nothing; return the differences.
 
-    journals: include them. Raises `NotWhole` if a check finds errors in the dataset, or in one of a run's, `UsageError`
-    if a dataset is pushed to a policy's address or vice versa, and `RemoteError`.
+    journals: include them. Raises `NotWhole` if a check finds errors in the dataset, or in a dataset of the run,
+    `UsageError` if a dataset is pushed to a policy's address or vice versa, and `RemoteError`.
     """
     kind: Kind = "dataset" if (source / INFO).is_file() else "policy"
     if kind == "policy" and not any((source / name).exists() for name in _OF_A_RUN):
@@ -66,7 +66,7 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
     for dataset in datasets_in(source):
         if errors := [one for one in examine_folder(dataset) if one.is_error]:
             text = f"{dataset} is damaged and was not pushed: {' '.join(str(errors[0]).split())}"
-            raise NotWhole(f"{text}; see all with manip-il data check, and try manip-il data repair {dataset}")
+            raise NotWhole(f"{text}; see all errors with manip-il data check, and try manip-il data repair {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         local = list_files(source.absolute(), kind, journals=journals)
         if isinstance(remote, Hub):  # other remotes hold the folder unchanged

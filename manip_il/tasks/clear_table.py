@@ -107,7 +107,7 @@ class ClearTable:
         }
 
     def error(self, world: World) -> float:
-        """Return the summed distances of the cubes outside the box from its middle [m]."""
+        """Return the distance from the box's middle, summed over the cubes that are not inside [m]."""
         at = world.pose(BOX).position
         return sum(math.dist(world.pose(name).position, at) for name in _left(world))
 

@@ -64,7 +64,9 @@ def complete(config: EnvConfig) -> EnvConfig:
     if config.horizon > LONGEST_EPISODE:
         raise UsageError(f"horizon is {config.horizon}; expected at most {LONGEST_EPISODE} control steps")
     if config.success_steps < 1 or config.horizon < config.success_steps:
-        raise UsageError(f"horizon is {config.horizon}; expected at least success_steps ({config.success_steps}) >= 1")
+        raise UsageError(
+            f"horizon is {config.horizon}, success_steps {config.success_steps}; expected horizon >= success_steps >= 1"
+        )
     return config
 
 

@@ -70,13 +70,13 @@ class Lie(NamedTuple):
 class Grasp(NamedTuple):
     """An object relative to the hand.
 
-    offset: its centre in the `ee` frame, from the middle between pads that hold it [m]. width, length, half: its size
-    between the fingers and across them, and half its height [m]. settled: it rests on a face, leans on something
-    without moving, or is between the fingers. yaw: the downward hand's yaw to grasp it; angle: the hand's angle to
-    that pose [rad].
+    offset: the place to grasp, in the `ee` frame, from the middle between pads that hold the object [m]. width, length:
+    its size between the fingers and across them [m]; half: height of its top over that place [m]. settled: it rests on
+    a face, leans on something without moving, or is between the fingers. yaw: a downward hand's yaw to grasp it; angle:
+    the hand's angle to that pose [rad].
     at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough: they pass on both
-    sides of it. off: misalignment of the hand, angle included [m]. funnel: height over the object that this requires
-    [m]; height: the same, but at most what clears its top [m]. lean: how much the hand leans to reach it, 0 to 1.
+    sides of it. off: misalignment of the hand, angle included [m]. funnel: height over `at` that `off` requires [m];
+    height: the same, but at most what clears the object's top [m]. lean: how much the hand leans to reach it, 0 to 1.
     """
 
     offset: tuple[float, float, float]
@@ -101,7 +101,7 @@ def is_cube(world: World, name: str) -> bool:
 
 
 def once_per_state[F: Callable[..., Any]](compute: F) -> F:
-    """Return a function of a world, and of names in it, whose result is kept until the world changes."""
+    """Return `compute`, a function of a world and names in it, with each result kept until the world changes."""
 
     @wraps(compute)
     def read(world: World, *names: str) -> Any:
@@ -112,7 +112,7 @@ def once_per_state[F: Callable[..., Any]](compute: F) -> F:
 
 @once_per_state
 def lie_of(world: World, name: str) -> Lie:
-    """Return how an object lies."""
+    """Return the ways to grasp an object as it lies."""
     rotation, hull = world.pose(name).rotation, world.hull(name)
     return _lie(world.kind(name), rotation, world.extents(name)) if hull is None else _hull_lie(hull, rotation)
 

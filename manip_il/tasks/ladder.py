@@ -1,4 +1,4 @@
-"""Rungs that tasks share: how a hand gets around an object, holds it and carries it, as pure geometry of a world.
+"""Rungs that tasks share: how a hand closes around an object, holds it and carries it, as pure geometry of a world.
 
 Within a rung targets are continuous in the state, and the approach is one funnel rather than waypoints: the nearer the
 hand is to being over the object, the lower it may go. Neighbouring states then have neighbouring labels, which a
@@ -40,8 +40,8 @@ _GRASPED = 0.5  # progress of an object that is held
 class LiftProfile(NamedTuple):
     """Height of a carried object over its goal, by the horizontal distance still to go [m].
 
-    most: height far from the goal [m]. slope: height per distance beyond `free`. free: distance without height [m].
-    rise_first: lag below that height at which it only rises [m]. max_step: how far the target is ahead of the hand [m].
+    most: height far from the goal [m]. slope: height per metre beyond `free`, the distance up to which it is 0 [m].
+    rise_first: how far below that height the object only rises [m]. max_step: lead of the target over the hand [m].
     """
 
     most: float = 0.05
@@ -91,7 +91,7 @@ def at_grasp(world: World, name: str) -> bool:
 
 
 def rise_first(at: F64, to: Sequence[float]) -> F64:
-    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if it is far too low."""
+    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far below it."""
     (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
     sideways = min(1.0, max(0.0, 1.0 - (to_z - z) / RISE_FIRST))
     return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
@@ -138,7 +138,7 @@ def let_go(world: World, name: str, height: float) -> Target:
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
     up = world.pose(name).position[2] + height if free else ee.position[2]
     at = np.array([*ee.position[:2], up])
-    if world.gripper.lopsided:  # the fixed jaw also leaves the object
+    if world.gripper.lopsided:  # the fixed jaw must move off the object, too
         along = g.offset[1] + world.gripper.middle(g.width) - world.gripper.middle(g.width + beyond)
         at[:2] += along * ee.rotation[:2, 1]
     return Target(at, hand_down(world.hand_yaw), g.width + beyond)
@@ -213,5 +213,5 @@ def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = CARRY) 
 
 
 def nearness(rest: float) -> float:
-    """Return 1 if at most `AT_GOAL` [m] is left, else less, towards 0 for a long way. rest: distance left [m]."""
+    """Return 1 if at most `AT_GOAL` [m] is left; it falls towards 0 as more is left. rest: distance left [m]."""
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))

@@ -17,17 +17,17 @@ from manip_il.tasks.grasp import OPEN_SLACK, lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 
 PEG, HOLE = "peg", "hole"
-_OPEN_SHARE = 0.85  # share of the gripper's opening beyond the peg, if that is less than the slack
+_OPEN_SHARE = 0.85  # share of the gripper's opening beyond the peg, if that is less than `OPEN_SLACK`
 FROM_END = 0.04  # distance of the grip from the peg's upper end [m]
 LOWEST = 0.024  # least height of the hand over the table at a lying peg [m]
 BACK = 0.05  # a held peg's upper end is the one nearer to a point that is this far behind the hand [m]
 STANDS = 0.4  # tilt below which the peg stands and is grasped from above [rad]
 LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
-LEAN_BY_ROOM = 3.0  # largest lean per distance to the end of the arm's reach, as the wrist is farther out [rad/m]
+LEAN_BY_ROOM = 3.0  # largest lean per distance to the end of the arm's reach: leaning moves the wrist outwards [rad/m]
 AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # errors up to which to close, to keep closing [m]
 AT_ANGLE = 0.25  # [rad]
 OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # height over the grip on approach [m]; per error; tolerated error [m]
-BARE = 0.012  # how far a hand that holds the peg may be from its faces and ends [m]
+BARE = 0.012  # how far outside the peg's faces and ends a hand that holds it may be [m]
 ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
 LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m]; height per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
@@ -62,7 +62,7 @@ class Grip(NamedTuple):
 
 
 def hand_at(yaw: float, pitch: float) -> F64:
-    """Return `ee`'s rotation (3, 3), the hand pointing down at `pitch` 0 and level along `yaw` at pi/2 [rad]."""
+    """Return `ee`'s rotation (3, 3): the hand points down at `pitch` 0, and level, along `yaw`, at pi/2 [rad]."""
     c, s = math.cos(yaw), math.sin(yaw)
     along, up = np.array([c, s, 0.0]), np.array([0.0, 0.0, 1.0])
     z = math.sin(pitch) * along - math.cos(pitch) * up
@@ -100,13 +100,13 @@ def _far_turn(yaw: float, at: float) -> float:
 
 
 def stands(world: World) -> bool:
-    """Return whether the peg stands, or nearly so, and is grasped from above."""
+    """Return whether the peg stands, or nearly so, and is therefore grasped from above."""
     return abs(world.pose(PEG).rotation[2, 2]) > math.cos(STANDS)
 
 
 @once_per_state
 def holds_peg(world: World) -> bool:
-    """Return whether both fingers touch the peg, and the hand is between its faces and its ends."""
+    """Return whether both fingers touch the peg, and the hand is within its faces and ends or just outside them."""
     if not world.touched(PEG):
         return False
     peg = world.pose(PEG)
@@ -155,9 +155,9 @@ def _farthest(scene: Scene) -> float:
 class Way(NamedTuple):
     """Remaining motion of a held peg.
 
-    rotation: of the hand once the peg is upright and, on its way to the hole, aligned with it, (3, 3); turn: rotation
-    vector to it, (3,) [rad]. off: horizontal offset left, (2,) [m]. error: off and turn, as one length [m]. low: height
-    of the peg's lower end over the table once it is upright [m].
+    rotation: the hand's once the peg is upright and, if it goes into the hole, aligned with the hole, (3, 3); turn: the
+    rotation vector left until then, (3,) [rad]. off: horizontal offset left, (2,) [m]. error: off and turn, as one
+    length [m]. low: height of the peg's lower end over the table once the peg is upright [m].
     """
 
     rotation: F64
@@ -176,7 +176,8 @@ class Way(NamedTuple):
 def to_stand(world: World) -> Way:
     """Return the remaining motion of a held peg that must stand on the table first.
 
-    It turns the peg upright by the smallest rotation and the hand to one side, near the middle but not at the hole.
+    The peg turns upright by the smallest rotation, and the hand to one side; the place to stand is near the workspace's
+    middle along x, and away from the hole.
     """
     hand, axis = world.ee.rotation, upper_axis(world)
     upright = _upright(axis) @ hand
@@ -214,7 +215,7 @@ def _free_place(world: World, end: F64) -> F64:
 def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
     """Return the remaining motion if the hand turns with the peg to a rotation (3, 3).
 
-    to: target of the upright peg's lower end, given where that would be, (3,) [m].
+    to: gives the target of the peg's lower end from where the turn alone would bring it, (3,) [m].
     """
     ee, peg = world.ee, world.pose(PEG)
     turn = rotation_vector(rotation @ ee.rotation.T)
@@ -315,7 +316,7 @@ def hangs(world: World) -> bool:
 
 
 def peg_progress(world: World) -> float:
-    """Return progress of gripping a peg from above, 0 to 1, after setting it up if it lies."""
+    """Return progress of gripping a peg from above, 0 to 1; a peg that lies must first be set up."""
     grip = grip_of(world)
     above = float(world.ee.position[2] - grip.position[2])
     if is_up(world):

@@ -61,7 +61,7 @@ class PickPlace:
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, goal, cube and the vectors between them; cosine and sine of four times a cube's yaw."""
+        """Return hand, goal, the object as `observe_object` describes it, and the vectors between them."""
         to_goal = world.goal - world.pose(OBJECT).position
         seen = observe_object(world, OBJECT)
         return {**observe_hand(world), "goal": world.goal, **seen, f"goal_from_{OBJECT}": to_goal}

@@ -32,10 +32,10 @@ ROOM = 0.06  # reachable margin behind the puck at the start [m]
 
 
 class PushStyle(NamedTuple):
-    """Dimensions of a pushing hand. behind: distance at which it starts behind the puck's middle [m].
+    """Dimensions of a pushing hand. behind: how far behind the puck's middle it starts [m].
 
-    opening: that of the fingers across the push, so that the puck rests against both [m]. touching: distance behind the
-    puck's middle at which it touches the puck [m]; lower: value of `LOW_ENOUGH` at the distance `behind` [m].
+    opening: gap between the fingers, so that the puck rests against both [m]. touching: how far behind the puck's
+    middle it touches the puck [m]. lower: what replaces `LOW_ENOUGH` at the distance `behind` [m].
     """
 
     behind: float
@@ -156,7 +156,7 @@ class Push:
         add_goal(spec, flat=True)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the puck, and a goal at a distance from it such that the hand reaches behind the puck."""
+        """Draw the puck, and a goal away from it, placed so that the hand can reach behind the puck."""
         at, height = draw_resting(rng, world, PUCK, ROOM + 0.02), resting_height(world, PUCK)
 
         def fits(goal: F64) -> bool:

@@ -1,4 +1,4 @@
-"""Sort: put the one of three cubes that the instruction names into the bin of its colour."""
+"""Sort: of three cubes, put the one that the instruction names into the bin of its colour."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _place(world: World) -> F64:
 
 
 def _to(world: World) -> F64:
-    """Release point of the named cube, (3,) [m]; shifted off the row of bins until the cube is level with its own."""
+    """Release point of the named cube, (3,) [m]; shifted off the row of bins until the cube is beside its bin."""
     name = asked(world)
     place = _place(world)
     along = abs(place[0] - world.pose(name).position[0])
@@ -169,7 +169,7 @@ class Sort:
     )
 
     def instruction_in(self, world: World) -> str:
-        """Return the sentence of a world's episode."""
+        """Return the instruction of a world's episode."""
         number = round(float(world.pose(ASKED).position[2])) % len(SENTENCES)
         return SENTENCES[number].format(colour=asked(world))
 
@@ -185,7 +185,7 @@ class Sort:
         add_furniture(spec, ASKED).pos = [0, 0, 0]
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the sentence, the bins' side and order, and the cubes, apart and at any yaw."""
+        """Draw which cube is named, the sentence, the bins' side and order, and the cubes, apart and at any yaw."""
         number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
         poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
         (x, y), hand = _middle(world), world.scene.robot.workspace.centre

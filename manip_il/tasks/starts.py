@@ -67,7 +67,7 @@ def draw_resting(rng: np.random.Generator, world: World, name: str, room: float 
 def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
     """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's start.
 
-    room: how far around it the hand reaches, too [m], so that an object that is knocked stays within reach.
+    room: margin around the place that is within reach, too [m], so that an object that is knocked stays within reach.
     """
     space = world.scene.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
@@ -119,7 +119,7 @@ def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World
 def draw_together(
     draw: Callable[[str], F64], names: Iterable[str], fits: Callable[[F64, Sequence[F64]], bool], world: World
 ) -> list[F64]:
-    """Draw one place (3,) [m] per name, each beside the earlier ones; if one does not fit, draw all of them again.
+    """Draw one place (3,) [m] per name, each to fit with the earlier ones; if none is found, draw all of them again.
 
     Raises `UsageError` after a thousand attempts.
     """

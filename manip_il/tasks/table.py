@@ -52,10 +52,10 @@ TASKS: dict[str, Task] = {
 
 
 def get_task(name: str, shape: str = "") -> Task:
-    """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or its Python file, with an object of a shape if given.
+    """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or by the path of its Python file.
 
-    shape: as `Shape.parse` reads it. Raises `UnknownName`, and `UsageError` for a file without a task, and for an
-    argument or a shape that is invalid or that the task does not take.
+    shape: of its object, as `Shape.parse` reads it; empty for the task's own. Raises `UnknownName`; `UsageError` for a
+    file without a task, or for an argument or a shape that is invalid or that the task does not take.
     """
     if name.endswith(SUFFIX):
         task = _of_file(Path(name).absolute())
@@ -67,7 +67,9 @@ def get_task(name: str, shape: str = "") -> Task:
                 raise UsageError(f"task is {name!r}, but only {_who(TakesArgument)} takes an argument after a colon")
             task = task.with_argument(argument)
     if shape and not isinstance(task, TakesShape):
-        raise UsageError(f"object is {shape!r}, but the objects of {name} are fixed; only {_who(TakesShape)} take one")
+        raise UsageError(
+            f"object is {shape!r}, but the objects of {name} are fixed; only {_who(TakesShape)} take others"
+        )
     return _shaped(task, shape) if shape else task
 
 

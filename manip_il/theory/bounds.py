@@ -2,9 +2,9 @@
 
 Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross & Bagnell 2010).
 Theorem 8.2: one that errs in a share eps of its own states loses at most u H eps; u is the largest cost of one wrong
-step if the expert then drives (Ross et al. 2011, Theorem 2.2; stated as H eps, it has u in its constant). Rewards are
-0 to 1 per step. Policies are fitted to trajectories; in states without data they take the worst action, as the theorems
-allow.
+step if the expert then drives (Ross et al. 2011, Theorem 2.2; where the bound is stated as H eps, its constant includes
+u). They are numbered as in the imitation-learning chapter. Rewards are 0 to 1 per step. Policies are fitted to
+trajectories; in states without data they take the worst action, as the theorems allow.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
 ERROR = 0.03  # mean error of a policy times the horizon, small enough that the gap does not saturate
 DRAWS = 16  # training sets drawn at each horizon
-ROUNDS, MORE = 5, 20  # DAgger's rounds; each adds a share 1 / MORE of the first number of trajectories
+ROUNDS, MORE = 5, 20  # DAgger's rounds; each adds 1 / MORE of the initial number of trajectories
 _BOOTSTRAPS = 2_000
 _ROUNDING = 1e-9
 Learner = Literal["cloning", "DAgger"]
@@ -52,7 +52,7 @@ class LossCurve:
 
     @property
     def slope(self) -> float:
-        """Power of the horizon with which gap over error grows."""
+        """Exponent with which gap over error grows with the horizon."""
         return float(self._log_slopes(self.ratios))
 
     @cached_property
@@ -115,9 +115,10 @@ def clone(process: Process, seen: NDArray[np.bool_]) -> F64:
 
 
 def dagger(process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.random.Generator]) -> F64:
-    """Return DAgger's policies (B, H, S), with `count` trajectories per round: the best of all rounds (Definition 8.2).
+    """Return DAgger's policies (B, H, S): those of the round with the fewest errors in its own states (Definition 8.2).
 
-    seen: whether states (B, H, S) have labels from the expert's own trajectories. rngs: see `Process.seen`.
+    seen: whether states (B, H, S) have labels from the expert's own trajectories. count: trajectories per round. rngs:
+    see `Process.seen`.
     """
     best, least = np.empty(seen.shape), np.full(len(seen), np.inf)
     for round_ in range(ROUNDS + 1):

@@ -28,10 +28,10 @@ _LATE = 10  # the growth is measured over this many final steps
 
 @dataclass(frozen=True)
 class Drift:
-    """Distance between a clone's and the expert's states. pole: a; noise: on the demonstrated actions.
+    """Distance between a clone's and the expert's states. pole: the system's a; noise: on demonstrated actions.
 
-    error: root mean square error of its actions in the expert's states; apart: root mean square distance from the
-    expert's states after each step, (STEPS,).
+    error: root mean square error of the clone's actions in the expert's states; apart: root mean square distance from
+    the expert's states after each step, (STEPS,).
     """
 
     pole: float
@@ -55,7 +55,7 @@ def drifts() -> list[Drift]:
 
 
 def _drift(pole: float, noise: float) -> Drift:
-    """The drift of a clone that has one policy per step, as in the theorems, linear between demonstrated states."""
+    """The drift of a clone with one policy per step, as in the theorems, linear between demonstrated states."""
     rng = rng_for(0, f"linear scalar {pole} {noise}")
     now, shown = rng.uniform(-1, 1, DEMONSTRATIONS), list[F64]()
     for _ in range(STEPS):

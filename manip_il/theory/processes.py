@@ -22,8 +22,8 @@ class Process:
     """S states and two actions; the expert always takes `RIGHT`. Rewards are 0 to 1 per step.
 
     words: what a wrong action does. moves: transition probabilities, (2, S, S), uniform over the successors. rewards:
-    (2, S). start: distribution of the first state, (S,). slopes: powers of the horizon with which the gap over the
-    policy's own error grows by the theorems, for cloning and DAgger.
+    (2, S). start: distribution of the first state, (S,). slopes: exponents with which, by the theorems,
+    gap over error grows with the horizon, for cloning and DAgger.
     """
 
     name: str

@@ -78,9 +78,9 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any]) -> Re
     walk, rope = PROCESSES[0].name, PROCESSES[1].name
     return Report(
         title="Theorems on imitation, compared with measurements",
-        verdict="If the expert can recover from a mistake, cloning's gap grows as the horizon to the power of "
-        f"{slopes[walk, 'cloning']:.1f} and DAgger's to the power of {slopes[walk, 'DAgger']:.1f}; on a {rope} both "
-        f"powers are {slopes[rope, 'DAgger']:.1f}.",
+        verdict="If the expert can recover from a mistake, cloning's gap per error grows as the horizon to the power "
+        f"of {slopes[walk, 'cloning']:.1f} and DAgger's to the power of {slopes[walk, 'DAgger']:.1f}; on a {rope} "
+        f"both powers are {slopes[rope, 'DAgger']:.1f}.",
         facts=tuple(facts),
         command=command,
         config=config,
@@ -108,9 +108,9 @@ def _theorems(theory: Theory) -> Section:
         tables=(slope_table(theory),),
         notes=(
             "Log-log slopes of gap over error, with 95 % bootstrap intervals over the draws of data. u is the largest "
-            "cost of one wrong step if the expert then drives. Stated as H ε, the theorem has u in its constant: if no "
-            "recovery is possible, as on the tightrope, u is H, and DAgger loses as much as cloning (Ross et al. 2011; "
-            "Rajaraman et al. 2020).",
+            "cost of one wrong step if the expert then drives. Where the bound is stated as H ε, its constant includes "
+            "u: if no recovery is possible, as on the tightrope, u is H, and DAgger loses as much as cloning (Ross et "
+            "al. 2011; Rajaraman et al. 2020).",
             f"Points: {DRAWS} fits per horizon, to trajectories that leave about {ERROR:g}/H of the states unseen; in "
             "those, a fit takes the worst action.",
         ),
@@ -209,8 +209,8 @@ def _arm(shift: Shift) -> list[Section]:
                 "the expert's states in new episodes.",
                 f"Costs are control steps until success, or {shift.env.horizon} without success; the expert takes "
                 f"{shift.expert_cost:.1f}. u is the largest observed cost of one wrong action for the expert, "
-                f"{shift.u} steps, a lower bound. A bound above the horizon says nothing about this policy: the "
-                "theorem counts every wrong action as the worst one.",
+                f"{shift.u} steps; the true u may be larger. A bound above the horizon says nothing about this policy: "
+                "the theorem counts every wrong action as the worst one.",
             ),
         ),
         Section(

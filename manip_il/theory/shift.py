@@ -49,9 +49,9 @@ class RoundShift:
     """One round's policy. on_expert, on_own: share of the expert's states, and of its own, in which it is wrong.
 
     on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode. distance: median
-    distance of its states to the nearest training state, relative to the expert's. cost, gap: mean cost, and its excess
-    over the expert's [control steps]; bound: Theorem 8.2's bound on the gap, u times `mistakes`. data, hand: positions
-    of the hand in the data and in its rollouts, (N, 3) [m].
+    distance of its states to the nearest training state, relative to that of the expert's states. cost, gap: mean cost,
+    and its excess over the expert's [control steps]; bound: Theorem 8.2's bound on the gap, u times `mistakes`. data,
+    hand: positions of the hand in the training data and in the policy's rollouts, (N, 3) [m].
     """
 
     round: int

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
 from manip_il.data.dataset import Dataset
-from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
+from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, SERVOS, STATE, RobotTaskSpec
 from manip_il.errors import ManipError
 from manip_il.learn import export
 from manip_il.learn.checkpoint import Origin, policy_sha256
@@ -144,6 +144,12 @@ def test_the_metadata_name_every_number_with_its_unit(tmp_path):
     assert [(one["name"], one["dtype"], one["shape"]) for one in (front, wrist)] == [
         (f"{IMAGES}{camera}", "uint8", ["batch", *SIDES, 3]) for camera in ("front", "wrist")
     ]
+
+
+def test_servos_numbers_are_in_their_own_units(tmp_path):
+    servos = replace(sample()[0], action_meaning=SERVOS)
+    told = metadata_in(export_onnx(write_cnn(tmp_path / "cnn", servos, "both"))[0])
+    assert told["outputs"][0]["units"] == ["deg"] * 7 + ["0 to 100"]
 
 
 def test_a_file_that_acts_otherwise_is_refused(spec, tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ CELL = 0.02  # grid spacing, at full scale [m]
 BEYOND = 0.09  # how far the grid extends beyond the workspace's half width, at full scale [m]
 TOP = 0.32  # height of the grid over the table, at full scale [m]
 LIFTED = 0.02  # least height of the object over its resting height, except near the goal [m]
-DOWN = 0.03  # sideways distance from the goal within which it may be lower, at full scale [m]
+DOWN = 0.03  # sideways distance from the goal within which the object may be lower, at full scale [m]
 AHEAD = 3  # how far the descent looks ahead [cells]
 OUTSIDE = 0.12  # largest distance to a node with a path if none is nearby, at full scale [m]
 KEPT = 8  # plans cached per process
@@ -113,7 +113,7 @@ class Grid:
 
     @cached_property
     def problem(self) -> PathProblem:
-        """Edges with the features of straight lines, as inverse reinforcement learning takes them."""
+        """The grid's edges, with features integrated along each, as a problem for inverse reinforcement learning."""
         features = self._integrals(self.layout.densities(self._fine))
         return PathProblem(self._links.edges, features, len(self.points), self.goal)
 
@@ -136,10 +136,10 @@ class Grid:
         return nodes[np.linalg.norm(self.points[nodes] - position, axis=1) < AHEAD * self.cell]
 
     def snap(self, positions: F64) -> I64:
-        """Return the path of free nodes along a path of positions (T, 3) [m], joined by edges, (n,).
+        """Return the free nodes, (n,), joined by edges, that follow a path of positions (T, 3) [m].
 
-        A straight line becomes a path no longer than the grid's shortest. Gaps without free nodes are bridged by the
-        shortest path; a path that ends near the goal is extended to it.
+        Along a straight line their path is no longer than the grid's shortest. Gaps without free nodes are bridged by
+        the shortest path; a path that ends near the goal is extended to it.
         """
         dense = _dense(positions, self.cell / 4)
         index = np.round((dense - self.origin) / self.cell).astype(np.int64).clip(0, np.array(self.shape) - 1)
@@ -178,7 +178,7 @@ def _dense(positions: F64, step: float) -> F64:
 class Descent:
     """Costs-to-go of a grid, and their descent from anywhere.
 
-    costs: (S,); weights: (K,) per metre.
+    costs: of the nodes, (S,); weights: of the features, per metre, (K,).
     """
 
     grid: Grid

@@ -1,7 +1,7 @@
 """Layouts of `carry`, as pure geometry: what stands on the table; and rewards: what a metre of path costs there.
 
 Paths are those of the carried object's centre. Features are densities per metre of path, functions of a point alone;
-for a path of points, or an edge of the grid, they are integrated along it. A reward has a weight for each.
+for a path of points, or an edge of the grid, they are integrated along it. A reward has a weight for each feature.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from manip_il.mdp import F64
 FEATURES = (
     "length",  # 1
     "height",  # height of the object over its resting height, in tenths of a metre
-    "above_vase",  # 1 over it, and within about 2 cm beside it
+    "above_vase",  # 1 over it, 0.4 at 2 cm beside it
     "above_laptop",
     "above_candle",
     "near_vase",  # 1 at it or over it, 0.6 at 8 cm beside it, 0.14 at 16 cm
@@ -63,7 +63,7 @@ class Edge(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Part of the object or the hand: its lowest point from the object's centre, and its radius [m]."""
+    """Part of object or hand: height of its lowest point, and its radius, both from the object's centre [m]."""
 
     bottom: float
     radius: float
@@ -73,9 +73,9 @@ class Part(NamedTuple):
 class Layout:
     """What stands on the table in one episode.
 
-    scale: of all lengths, 1 for a workspace of half width `FULL`. goal: target of the object's centre [m]. places:
-    (x, y) [m] of the obstacles present, by name. edge: None if none is near. half: half the object's height [m]. parts:
-    of object and hand, relative to the object's centre.
+    scale: factor on all lengths, 1 for a workspace of half width `FULL`. goal: target of the object's centre [m].
+    places: (x, y) [m] of the obstacles present, by name. edge: None if none is near. half: half the object's height
+    [m]. parts: of object and hand, relative to the object's centre.
     """
 
     scale: float
@@ -102,7 +102,7 @@ class Layout:
         )
 
     def densities(self, points: F64) -> F64:
-        """Return the features of a metre of path at points (N, 3) [m], (N, K)."""
+        """Return the features per metre of path at points (N, 3) [m], (N, K)."""
         found = np.zeros((len(points), len(FEATURES)))
         found[:, 0] = 1.0
         found[:, 1] = np.maximum(points[:, 2] - self.half, 0.0) / (self.scale * HEIGHT)
@@ -129,7 +129,7 @@ class Layout:
         return found
 
     def is_free(self, start: F64, end: F64, spare: float) -> bool:
-        """Return whether a straight line from (3,) to (3,) [m] keeps room to spare [m]."""
+        """Return whether `room` is at least `spare` [m] all along a straight line from (3,) to (3,) [m]."""
         pieces = max(1, math.ceil(np.linalg.norm(end - start) / (2 * STEP)))
         return bool(self.room(start + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end - start)).min() >= spare)
 
@@ -153,9 +153,9 @@ def path_features(layout: Layout, positions: F64) -> F64:
 
 @dataclass(frozen=True)
 class Reward:
-    """Weights, in the order of `FEATURES`: the cost of a metre of path at which a feature is 1.
+    """Weights, in the order of `FEATURES`: the cost of a metre of path on which that feature is 1.
 
-    Raises `UsageError` for weights that are not finite or below 0, and for a `length` of 0: paths could otherwise have
+    Raises `UsageError` for weights outside 0 to `MOST`, and for a `length` of 0: paths could otherwise have
     any length.
     """
 
@@ -166,11 +166,11 @@ class Reward:
             if not 0 <= weight <= MOST:
                 raise UsageError(f"weight of {name} is {weight:g}; expected 0 to {MOST:g}")
         if not self.weights[0]:
-            raise UsageError("weight of length is 0; expected more, as paths could otherwise have any length")
+            raise UsageError("weight of length is 0; expected more than 0, as paths could otherwise have any length")
 
     @classmethod
     def of(cls, weights: Mapping[str, float]) -> Reward:
-        """Return the reward of weights by name; missing ones are 0. Raises `UnknownName` for any other name."""
+        """Return a reward from weights by feature; those left out are 0. Raises `UnknownName` for any other name."""
         for name in weights:
             if name not in FEATURES:
                 raise UnknownName("feature", name, FEATURES)
@@ -198,7 +198,7 @@ class Reward:
 
     @property
     def numbers(self) -> str:
-        """`NAME=NUMBER,...` of the nonzero weights, exactly."""
+        """The nonzero weights as `NAME=NUMBER,...`, not rounded."""
         pairs = zip(FEATURES, self.weights, strict=True)
         return ",".join(f"{name}={_short(weight)}" for name, weight in pairs if weight)
 

@@ -44,7 +44,7 @@ def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
         body.pos = [0.5, 0, -PARKED]
         half = scale * np.array([*obstacle.half, obstacle.height / 2])
         add_part(body, name, half.tolist(), (0, 0, half[2]), _LID)
-        body.first_geom().rgba = [0, 0, 0, 0]  # its visual geoms lie within
+        body.first_geom().rgba = [0, 0, 0, 0]  # invisible: the visual geoms lie within it
         for kind, (wide, tall), middle, colour in _LOOKS[name]:
             size = half * [wide, wide, 2 * tall]
             _add_look(body, kind, size if kind != "CYLINDER" else size[[0, 2, 2]], middle * 2 * half[2], colour)
@@ -118,7 +118,7 @@ def _numbers(vector: F64) -> tuple[float, float, float]:
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout that an observation describes. name: the object's; seen: `environment_state` by name."""
+    """Return the layout that an observation describes. name: which object; seen: `environment_state` by name."""
 
     def vector(of: str) -> F64:
         return np.array([seen[f"{of}.{axis}"] for axis in "xyz"], dtype=np.float64)
@@ -150,7 +150,7 @@ class Box(NamedTuple):
 
 
 class HandShape(NamedTuple):
-    """The open, downward hand. parts: bottoms and radii about the vertical through `ee`; boxes: upright ones around it.
+    """The open, downward hand. parts: lowest points and radii about the vertical through `ee`; boxes: one per geom.
 
     home: position of `ee` in the arm's home pose, (3,) [m].
     """

@@ -50,14 +50,14 @@ _DRAWS, _TOO_MANY = 4_000, 80  # draws of a start, and draws after which one mor
 _GRASPED = 0.5  # progress of an object that is held
 SPARE = 0.008  # extra clearance at the start and at the goal [m]
 GAP = 0.02  # least gap between two obstacles, at full scale [m]
-BETWEEN, OFF = 0.8, 0.05  # share of obstacles between start and goal, and their standard deviation from that line [m]
+BETWEEN, OFF = 0.8, 0.05  # share of obstacles near the line from start to goal; standard deviation from it [m]
 FROM_EDGE = (0.045, 0.09)  # range of distances from the table's edge to the nearer of start and goal [m]
 TRIES = 40  # draws of an obstacle's place before the layout is drawn again
 _SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # sides that the edge may be on: away from the robot, left, right
 
 
 def descent_of(world: World) -> Descent:
-    """Return the descent of the costs-to-go of a world's episode."""
+    """Return the costs-to-go of a world's episode, and their descent."""
     return descent(layout_of(world, OBJECT), reward_in(world), world.scene.robot)
 
 
@@ -146,7 +146,7 @@ class Carry(PickPlace):
         add_obstacles(spec, self.scale)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw object and goal, one to four obstacles, mostly between the two, and take the task's reward."""
+        """Draw object, goal and one to four obstacles, mostly between the two, and set the task's reward."""
         names = rng.permutation([*OBSTACLES, EDGE]).tolist()
         names = names[: int(rng.integers(1, len(names) + 1))]
         for tried in range(_DRAWS):
@@ -260,7 +260,7 @@ def _draw_place(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> F
 
 
 def _leaves_room(layout: Layout, home: F64, at: F64) -> bool:
-    """Whether the last obstacle leaves room at the start, the goal and the hand's home, and to others and the edge."""
+    """Whether the last obstacle is clear of start, goal and the hand's home, of other obstacles, and of the edge."""
     ends = np.array([at, layout.goal, [*home[:2], max(home[2], layout.half)]])
     if layout.room(ends).min() < SPARE:
         return False

@@ -47,7 +47,7 @@ class StockBase:
         self._begin()
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (n,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
+        """Apply one action (n,) for one control step and return it. Raises `NotFiniteError`, `MismatchError`."""
         _, reward, _, _, info = self._env.step(self.actions.clip(action, self._step))
         solved = bool(info["is_success"])
         self.reward = float(reward)

@@ -51,7 +51,7 @@ class StockEnv(StockBase):
         self._remember()
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (4,) for one control step; returns it. Raises `NotFiniteError`, `MismatchError`."""
+        """Apply one action (4,) for one control step and return it. Raises `NotFiniteError`, `MismatchError`."""
         super().advance(action)
         if self.task.blocked:  # with closed fingers, the environment's step has recomputed all poses
             self._remember()

@@ -40,7 +40,7 @@ def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
     """Raise `UsageError` for cameras that a robot, stock or not, does not have."""
     known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
     if cameras is not None and not known:
-        raise UsageError(f"{robot} has no cameras here ({', '.join(cameras.names)}); omit --cameras")
+        raise UsageError(f"{robot} has no cameras here; omit --cameras={','.join(cameras.names)}")
     require_cameras(cameras, known)
 
 

@@ -1,4 +1,4 @@
-"""Experts of the stock environments: ladders over gripper, cube and goal, latest rung first.
+"""Experts of the stock environments: ladders over gripper, cube and goal, the task's last rung first.
 
 A rung reads the environment. Its target is the gripper's displacement, (3,) [m], and the fingers' command, -1 to 1. An
 action of 1 moves the gripper by about `REACH` in a control step along each axis independently, so that the longest of
@@ -107,7 +107,7 @@ def _is_behind(env: StockEnv) -> bool:
 
 
 def _push(env: StockEnv) -> tuple[F64, float]:
-    """Move at full speed in the cube's direction, and towards the line through cube and goal."""
+    """Move at full speed in the direction to push, and towards the line through cube and goal."""
     direction = _direction(env)
     across = np.array([-direction[1], direction[0]])
     way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (_to_cube(env)[:2] @ across)

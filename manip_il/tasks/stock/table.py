@@ -18,7 +18,7 @@ PHASES = ("none", "approach", "grasp", "carry", "push", "hold")
 
 @dataclass(frozen=True)
 class StockTask:
-    """One environment. has_object: the goal is for a cube, not the gripper; blocked: the fingers stay closed."""
+    """One environment. has_object: the goal is for a cube, not for the gripper; blocked: the fingers stay closed."""
 
     name: str
     instruction: str
@@ -28,7 +28,7 @@ class StockTask:
 
     @property
     def observed(self) -> tuple[str, ...]:
-        """Names of `environment_state`, (k,): the stock observation, then the goal; lengths in [m]."""
+        """Names of the entries of `environment_state`, (k,): the stock observation, then the goal; lengths in [m]."""
         things = ("object", "object_offset") if self.has_object else ()
         turning = ("object_turn", "object_velocity", "object_spin") if self.has_object else ()
         fingers = ("finger.right", "finger.left")
@@ -86,13 +86,13 @@ class AlohaTask:
 
     @property
     def phases(self) -> tuple[str, ...]:
-        """`none`, then every pair of a left and a right hand's rung, in their order."""
+        """`none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, in the order of `rungs`."""
         left, right = (self.rungs[side] for side in SIDES)
         return ("none", *(f"{one}, {other}" for one in left for other in right))
 
     @property
     def observed(self) -> tuple[str, ...]:
-        """Names of `environment_state`, (k,): lengths [m], entries of rotations, and 1 for contacts."""
+        """Names of the entries of `environment_state`, (k,): lengths [m], entries of rotations, and contacts (0, 1)."""
         names = [name for side in SIDES for name in _vectors(f"{side}_ee", f"{side}_ahead", f"{side}_across")]
         for thing in self.objects:
             names += [*_vectors(thing, f"{thing}_ahead", f"{thing}_up"), f"{thing}_on_table"]
@@ -130,7 +130,7 @@ ALOHA_TASKS: dict[str, AlohaTask] = {
 class StockRobot:
     """The environments of one package. fixed: settings of `EnvConfig` that cannot change; horizon: the default.
 
-    cameras: the environment's, the default one first. ends_solved: whether an episode ends once it is solved.
+    cameras: their names, the default one first. ends_solved: whether an episode ends once it is solved.
     """
 
     tasks: Mapping[str, StockTask | AlohaTask]

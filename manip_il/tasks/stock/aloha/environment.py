@@ -102,7 +102,7 @@ class AlohaEnv(StockBase):
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
         """Return a state in which the arms, and untouched objects on the table, may be elsewhere.
 
-        A hand takes along what it carries, or has dropped it. Return None if bodies then overlap.
+        What a hand carries moves with it, or has been dropped. Return None if bodies then overlap.
         """
         self.set_state(state)
         self._env.reset(seed=int(rng.integers(2**32)))

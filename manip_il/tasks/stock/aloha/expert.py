@@ -18,7 +18,7 @@ from manip_il.tasks.stock.base import StockRung
 from manip_il.tasks.stock.table import SIDES
 
 ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
-ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # forearm roll's cost at a straight wrist; its width, wrist up and down [rad]
+ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
 FOREARM_ROLL, WRIST = 3, 4
 MOST_STEP, MOST_TURN = 0.10, 0.5  # largest step of a hand towards its target [m], [rad]
 FALLEN = -0.02  # an object under this height has left the table [m]

@@ -40,9 +40,9 @@ MOST_TURN = 0.3  # largest turn of an object in a step [rad]
 
 @dataclass(frozen=True)
 class Hand:
-    """One hand: its position (3,) [m], axes (ahead, across the fingers, up) (3, 3), half the gap of its fingers [m].
+    """One hand: its position (3,) [m], axes (ahead, across, up) (3, 3), and half the gap between its fingers [m].
 
-    q: joints of its arm, (6,) [rad]. outward: direction of its fingers' opening when it reaches for the table's middle.
+    q: joints of its arm, (6,) [rad]. outward: its axis across, (3,), when it reaches straight for the table's middle.
     """
 
     position: F64
@@ -68,7 +68,7 @@ class Thing:
     def frame(self) -> F64:
         """Axes, the long one first, with the order and signs nearest to the world's, (3, 3).
 
-        The object looks the same in all of these frames.
+        All such frames are equivalent: the object looks the same in each.
         """
         if self.about.long:
             ahead = nearest(self.axes[:, :1], X)
@@ -80,7 +80,7 @@ class Thing:
 
 
 class AlohaScene:
-    """One state. A task's own scene adds the facts that its rungs need."""
+    """Hands, objects and contacts in one state. A task's own subclass adds the facts that its rungs need."""
 
     def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
         self.task, self._model = task, model
@@ -118,7 +118,7 @@ class AlohaScene:
         return all(self.touches(side, name)) or (thing.position[2] > LIFTED and hand.gap < thing.about.open + SLACK)
 
     def is_at_grasp(self, side: str, name: str, rotation: F64) -> bool:
-        """Return whether a hand may close, or keep closing, on an object in a grasp's rotation (3, 3)."""
+        """Return whether a hand may close, or keep closing, on an object. rotation: the grasp's, (3, 3)."""
         hand, thing = self.hands[side], self.things[name]
         if hand.gap < thing.about.thin:  # closed beside it: open again
             return False
@@ -153,7 +153,7 @@ def cross(a: F64, b: F64) -> F64:
 
 
 def nearest(axes: F64, way: F64) -> F64:
-    """Return the column of `axes` (3, c), with its sign, that is nearest to a direction (3,)."""
+    """Return the column of `axes` (3, c), or its negative, that is nearest to a direction (3,)."""
     along = way @ axes
     best = int(np.abs(along).argmax())
     return axes[:, best] * math.copysign(1.0, along[best])
@@ -196,7 +196,7 @@ class HandTarget(NamedTuple):
 
 
 def close_on(scene: AlohaScene, name: str, rotation: F64, longest: float = FAST) -> HandTarget:
-    """Close the fingers at the object, in a grasp's rotation (3, 3)."""
+    """Close the fingers at the object. rotation: the grasp's, (3, 3)."""
     return HandTarget(scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest)
 
 
@@ -205,7 +205,7 @@ def approach(
 ) -> HandTarget:
     """Approach an object with open fingers, in a funnel along the grasp's axis.
 
-    rotation: the grasp's, (3, 3). back: least distance to keep from it [m].
+    rotation: the grasp's, (3, 3). back: least distance to keep from the object [m].
     """
     hand, thing = scene.hands[side], scene.things[name]
     off = rotation.T @ (thing.position - hand.position)
@@ -220,7 +220,7 @@ def approach(
 
 
 def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[StockRung, StockRung]:
-    """Return the rungs of a hand that takes an object from the table. grasp: its rotation in a scene, (3, 3)."""
+    """Return the rungs of a hand that takes an object from the table. grasp: gives the hand's rotation, (3, 3)."""
     return (
         StockRung(
             "grasp", lambda one: one.is_at_grasp(side, name, grasp(one)), lambda one: close_on(one, name, grasp(one))
@@ -230,7 +230,7 @@ def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[Stock
 
 
 def move_object(scene: AlohaScene, side: str, name: str, to: F64, frame: F64, longest: float) -> HandTarget:
-    """Bring a held object to a place (3,) [m] and its `frame` to axes (3, 3)."""
+    """Bring a held object to a place (3,) [m], and turn its `Thing.frame` to `frame` (3, 3)."""
     hand, thing = scene.hands[side], scene.things[name]
     turn = turned_towards(np.eye(3), frame @ thing.frame.T, MOST_TURN)
     return HandTarget(to + turn @ (hand.position - thing.position), turn @ hand.rotation, CLOSED, longest)
