@@ -67,7 +67,9 @@ def run_report(
 
 def compare_report(study: Study, title: str, command: str, config: Mapping[str, Any] | None = None) -> Report:
     """Return the report of a comparison of arms."""
-    colours = arm_colours(study)
+    others = [arm.name for arm in study.arms if arm.name != study.baseline]
+    palette = {name: ARMS[place % len(ARMS)] for place, name in enumerate(others)}
+    colours = {arm.name: palette.get(arm.name, BASELINE) for arm in study.arms}
     first = study.arms[0].members[0].test
     of_arms = tuple(colours.values())
     results, *costs = (replace(table, colours=of_arms) for table in study.tables)
@@ -96,13 +98,6 @@ def compare_report(study: Study, title: str, command: str, config: Mapping[str, 
         config=config or {},
         fingerprint=first.fingerprint,
     )
-
-
-def arm_colours(study: Study) -> dict[str, str]:
-    """Return arm -> colour: grey for the baseline, the palette in order for the others."""
-    others = [arm.name for arm in study.arms if arm.name != study.baseline]
-    found = {name: ARMS[place % len(ARMS)] for place, name in enumerate(others)}
-    return {arm.name: found.get(arm.name, BASELINE) for arm in study.arms}
 
 
 def failures_sections(

@@ -211,8 +211,7 @@ class EvalResult:
         return cls(
             policy=data["policy"],
             robot=str(data["robot"]),
-            # A path is refused, because its file would be run. Older files have the reward as a separate setting.
-            task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
+            task=checks.task_name(data["task"]),  # refuses paths, because they would run code
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
             settings=EvalSettings.from_json(data["settings"]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -142,17 +142,12 @@ class Instructing(Protocol):
 
 def instruction_in(task: Task, world: World) -> str:
     """Return the text of the world's present episode: the task's instruction, unless texts differ between episodes."""
-    return task.instruction_in(world) if _instructs(task) else task.instruction
+    return task.instruction_in(world) if isinstance(task, Instructing) else task.instruction
 
 
 def objects_in(task: Task, world: World) -> tuple[str, ...]:
     """Return the objects that the arm must reach in the world's present episode."""
-    return task.objects_in(world) if _instructs(task) else task.objects
-
-
-def _instructs(task: object) -> TypeGuard[Instructing]:
-    """Twenty times faster than `isinstance`, which for a protocol checks all members on each call."""
-    return hasattr(task, "instruction_in")
+    return task.objects_in(world) if isinstance(task, Instructing) else task.objects
 
 
 @runtime_checkable

@@ -192,7 +192,7 @@ class World:
     @property
     def goal(self) -> F64:
         """Position of the goal marker, (3,) [m]."""
-        return self.data.mocap_pos[self._mocap_goal]
+        return self.pose(GOAL).position
 
     @property
     def measured(self) -> F64:
@@ -297,10 +297,6 @@ class World:
     def reach(self) -> Reach:
         """Map of the points that the downward hand reaches."""
         return reach_of(self.robot)
-
-    @cached_property
-    def _mocap_goal(self) -> int:
-        return int(self._body(GOAL).mocapid[0])
 
     def _body(self, name: str) -> Any:
         try:

@@ -77,12 +77,6 @@ def test_a_file_from_before_there_were_conditions_is_a_nominal_one():
     assert EvalResult.from_json(data).settings == SETTINGS
 
 
-def test_a_file_whose_reward_was_a_setting_has_it_in_the_tasks_name():
-    data = json.loads(json.dumps(result([True], task="carry").to_json()))
-    data["settings"]["reward"] = "length=1,height=3"
-    assert EvalResult.from_json(data).task == "carry:length=1,height=3"
-
-
 def compared(left: EvalResult, right: EvalResult) -> Comparison:
     return Comparison(left.policy, right.policy, ((left, right),))
 

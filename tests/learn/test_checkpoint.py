@@ -185,7 +185,7 @@ def test_every_policy_of_lerobots_is_plain_or_needs_trust(kind):
     if kind in PLAIN:
         require_trust(settings, "x", trust=False)
     else:
-        with pytest.raises(ManipError, match=rf"'{kind}', which loads .*--trust=true"):
+        with pytest.raises(ManipError, match=rf"'{kind}', whose configuration .*--trust=true"):
             require_trust(settings, "x", trust=False)
     require_trust(settings, "x", trust=True)
 
