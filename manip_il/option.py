@@ -8,7 +8,6 @@ from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 from manip_il.errors import UsageError
-from manip_il.seeding import MAX_SEED
 
 
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
@@ -49,4 +48,4 @@ def check_bounds(options: Any, prefix: str = "") -> None:
 class Seeded:
     """Options of everything that draws random numbers."""
 
-    seed: int = option(0, "random seed, 0 to 1000; it shifts every random stream", at_least=0, at_most=MAX_SEED)
+    seed: int = option(0, "random seed, 0 to 1000; it shifts every random stream", at_least=0, at_most=1000)
