@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import getpass
 import multiprocessing
 import os
 import shutil
@@ -27,19 +28,15 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-import boto3
 import huggingface_hub
 import paramiko
 from _machine import describe_machine
 from huggingface_hub.utils import disable_progress_bars
 from s3fs import S3FileSystem
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from store.hub_server import TOKEN, Hub, hub_server, talk_to  # pyright: ignore[reportMissingImports]
-from store.s3 import KEY, SECRET, running_moto, variables  # pyright: ignore[reportMissingImports]
-from store.sshd import Sshd, running_sshd  # pyright: ignore[reportMissingImports]
-
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from manip_il.store.transfer import open_remote, pull, push
+from tests.store.servers import TOKEN, Hub, Sshd, hub_server, s3_server, sshd_server, talk_to
 
 BUCKET = "benchmark"
 
@@ -66,8 +63,8 @@ def main() -> int:
     print(f"store     files            push: {columns}    pull: {columns}")
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="remote_speed_")))
-        os.environ |= variables(stack.enter_context(moto_beside()))
-        server = stack.enter_context(running_sshd(_made(folder / "sshd")))
+        os.environ |= stack.enter_context(moto_beside())
+        server = stack.enter_context(sshd_server(_made(folder / "sshd")))
         os.environ["HOME"] = str(server.home)
         hub = stack.enter_context(hub_server())
         warm = make_tree(folder / "warm", 10, 10_000, "json")
@@ -124,8 +121,8 @@ def show(row: str, turns: list[dict[str, float]]) -> None:
 
 
 @contextlib.contextmanager
-def moto_beside() -> Iterator[str]:
-    """Yield the endpoint of a server in another process; in this one it would compete for Python's global lock."""
+def moto_beside() -> Iterator[dict[str, str]]:
+    """Yield the variables of a server in another process; in this one it would compete for Python's global lock."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     server = context.Process(target=_serve_s3, args=(there,))
@@ -138,15 +135,12 @@ def moto_beside() -> Iterator[str]:
 
 
 def _serve_s3(parent: Connection) -> None:
-    with running_moto() as endpoint:
-        parent.send(endpoint)
+    with s3_server(BUCKET) as variables:
+        parent.send(variables)
         parent.recv()
 
 
 def stores(server: Sshd, hub: Hub) -> list[Store]:
-    client = boto3.client("s3", aws_access_key_id=KEY, aws_secret_access_key=SECRET)
-    client.create_bucket(Bucket=BUCKET)
-
     def s3_put(tree: Path, place: str) -> None:
         S3FileSystem(skip_instance_cache=True).put(str(tree), f"{BUCKET}{place}", recursive=True)
 
@@ -194,7 +188,7 @@ def connected(server: Sshd) -> Iterator[paramiko.SFTPClient]:
     client = paramiko.SSHClient()
     client.load_system_host_keys()
     key = str(server.home.parent / "user_key")
-    client.connect("127.0.0.1", server.port, server.user, key_filename=key)
+    client.connect("127.0.0.1", server.port, getpass.getuser(), key_filename=key)
     with client, client.open_sftp() as sftp:
         yield sftp
 
