@@ -156,7 +156,7 @@ class Lockstep(DummyVecEnv):
 
     @override
     def reset(self) -> F32:
-        """Start the episodes; return observations (B, d + 2)."""
+        """Start the episodes; return observations (B, d + 2), see `Unending`."""
         self.executed = []
         return np.asarray(super().reset())
 

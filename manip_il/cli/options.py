@@ -115,7 +115,7 @@ def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
 
 
 def type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
-    """Return the type of one field of a dataclass. Other fields' types may be imported only for type checking."""
+    """Return the type of one field of a dataclass; the names in other fields' types need not exist at run time."""
     home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
     return eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
 

@@ -85,7 +85,7 @@ class Recording:
             for journal, rollout in itertools.chain([first], rollouts):
                 name = f"the journal of seed {rollout.seed}"
                 if journal.spec != about.spec:
-                    raise MismatchError("robot, task or cameras", name, journal.spec, "the first", about.spec)
+                    raise MismatchError("spec (robot, task or cameras)", name, journal.spec, "the first", about.spec)
                 for line in compare_fingerprints(name, journal.fingerprint, "the first", about.fingerprint):
                     _LOG.warning("%s", line)
                 if self._is_full(found, labels):
@@ -176,7 +176,7 @@ def rewrite_columns(
     """Write a dataset to `target` with some columns replaced; video files are copied.
 
     columns: for every episode in stored order, name -> (T,) or (T, d). options: those of `write_dataset`. Raises what
-    `write_dataset` raises, `ManipError` if a column and its episode differ in length.
+    `write_dataset` raises, and `ManipError` if a column and its episode differ in length.
     """
 
     def changed() -> Iterator[tuple[Episode, Films | None]]:

@@ -162,6 +162,6 @@ def ordered_columns(episode: Episode, spec: RobotTaskSpec, without: Collection[s
     """
     table = {key: feature for key, feature in features(spec).items() if key not in without}
     if table.keys() != episode.columns.keys():
-        raise MismatchError("columns", f"seed {episode.seed}", [*episode.columns], "the dataset", [*table])
+        raise MismatchError("list of columns", f"seed {episode.seed}", [*episode.columns], "the dataset", [*table])
     columns = {key: episode.columns[key] for key in table}
     return {key: one.reshape(-1) if table[key]["shape"] == (1,) else one for key, one in columns.items()}

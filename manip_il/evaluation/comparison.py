@@ -81,7 +81,7 @@ class Comparison:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """(low, high) of `difference`: Newcombe's for one training seed, Student's over training seeds for more."""
+        """(low, high) of `difference`: Newcombe's interval for one training seed, Student's for two or more."""
         if len(self.pairs) == 1:
             return self.pairs[0].interval
         return mean_interval([pair.difference for pair in self.pairs])

@@ -126,7 +126,7 @@ class EvalResult:
     """One policy on one robot and task: every episode, and the statistics derived from them.
 
     policy_sha256: hash of its files, empty if it has none. until_width: the interval width at which the evaluation was
-    to stop, so that intervals hold whenever it stops; None if the number of episodes was fixed in advance.
+    to stop (intervals are then valid at any stopping time); None if the number of episodes was fixed in advance.
 
     Raises `ManipError` on construction if there is no episode or a seed occurs twice.
     """

@@ -78,7 +78,7 @@ class Rule:
     """The rule that chooses the round of each run, fixed before any test episode.
 
     checkpoint: the last round, or the one with the highest validation success (the later one if equal). at: `end`
-    allows all rounds, a cost only those that used at most `limit` of it, the largest amount that every run reached.
+    allows all rounds; a cost allows rounds that used at most `limit` of it, the largest amount that every run reached.
     """
 
     checkpoint: Literal["best", "last"] = "best"

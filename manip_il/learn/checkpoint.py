@@ -37,7 +37,7 @@ _MLP_SHAPE = (  # options that define an mlp's architecture
 
 @dataclass(frozen=True)
 class Origin:
-    """Robot, task and data that a policy was trained for, and the options of its fit; `manip_il.json`.
+    """Content of `manip_il.json`: a policy's robot and task, its training data, and the options of its fit.
 
     observation: one of `OBSERVATIONS`. cameras, image_size: those of its training pictures, if any; look: the lighting
     of these pictures, as arguments of `sim.look.Look`, None if unknown. datasets: name, frames and weight of each.

@@ -98,7 +98,7 @@ class CNNConfig(MLPConfig):
 class CNNPolicy(MLPPolicy):
     """LeRobot's policy interface to one `KeypointEncoder` per camera and an `MLPNetwork` on joints and keypoints.
 
-    Batches hold the columns of the mlp's (`observation.environment_state` only if it is an input) and
+    Batches hold the same columns as the mlp's (`observation.environment_state` only if it is an input) and
     `observation.images.<camera>` (B, 3, H, W), from 0 to 1. Pictures that are larger than in training, as those of
     `lerobot-eval` may be, are reduced to that size by averaging.
 

@@ -55,9 +55,9 @@ class Windows:
         return np.searchsorted(self.episodes, self.episodes, side="right") - 1
 
     def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
-        """Return the rows of one column's frames, (B, K), and a padding mask, (B, K), under LeRobot's name.
+        """Return the row numbers of a column's windows, (B, K), and its padding mask, (B, K), as `<column>_is_pad`.
 
-        For a column without a window, return the samples themselves, (B,), and no mask.
+        For a column without a window, return `samples` themselves, (B,), and no mask.
         """
         if key not in self.deltas:
             return samples, {}

@@ -70,7 +70,7 @@ class Preferences:
         place = next((number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None)
         if place is None:
             own = pairs[0].sha256
-            raise MismatchError("pairs (sha256)", str(path), found.pairs[:12], "the file of pairs", own[:12])
+            raise MismatchError("sha256 of the pairs", str(path), found.pairs[:12], "the file of pairs", own[:12])
         before = sum(map(len, pairs[:place]))
         return replace(found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers))
 
@@ -131,7 +131,7 @@ class Teacher:
     def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
         """Return the teacher's answer about every pair. Raises `ManipError` if the sources have no true progress."""
         if clips.progress is None:
-            raise ManipError("the sources have no column progress, which teachers compare by; ask people")
+            raise ManipError("the sources have no progress column, by which teachers compare; use manip-il reward ask")
         returns = clips.progress[clips.rows].sum(-1)
         difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
         mistaken = rng.random(len(returns)) < self.epsilon

@@ -137,7 +137,7 @@ def join_pairs(given: Sequence[Pairs]) -> Pairs:
     first = given[0]
     for other in given[1:]:
         if first.clip != other.clip:
-            raise MismatchError("length", "the first file of pairs", first.clip, "another", other.clip)
+            raise MismatchError("clip length", "the first file of pairs", first.clip, "another", other.clip)
     sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
     joined: list[tuple[Clip, Clip]] = []
     for one in given:

@@ -116,7 +116,7 @@ def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
 def write_weights(path: Path, scores: Scores) -> None:
     """Write the columns that LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse`.
 
-    RA-BC ignores the additional column `score`. Raises `WriteError` if the disk is full or read-only.
+    RA-BC ignores the additional column `score`. Raises `ManipError` if the disk is full or read-only.
     """
     data = scores.data
     steps = np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths)

@@ -40,7 +40,7 @@ _DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: Mapping[str, Any]) -> Robot:
-    """Return the robot of a YAML's fields, the others found in its model. Raises `UsageError` if one is not found."""
+    """Return a robot with a YAML's fields and the rest found in its model. Raises `UsageError` if one is not found."""
     files, names = said["files"], said["joints"]
     spec = bare_spec(said["name"], files, said["hand"], said["gripper"])
     require(said["name"], "joint", names, spec.joints)

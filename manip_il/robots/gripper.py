@@ -34,10 +34,10 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 class Sweep:
     """Measured relation of command and opening.
 
-    shares: how far the fingers are from closed, 0, to open, 1, for commands and measured positions alike; rising, (c,).
-    openings: gaps between the pads there [m], rising, (c,). middles: offsets along the hand's y of the midpoint between
-    the pads [m], (c,); all 0 if both sides move alike. pads: for each finger the indices of its pads among its geoms,
-    nearest to the other finger first; holding: the same for the geoms that may hold an object.
+    shares: how far the fingers are open, 0 to 1, for commands and measured positions alike; rising, (c,).
+    openings: gaps between the pads at these [m], rising, (c,). middles: offsets along the hand's y of the midpoint
+    between the pads [m], (c,); all 0 if both sides move alike. pads: for each finger the indices of its pads among its
+    geoms, nearest to the other finger first; holding: the same for the geoms that may hold an object.
     """
 
     shares: F64

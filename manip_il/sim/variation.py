@@ -84,8 +84,8 @@ def part(variation: F64, name: str) -> F64:
 def completed(variation: F64, like: F64) -> F64:
     """Return a variation (v,) in the current format. like: the scene's own, (v,).
 
-    Older states lack numbers at the end. These get the values of nothing drawn; if something was, only the data's
-    provenance records it. Raises `MismatchError` for a variation of any other length.
+    Older states lack numbers at the end. These get their nominal values; if others were drawn, only the
+    dataset's provenance records them. Raises `MismatchError` for a variation of any other length.
     """
     if (lacks := len(like) - len(variation)) in OLDER:
         return np.concatenate([variation, NOTHING_DRAWN[-lacks:]])

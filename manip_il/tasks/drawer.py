@@ -265,7 +265,7 @@ class Drawer:
         }
 
     def error(self, world: World) -> float:
-        """Return how far the drawer is open, plus the distance from its middle of an object that is not inside [m]."""
+        """Return how far the drawer is open, plus the object's distance from the drawer's middle, 0 inside [m]."""
         missing = 0.0 if is_in_drawer(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))
         return max(0.0, pulled(world)) + missing
 

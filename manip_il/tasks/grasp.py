@@ -74,9 +74,10 @@ class Grasp(NamedTuple):
     its size between the fingers and across them [m]; half: height of its top over that place [m]. settled: it rests on
     a face, leans on something without moving, or is between the fingers. yaw: a downward hand's yaw to grasp it; angle:
     the hand's angle to that pose [rad].
-    at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough: they pass on both
-    sides of it. off: misalignment of the hand, angle included [m]. funnel: height over `at` that `off` requires [m];
-    height: the same, but at most what clears the object's top [m]. lean: how much the hand leans to reach it, 0 to 1.
+    at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough: whether they
+    pass on both sides of it. off: misalignment of the hand, distance and angle as one length [m]. funnel: height over
+    `at` that `off` requires [m]; height: the same, but at most what clears the object's top [m]. lean: how much the
+    hand leans to reach it, 0 to 1.
     """
 
     offset: tuple[float, float, float]

@@ -41,7 +41,7 @@ class LiftProfile(NamedTuple):
     """Height of a carried object over its goal, by the horizontal distance still to go [m].
 
     most: height far from the goal [m]. slope: height per metre beyond `free`, the distance up to which it is 0 [m].
-    rise_first: how far below that height the object only rises [m]. max_step: lead of the target over the hand [m].
+    rise_first: an object this far below that height, or farther, only rises [m]. max_step: see `Target` [m].
     """
 
     most: float = 0.05

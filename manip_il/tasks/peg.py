@@ -48,9 +48,9 @@ IN_AIR, BESIDE = 0.006, 0.045  # least height of a falling peg; largest distance
 class Grip(NamedTuple):
     """Grip that the hand aims for: pose of `ee`, position (3,) [m] and rotation (3, 3).
 
-    off: misalignment of the hand, angle included [m]; angle: between the hand's rotation and this one [rad]; height:
-    distance to keep above the grip, which grows with the misalignment [m]. open_enough: the fingers pass on both sides
-    of the peg.
+    off: misalignment of the hand, distance and angle as one length [m]; angle: between the hand's rotation and this one
+    [rad]; height: distance to keep above the grip, which grows with the misalignment [m]. open_enough: whether the
+    fingers pass on both sides of the peg.
     """
 
     position: F64

@@ -67,7 +67,7 @@ def draw_resting(rng: np.random.Generator, world: World, name: str, room: float 
 def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
     """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's start.
 
-    room: margin around the place that is within reach, too [m], so that an object that is knocked stays within reach.
+    room: margin around the place that must be within reach, too [m], so that a knocked object stays within reach.
     """
     space = world.scene.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)

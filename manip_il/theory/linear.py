@@ -28,10 +28,10 @@ _LATE = 10  # the growth is measured over this many final steps
 
 @dataclass(frozen=True)
 class Drift:
-    """Distance between a clone's and the expert's states. pole: the system's a; noise: on demonstrated actions.
+    """Distance between a clone's and the expert's states. pole: the system's a.
 
-    error: root mean square error of the clone's actions in the expert's states; apart: root mean square distance from
-    the expert's states after each step, (STEPS,).
+    noise: standard deviation of the noise on demonstrated actions. error: root mean square error of the clone's
+    actions in the expert's states; apart: root mean square distance from the expert's states after each step, (STEPS,).
     """
 
     pole: float

@@ -45,7 +45,7 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     assert run(f"reward fit {words}") == 0
     assert "45 answers about 45 pairs" in capsys.readouterr().out
     assert run("reward fit pairs.json c.json --members=3 --output_dir=third") == 1
-    assert "pairs (sha256) differs: c.json has" in capsys.readouterr().err
+    assert "sha256 of the pairs differs: c.json has" in capsys.readouterr().err
 
 
 def test_true_progress_scores_without_a_reward(here, capsys):

@@ -1,4 +1,4 @@
-"""A grid over a layout's free space, its costs-to-go for a reward, and their descent from anywhere.
+"""A grid over a layout's free space, its costs-to-go for a reward, and how to descend them from any position.
 
 The goal is one of the grid's nodes. Features are integrated along the grid's edges as along any path, so that inverse
 reinforcement learning can compare demonstrated paths with those on the grid.
@@ -176,7 +176,7 @@ def _dense(positions: F64, step: float) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Costs-to-go of a grid, and their descent from anywhere.
+    """Costs-to-go of a grid, and how to descend them from any position.
 
     costs: of the nodes, (S,); weights: of the features, per metre, (K,).
     """

@@ -182,7 +182,7 @@ class Carry(PickPlace):
         return "" if leads else "no free path to the goal"
 
     def progress(self, world: World) -> float:
-        """Return progress by the distance to the grasp, then by the cost-to-go over the cost of a metre at the goal."""
+        """Return progress by distance to the grasp, then by cost-to-go divided by the cost of a metre at the goal."""
         if not held(world, OBJECT):
             return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
         if _at_goal(world):
