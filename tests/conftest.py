@@ -47,7 +47,7 @@ IMPORTED_ONCE = [
 forkserver.set_forkserver_preload(IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
 
-LARGE = 1_500_000_000  # of a process [bytes]
+LARGE, VERY_LARGE = 1_000_000_000, 1_500_000_000  # of a process [bytes]
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
 
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
@@ -84,13 +84,13 @@ def _take_back() -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _memory_goes_back(request: pytest.FixtureRequest) -> Iterator[None]:
-    """What a file keeps for its own tests is let go after them, and what the allocator holds of it given back.
+def _caches_are_freed(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Free what a file keeps for its own tests after them.
 
-    Caches of the package and of MuJoCo are kept for the next file unless this process has grown large.
+    Caches of the package and of MuJoCo are kept for the next file unless this process has grown very large.
     """
     yield
-    large = _resident() > LARGE
+    large = _resident() > VERY_LARGE
     modules = [module for name, module in sys.modules.items() if large and name.startswith("manip_il.")]
     for kept in [one for module in (request.module, *modules) for one in vars(module).values()]:
         if isinstance(kept, functools._lru_cache_wrapper):
@@ -100,7 +100,13 @@ def _memory_goes_back(request: pytest.FixtureRequest) -> Iterator[None]:
 
         mujoco.mj_clearCache(mujoco.mj_getCache())  # of compiled meshes
         gc.collect()
-    if _TRIM is not None:
+
+
+@pytest.fixture(autouse=True)
+def _allocator_gives_back() -> Iterator[None]:
+    """Give back what the allocator holds of freed memory: glibc keeps all of it once a large model was freed."""
+    yield
+    if _TRIM is not None and _resident() > LARGE:
         _TRIM(0)
 
 
