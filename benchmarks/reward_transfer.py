@@ -102,7 +102,7 @@ def demonstrate(folder: Path, taste: str, count: int) -> Path:
     kept.mkdir()
     for path in few:
         shutil.copy(path, kept)
-    if len(few) < count or manip_il(["data", "build", str(kept), str(folder / "few"), "--repo_id=benchmark/few"]):
+    if len(few) < count or manip_il(["data", "build", str(kept), str(folder / "few")]):
         raise SystemExit(f"only {len(few)} of {3 * count} layouts have at most {FEW} things, or no dataset was built")
     return folder / "few"
 

@@ -6,11 +6,13 @@ Options are fields of the same classes that the commands use, with the same name
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from manip_il import checks
 from manip_il.algorithms.config import BetaSchedule, RunConfig, check_labels
 from manip_il.algorithms.results import Result
 from manip_il.algorithms.run import Run
@@ -19,9 +21,10 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query
 from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
 from manip_il.collect.workers import Engine
+from manip_il.data.atomic import write_json
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
-from manip_il.errors import FolderExistsError, UsageError
+from manip_il.errors import FolderExistsError, MismatchError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import HOLD, episode_hold
@@ -104,12 +107,14 @@ def dagger(
     """Run DAgger, or another `method`, in a folder; return the results of all rounds, starting with 0 (cloning).
 
     beta, query: as on the command line, such as `"linear:5"` and `"probability:0.1"`. options: other fields of
-    `RunConfig`. A folder with finished rounds is continued. Raises `UsageError` for options that contradict each other.
+    `RunConfig`. A folder with finished rounds is continued; only `rounds` may then be larger. Raises `UsageError` for
+    options that contradict each other, `MismatchError` for others than the folder's.
     """
     options |= {} if beta is None else {"beta": BetaSchedule.parse(beta)}
     options |= {} if query is None else {"query_rule": parse_query(query)}
     config = RunConfig(env=env, fit=fit or FitConfig(), **options)
     check_labels(config)
+    _check_same(output_dir / "settings.json", config)
     with Engine(workers) as engine:
         return list(Run(config, output_dir, engine).results())
 
@@ -141,6 +146,16 @@ def evaluate(
     job = RolloutJob(env, driver, **chosen)
     with Engine(workers) as engine:
         return run_episodes(engine, job, stream_seeds(stream, episodes, seed), str(path or "expert"))
+
+
+def _check_same(path: Path, config: RunConfig) -> None:
+    """Raise `MismatchError` unless the file holds the same options, apart from `rounds`; write it if it is missing."""
+    now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
+    before = checks.read_json(path, "a run's options") if path.is_file() else now
+    for key in now:
+        if before.get(key) != now[key]:
+            raise MismatchError(key, str(path.parent), before.get(key), "this call", now[key])
+    write_json(path, now)
 
 
 def _folder(policy: Policy) -> Path:

@@ -253,7 +253,7 @@ class Run:
         if not here.is_dir():
             with new_folder(here) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
-        job = RolloutJob(self.config.env, PolicyDriver((policy,)), HOLD, label="last")
+        job = RolloutJob(self.config.env, PolicyDriver((here / PRETRAINED_MODEL,)), HOLD, label="last")
         found = self._evaluate(job, here / FILE_NAME, f"iteration {number}")
         if number == best_validation(validations(self.folder)):
             self._keep_best(policy)

@@ -163,7 +163,8 @@ class RedrawOptions(Edit, Varied, Seeded):
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
         with self.open("redrawn", root, -(-self.frames // CHUNK)) as (source, target):
             conditions = varied(self.vary, source.env, sees=True)
-            cameras = self.camera_config(source.env) if self.pictures else None
+            cameras = self.camera_config(source.env)  # refuses environments without cameras, also for states alone
+            cameras = cameras if self.pictures else None
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)
             left = self.frames - info.episodes

@@ -146,6 +146,8 @@ def _report(error: BaseException, words: list[str]) -> int:
         text, code = f"interrupted{f'; {error}' if error.args else ''}", EXIT_INTERRUPTED
     elif isinstance(error, ManipError):
         text, code = f"error: {error}", error.exit_code
+    elif isinstance(error, OSError) and error.strerror and error.filename:
+        text = f"error: {error.strerror}: {error.filename}"
     else:
         text = f"error: {told(error)}; run again with --debug for the traceback"
     print(f"{PROGRAM}: {' '.join(_clean(text, words).split())}", file=sys.stderr, flush=True)

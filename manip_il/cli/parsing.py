@@ -141,6 +141,8 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
             if not rest or rest[0].startswith("--"):
                 raise UsageError(f"--{name} has no value; expected {metavar(kind)}")
             value = rest.pop(0)
+        if name == CONFIG_PATH and name in raw:
+            raise UsageError(f"--{CONFIG_PATH} is given twice; expected one file")
         raw[name] = _Value(option, from_word(kind, value), f"--{name}")
     return raw
 

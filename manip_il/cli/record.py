@@ -13,6 +13,7 @@ from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, 
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
+from manip_il.errors import MismatchError
 from manip_il.evaluation.suites import varied
 from manip_il.option import Seeded, option
 from manip_il.seeding import stream_seeds
@@ -82,6 +83,10 @@ class RecordOptions(Varied, Seeded, Resumable):
         save_options(journals, self)
         video = asdict(VideoConfig(**self.dataset.rgb_encoder)) if job.cameras else {}
         recording = Recording(repo_id, True, count, provenance(job), video)
+        if list_seeds(journals):
+            before, now = (one.provenance.get("vary") for one in (Recording.read(journals), recording))
+            if before != now:
+                raise MismatchError("what --vary draws from", str(journals), before, "the command line", now)
         with Stages(f"every finished episode, in {journals}") as stages, self.engine.open() as engine:
             stages.start(f"record {job.env.robot} {job.env.task}", max(0, count - len(list_seeds(journals))))
             episodes = collect_successes(engine, job, seeds, count, journals, stages.episode)

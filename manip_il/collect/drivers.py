@@ -23,7 +23,7 @@ from manip_il.seeding import rng_for
 if TYPE_CHECKING:
     from manip_il.learn.policy import LearnedPolicy
 
-F32, F64 = NDArray[np.float32], NDArray[np.float64]
+F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

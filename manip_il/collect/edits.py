@@ -66,7 +66,7 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
         raise ManipError(
             f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
-    env = make_config(robot or spec.robot, task or spec.task, object=shape or spec.object)
+    env = make_config(robot or spec.robot, task or spec.task, spec.fps, object=shape or spec.object)
     given = env_spec(env)
     for what in ("robot", "task", "object"):
         if getattr(given, what) != getattr(spec, what):

@@ -167,7 +167,8 @@ def merge_datasets(
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
     options: dict[str, Any] = {"repo_id": repo_id, "fingerprint": own}
     episodes = itertools.chain.from_iterable(map(_with_films, opened))
-    return write_dataset(episodes, root, about.spec, {**(provenance or {}), "merged": sources}, **options)
+    spec = dataclasses.replace(about.spec, video=any(one.spec.video for one in opened))
+    return write_dataset(episodes, root, spec, {**(provenance or {}), "merged": sources}, **options)
 
 
 def rewrite_columns(

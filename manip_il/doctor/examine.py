@@ -111,6 +111,11 @@ def _rebuild(root: Path, kept: Path) -> str:
     if info.episodes < held:
         shutil.rmtree(fresh)
         return f"not rebuilt: {journals.name} holds {info.episodes} episodes, but {held} are still readable"
+    with suppress(ManipError, LookupError):  # if it cannot be read
+        was, now = ((one.spec, one.provenance["seeds"][0]) for one in map(Dataset.open, (root, fresh)))
+        if was != now:
+            shutil.rmtree(fresh)
+            return f"not rebuilt: {journals.name} holds another recording; move it elsewhere"
     root.rename(kept)
     fresh.rename(root)
     return f"rebuilt from {journals.name}: {info.episodes} episodes"

@@ -211,7 +211,8 @@ class EvalResult:
         return cls(
             policy=data["policy"],
             robot=str(data["robot"]),
-            task=checks.task_name(data["task"]),  # refuses paths, because they would run code
+            # Paths are refused because they would run code. The reward was once a setting.
+            task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
             settings=EvalSettings.from_json(data["settings"]),

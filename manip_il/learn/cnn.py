@@ -16,10 +16,18 @@ from lerobot.configs import PreTrainedConfig
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, interpolate
 
-from manip_il.data.dataset import joined_columns
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.lerobot_layout import INDEX
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, KEYPOINTS, LABEL_VALID, STATE
-from manip_il.errors import MismatchError, UsageError
+from manip_il.data.schema import (
+    ACTION,
+    ENVIRONMENT_STATE,
+    IMAGES,
+    KEYPOINTS,
+    LABEL_VALID,
+    STATE,
+    check_same_spec,
+)
+from manip_il.errors import UsageError
 from manip_il.learn.mlp import MLPConfig, MLPPolicy, offsets_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
@@ -79,8 +87,6 @@ class CNNConfig(MLPConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.channels = tuple(self.channels)
-        if self.states and self.action_space == EE_DELTA:
-            raise UsageError(f"policy.states cannot be combined with {EE_DELTA}; expected {JOINT_DELTA}")
         if len(self.channels) < 2 or min(self.channels) < 1:
             raise UsageError(
                 f"policy.channels is {list(self.channels)}; expected at least two layers, of at least one channel each"
@@ -90,6 +96,8 @@ class CNNConfig(MLPConfig):
     def validate_features(self) -> None:
         """Raise unless there are `observation.state`, `action` of the same size, and pictures."""
         super().validate_features()
+        if self.states and self.action_space == EE_DELTA:
+            raise UsageError(f"policy.states cannot be combined with {EE_DELTA}; expected {JOINT_DELTA}")
         if not self.image_features:
             have = ", ".join(self.input_features or {})
             raise UsageError(f"the cnn policy needs pictures (observation.images.*); the inputs are {have}")
@@ -252,6 +260,14 @@ class CNNPolicy(MLPPolicy):
         """Return the columns of the true state, and of the named points' positions if heat maps are trained."""
         return [ENVIRONMENT_STATE, *self._place_columns()]
 
+    @override
+    def _columns(self, config: MLPConfig, dataset_meta: Any) -> Table:
+        if states := cast(CNNConfig, config).states:
+            pictures = self._roots(dataset_meta)[0]
+            found, own = (Dataset.open(Path(root).expanduser()).spec for root in (states, pictures))
+            check_same_spec(states, found, str(pictures), own, ["task"])
+        return super()._columns(config, dataset_meta)
+
     def _place_columns(self) -> list[str]:
         return [key.replace(IMAGES, KEYPOINTS) for key in self.cameras] if self.heatmap_weight else []
 
@@ -263,7 +279,7 @@ class CNNPolicy(MLPPolicy):
             config.privileged_size, config.named_points = sizes
             self._make(config)
         if config.states:
-            self._learn_states(columns, truth, Path(config.states))
+            self._learn_states(columns, truth, Path(config.states).expanduser())
         else:
             super()._learn_columns(columns)
         if truth is not None and config.privileged_size == sizes[0]:  # else the checkpoint is from another task
@@ -277,15 +293,12 @@ class CNNPolicy(MLPPolicy):
     def _learn_states(self, columns: Table, truth: Tensor | None, more: Path) -> None:
         """Compute the action network's statistics from joints and true state, and keep all labelled states.
 
-        more: the dataset of states. Raises `MismatchError` if it is of another task.
+        more: the dataset of states.
         """
         if truth is None:
             raise UsageError("policy.states needs a dataset with observation.environment_state, and aux_weight > 0")
         table = joined_columns([more], [STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID])
-        if (size := table[ENVIRONMENT_STATE].shape[1]) != truth.shape[1]:
-            raise MismatchError(
-                "size of the environment state", str(more), size, "the pictures' dataset", len(truth[0])
-            )
+        table[ENVIRONMENT_STATE] = table[ENVIRONMENT_STATE].reshape(-1, truth.shape[1])
         self._table = tuple(
             torch.cat(
                 [torch.from_numpy(one[key])[torch.from_numpy(valid_frames(one))].float() for one in (columns, table)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, override
 
 import torch
@@ -173,9 +174,14 @@ class MLPPolicy(PreTrainedPolicy):
             )
         wanted = [key for key in (*self.inputs, ACTION, LABEL_VALID, *self._more_columns()) if key not in table]
         if names := [key for key in wanted if key in dataset_meta.features]:
-            roots = getattr(dataset_meta, "roots", ()) or (dataset_meta.root,)
-            table |= joined_columns(roots, [*names, INDEX])
+            table |= joined_columns(self._roots(dataset_meta), [*names, INDEX])
+            for key in names:
+                table[key] = table[key].reshape(len(table[key]), -1)  # as `load_data` does
         return table
+
+    def _roots(self, dataset_meta: Any) -> Sequence[Path]:
+        """Return the folders of the training data."""
+        return getattr(dataset_meta, "roots", ()) or (dataset_meta.root,)
 
     def _more_columns(self) -> Sequence[str]:
         """Return the columns that training needs in addition to the mlp's."""

@@ -70,9 +70,11 @@ def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
 def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the lighting of a dataset's pictures, as arguments of `sim.look.Look`; {} is the default.
 
-    None if unknown: for another program's dataset, or one without pictures.
+    None if unknown: for another program's dataset, one without pictures, or one merged from different ones.
     """
     if "cameras_sha256" not in fingerprint:
         return None
-    rendered = provenance.get("rendered", {}).get("cameras", {})  # `record` always uses the default lighting
-    return dict(rendered.get("look", {}))
+    sources = [one["provenance"] for one in provenance.get("merged", [])] or [provenance]
+    rendered = [one.get("rendered", {}).get("cameras", {}) for one in sources]  # `record` uses the default lighting
+    looks = [dict(one.get("look", {})) for one in rendered]
+    return looks[0] if all(look == looks[0] for look in looks) else None

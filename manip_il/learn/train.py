@@ -132,7 +132,7 @@ class Trainer:
         )
 
     def _build(self, config: PreTrainedConfig, checkpoint: Path | None) -> None:
-        set_seed(self.config.seed)
+        set_seed(self.config.seed % 2**32)  # more is too large for NumPy
         before = checkpoint / PRETRAINED_MODEL if checkpoint is not None else None
         policy = build_policy(config, self.meta, before)
         optimizer, scheduler = make_optimizer_and_scheduler(self.pipeline, policy)
@@ -268,7 +268,7 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
         precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
     if not torch.distributed.is_initialized():  # accelerate keeps the precision of the first fit in a process
         AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
-    ours = policy.type in OWN_SPACE  # their buffers are statistics of the data, which do not change
+    ours = policy.type in OWN_SPACE  # their buffers are equal in every process, but for the cnn's mean error
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,

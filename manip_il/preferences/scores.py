@@ -27,7 +27,7 @@ from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.evaluation.tables import Table
 from manip_il.preferences.frames import Frames
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+F64 = NDArray[np.float64]
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
 LAST = 1.0  # an episode's score is the mean over its last second [s]
 BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it a kept episode may be

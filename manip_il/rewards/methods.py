@@ -46,7 +46,7 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
     return Learnt(method, weights / weights[LENGTH], unknown)
 
 
-def prior_interval(level: float = LEVEL) -> tuple[float, float]:
+def prior_interval() -> tuple[float, float]:
     """Return the prior interval of the ratio of two weights; for exponentials P(ratio < r) = r / (1 + r)."""
-    low, high = (1 - level) / 2, (1 + level) / 2
+    low, high = (1 - LEVEL) / 2, (1 + LEVEL) / 2
     return low / (1 - low), high / (1 - high)

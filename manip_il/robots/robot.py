@@ -133,6 +133,8 @@ class LeRobotConfig:
 
     def __post_init__(self) -> None:
         checks.name("robot_type", self.robot_type)
+        if len(set(self.gripper)) != 2:
+            raise ManipError(f"gripper is {list(self.gripper)}; expected two positions, at 0 and at 100 [rad]")
 
     def percent(self, joint: F64) -> F64:
         """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint [rad]."""

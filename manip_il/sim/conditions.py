@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
@@ -19,7 +18,6 @@ from manip_il.seeding import rng_for
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.shape import KINDS, draws_shape
 
-F64 = NDArray[np.float64]
 Range = tuple[float, float]
 # Limits of each range.
 _BOUNDS: dict[str, Range] = {

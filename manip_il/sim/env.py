@@ -28,7 +28,7 @@ from manip_il.sim.variation import with_drawn
 from manip_il.sim.window import Window, require_display
 from manip_il.sim.world import Scene, World, once_per_scene
 
-F32, F64 = NDArray[np.float32], NDArray[np.float64]
+F32 = NDArray[np.float32]
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 
 

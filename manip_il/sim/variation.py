@@ -167,7 +167,7 @@ def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, sh
     if shape is not None:
         kind, (condim, rolling) = int(GEOMS[shape]), contact(shape)
     like, at, inertia = plain, geom, plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
-    if kind != own or not np.array_equal(size, plain.geom_size[geom]):
+    if kind != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
         like, at = _solid(kind, size, mass), 0
         inertia = like.body_inertia[1]
     if kind != _MESH:

@@ -11,6 +11,7 @@ import contextlib
 import os
 import threading
 import time
+import warnings
 from typing import Any
 
 import mujoco
@@ -34,11 +35,14 @@ def has_display() -> bool:
 
 
 def require_display() -> None:
-    """Raise `RenderError` if there is no display: MuJoCo's viewer would wait forever."""
-    if not has_display():
-        raise RenderError(
-            f'no display: set {" or ".join(DISPLAYS)}, use render_mode="rgb_array", or manip-il view --output=FILE.rrd'
-        )
+    """Raise `RenderError` if no window can be opened: MuJoCo's viewer would end the process, or wait forever."""
+    import glfw  # MuJoCo's own
+
+    with warnings.catch_warnings(action="ignore"):  # glfw warns if there is no display
+        opened = has_display() and glfw.init()
+    if not opened:
+        named = ", ".join(f"{name}={os.environ.get(name, '')}" for name in DISPLAYS)
+        raise RenderError(f'no display: {named}; use render_mode="rgb_array", or manip-il view --output=FILE.rrd')
 
 
 class Clock:

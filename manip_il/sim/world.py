@@ -65,7 +65,7 @@ class Scene:
     yaws: tuple[float, float]
     nominal: F64
     hulls: Mapping[str, Hull]
-    kept: dict[Any, Any] = field(default_factory=dict[Any, Any])  # results of `once_per_scene`
+    kept: dict[Any, Any] = field(default_factory=dict[Any, Any], init=False)  # results of `once_per_scene`
 
     @cached_property
     def state_size(self) -> int:

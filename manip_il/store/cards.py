@@ -21,8 +21,11 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.finding import journals_of
 from manip_il.errors import ManipError
+from manip_il.sim.conditions import NOMINAL
 from manip_il.store.errors import redact
 from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
+from manip_il.tasks import ENV_IDS
+from manip_il.tasks.stock.table import ALOHA
 
 PICTURE = "assets/episodes.png"
 _FRAMES = 6  # per camera
@@ -69,14 +72,32 @@ def policy_facts(root: Path) -> dict[str, Any]:
         raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
     found = {name: root / inside / f"{name}.json" for name in ("config", "manip_il", "train_config")}
     facts = {name: checks.read_json(path, "JSON") if path.is_file() else {} for name, path in found.items()}
-    evaluations = [  # a round's evaluation is not a test, because it chose the policy
-        {**checks.read_json(path, "JSON"), "is_test": not path.parent.name.startswith("round_")}
+    evaluations = [  # of the policy without disturbances; an evaluation that chose it is not a test
+        {**one, "is_test": not path.parent.name.startswith("round_") and path.parent.parent.name != "validation"}
         for path in root.rglob("eval.json")
+        if (one := checks.read_json(path, "JSON")).get("policy") != "expert"
+        and one.get("settings", {}).get("suite", NOMINAL.name) == NOMINAL.name
     ]
     order = ("is_test", "n_episodes", "success_rate")
     facts["evaluation"] = max(evaluations, key=lambda one: [one[key] for key in order], default={})
     fitted_to = Dataset.open(root / "dataset").info if (root / "dataset" / INFO).is_file() else None
-    return {**facts, "is_ours": bool(facts["manip_il"]), "fitted_to": fitted_to, "options": options(root)}
+    words = lerobot_words(facts["manip_il"].get("robot"), facts["manip_il"].get("task") or "")
+    return {
+        **facts,
+        "is_ours": bool(facts["manip_il"]),
+        "lerobot_words": words,
+        "fitted_to": fitted_to,
+        "options": options(root),
+    }
+
+
+def lerobot_words(robot: str | None, task: str) -> list[str]:
+    """Return `lerobot-eval`'s options for a robot and task; [] if they are not built in."""
+    name, colon, argument = task.partition(":")
+    if robot == ALOHA:
+        return ["--env.type=aloha", f"--env.task={task}"]
+    named = next((env_id for env_id, names in ENV_IDS.items() if names == (robot, name)), None)
+    return ["--env.type=manip_il", f"--env.task={named.partition('/')[2]}{colon}{argument}"] if named else []
 
 
 def options(folder: Path) -> str:

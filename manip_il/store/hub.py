@@ -88,7 +88,7 @@ class Hub:
             if self.kind == "dataset" and self._revision in (None, "main"):
                 self._move_tag()
 
-    def fetch(self, manifest: Manifest, paths: list[str], folder: Path) -> None:
+    def fetch(self, manifest: Manifest, folder: Path) -> None:
         """Download a commit's files into `folder`, without checking hashes."""
         left_out = [".*", "*/.*", *(glob.escape(path) for path in (*manifest.copies, MANIFEST_FILE))]
         with explained(f"pull from {self.name}"):

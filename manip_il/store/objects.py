@@ -126,12 +126,12 @@ class Objects:
                 if unused := there.keys() - named:
                     self._fs.rm([self._object(key) for key in unused])
 
-    def fetch(self, manifest: Manifest, paths: list[str], folder: Path) -> None:
+    def fetch(self, manifest: Manifest, folder: Path) -> None:
         """Download objects to the paths of their files in a folder, without checking hashes."""
         with explained(f"pull from {self.name}"):
-            sources = [self._object(manifest.files[path].sha256) for path in paths]
-            how = self._transfer_options("pull", max(manifest.files[path].size for path in paths))
-            self._fs.get(sources, [str(folder / path) for path in paths], **how)
+            sources = [self._object(file.sha256) for file in manifest.files.values()]
+            how = self._transfer_options("pull", max(file.size for file in manifest.files.values()))
+            self._fs.get(sources, [str(folder / path) for path in manifest.files], **how)
 
     def _transfer_options(self, what: str, largest: int) -> dict[str, Any]:
         """Return options of a transfer: a progress bar, and the number of concurrent files."""

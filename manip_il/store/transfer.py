@@ -120,7 +120,7 @@ def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
     files = manifest.files
     for path in files:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-    remote.fetch(manifest, list(files), folder)
+    remote.fetch(manifest, folder)
     with ThreadPoolExecutor() as pool:
         fits = pool.map(lambda path: files[path].fits(folder / path), files)
         wrong = next((path for path, is_right in zip(files, fits, strict=True) if not is_right), None)

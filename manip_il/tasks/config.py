@@ -74,9 +74,10 @@ def _with_task(config: EnvConfig) -> EnvConfig:
     """Canonicalise the object (the default becomes "") and the task's argument; fill in rate and limits."""
     from manip_il.robots.table import get_robot  # imported here: help needs no robot and no simulator
     from manip_il.sim.task import TakesArgument
-    from manip_il.tasks.table import get_task
+    from manip_il.tasks.table import check_unchanged, get_task
 
     task = get_task(config.task)
+    check_unchanged(config.task)
     if isinstance(task, TakesArgument):
         config = replace(config, task=task.name)
     if config.object:

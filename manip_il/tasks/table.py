@@ -58,7 +58,7 @@ def get_task(name: str, shape: str = "") -> Task:
     file without a task, or for an argument or a shape that is invalid or that the task does not take.
     """
     if name.endswith(SUFFIX):
-        task = _of_file(Path(name).absolute())
+        task = _of_file(Path(name).absolute())[0]
     else:
         base, colon, argument = name.partition(":")
         task = _named(base)
@@ -89,6 +89,13 @@ def source_hash(task: Task) -> str:
     return hashlib.sha256(Path(inspect.getfile(type(task))).read_bytes()).hexdigest()
 
 
+def check_unchanged(name: str) -> None:
+    """Raise `UsageError` if a task's file was edited since this process ran it, which it does only once."""
+    path = Path(name).absolute()
+    if name.endswith(SUFFIX) and path.read_bytes() != _of_file(path)[1]:
+        raise UsageError(f"{path} was edited after this process had run it; start Python again")
+
+
 @cache
 def _named(name: str) -> Task:
     if name in TASKS:
@@ -108,15 +115,16 @@ def _entry_point(name: str) -> EntryPoint | None:
 
 
 @cache
-def _of_file(path: Path) -> Task:
-    """Run a file and return its one task."""
+def _of_file(path: Path) -> tuple[Task, bytes]:
+    """Run a file; return its one task and its text."""
     if not path.is_file():
         raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
     name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None  # its suffix is Python's
     assert spec.loader is not None
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look it up there
+    text, module = path.read_bytes(), importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look it up there
     try:
         spec.loader.exec_module(module)
     except Exception as error:
@@ -130,7 +138,7 @@ def _of_file(path: Path) -> Task:
     task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
     if task.name in TASKS:
         raise UsageError(f"{path}: its task has a built-in task's name, {task.name!r}; choose another")
-    return task
+    return task, text
 
 
 def _made(what: str, cls: Any) -> Task:
@@ -139,6 +147,9 @@ def _made(what: str, cls: Any) -> Task:
     try:
         task = cls()
         checks.name("its name", task.name)
+        for member in ("objects", "grasped"):
+            if isinstance(named := getattr(task, member), str):
+                raise UsageError(f"{member} is {named!r}; expected a tuple of names")
     except Exception as error:
         raise UsageError(f"{what}: {checks.one_line(error)}") from error
     return task

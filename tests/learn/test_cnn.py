@@ -13,11 +13,13 @@ from lerobot.optim.optimizers import save_optimizer_state
 from lerobot.policies.factory import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
 
 from manip_il.data.schema import features
-from manip_il.errors import UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.learn import mlp
 from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
+
+from .conftest import write_table
 
 SIDE = 32
 PICTURES = ["observation.images.front", "observation.images.wrist"]
@@ -204,7 +206,9 @@ def test_offsets_that_are_read_off_or_given_enter_at_several_scales_too(meta, ta
         new_policy(meta, scales=scales)
 
 
-def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the_predicted_one(meta, table, tmp_path):
+def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the_predicted_one(
+    meta, table, spec, tmp_path
+):
     policy, batch = new_policy(meta, states=str(meta.root), width=64), make_batch(table)
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
     blank = batch | {key: torch.zeros_like(batch[key]) for key in PICTURES}  # the label does not show in these
@@ -224,6 +228,11 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
     assert torch.equal(CNNPolicy.from_pretrained(tmp_path, strict=True).eval().select_action(batch), expected)
     with pytest.raises(UsageError, match=r"policy\.states needs"):
         new_policy(meta, states=str(meta.root), aux_weight=0.0)
+    with pytest.raises(UsageError, match=r"policy\.states cannot be combined with ee_delta"):
+        new_policy(meta, states=str(meta.root), action_space="ee_delta")
+    other = write_table(table, tmp_path / "other", replace(spec, task="lift"))
+    with pytest.raises(MismatchError, match="task differs"):
+        new_policy(meta, states=str(other[0].root))
 
 
 @pytest.fixture

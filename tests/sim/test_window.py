@@ -10,12 +10,14 @@ from manip_il.sim.window import Clock
 from manip_il.tasks.envs import make_env
 
 
-def test_without_a_display_human_is_refused_in_one_line(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
+@pytest.mark.parametrize("display", ["", ":99"])
+def test_without_a_display_human_is_refused_in_one_line(display, monkeypatch):
+    monkeypatch.setenv("DISPLAY", display)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(
-        RenderError, match=r'^no display: .*, use render_mode="rgb_array", or manip-il view --output=.*$'
-    ):
+    says = (
+        rf'^no display: DISPLAY={display}, WAYLAND_DISPLAY=; use render_mode="rgb_array", or manip-il view --output=.*$'
+    )
+    with pytest.raises(RenderError, match=says):
         gymnasium.make("manip_il/PandaReach-v0", render_mode="human")
     with pytest.raises(UsageError, match=r"unknown render_mode 'humna' \(did you mean 'human'\?\)"):
         make_env(render_mode="humna")

@@ -49,8 +49,8 @@ def test_bytes_that_differ_are_refused(tmp_path: Path, monkeypatch):
     push(make_run(tmp_path / "run"), remote)
     fetch = remote.fetch
 
-    def lie(manifest: Manifest, paths: list[str], folder: Path) -> None:
-        fetch(manifest, paths, folder)
+    def lie(manifest: Manifest, folder: Path) -> None:
+        fetch(manifest, folder)
         (folder / "new.txt").write_bytes(b"x" + (folder / "new.txt").read_bytes()[1:])
 
     monkeypatch.setattr(remote, "fetch", lie)

@@ -112,6 +112,7 @@ def test_a_node_gets_the_file(touch):
 MISTAKES = {
     "is not Python": ("def (", "cannot be run: SyntaxError"),
     "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
+    "one name": (TOUCH.replace("    def draw(", '    grasped = "cube"\n\n    def draw('), "expected a tuple of names"),
     "observes two": (
         TOUCH.replace('"cube": cube,', '"cube": cube[:2],'),
         "cube has shape (2,); expected a number or (3,)",
