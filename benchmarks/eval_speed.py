@@ -36,7 +36,7 @@ from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import make_env
+from manip_il.tasks.envs import env_of
 
 BIN = Path(sys.executable).parent
 TASK = "pick_place"
@@ -85,14 +85,14 @@ def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, flo
 
 
 def replay_seconds(config: EnvConfig, episode: Episode) -> float:
-    env = make_env(config=config)
+    env = env_of(config)
     env.start(episode.seed)
     scene, data = env.scene, env.data
     controls = np.zeros((len(episode), scene.model.nu))
     for control, action in zip(controls, episode.columns["executed_action"], strict=True):
         action = scene.actions.clip(action, 0)
-        control[scene.arm_ctrl] = action[scene.actions.arm]
-        control[scene.gripper.ctrl] = scene.gripper.command(action[scene.actions.gripper])
+        control[scene.arm_ctrl], opening = scene.actions.split(action)
+        control[scene.gripper.ctrl] = scene.gripper.command(opening)
     started = time.perf_counter()
     for control in controls:
         data.ctrl[:] = control

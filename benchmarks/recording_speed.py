@@ -26,7 +26,7 @@ import numpy as np
 from _machine import describe_machine
 
 from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import make_env
+from manip_il.tasks.envs import env_of
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa renders on the calling core, here and in the limit
 
@@ -141,11 +141,11 @@ def replay_seconds(job: RolloutJob, seed: int, actions: np.ndarray) -> float:
     """Return the seconds of an episode's bare physics, and of rendering its pictures if the job has cameras."""
     import mujoco  # after our import, which chooses the OpenGL backend
 
-    env = make_env(config=job.env)
+    env = env_of(job.env)
     env.start(seed)
     model, data, physics_steps = env.scene.model, env.data, job.env.physics_steps
     space, gripper = env.scene.actions, env.scene.gripper
-    commands = [np.append(action[space.arm], gripper.command(action[space.gripper])) for action in actions]
+    commands = [np.append(arm, gripper.command(opening)) for arm, opening in map(space.split, actions)]
     controls, order = np.array(commands), [*env.scene.arm_ctrl, *gripper.ctrl]
     if job.cameras is not None:
         pictures(env.scene, data, job.cameras)  # the first call creates the context
@@ -185,7 +185,7 @@ def bare_seconds(job: RolloutJob) -> float:
     """Return the seconds of some bare physics."""
     import mujoco
 
-    env = make_env(config=job.env)
+    env = env_of(job.env)
     env.start(0)
     started = time.perf_counter()
     mujoco.mj_step(env.scene.model, env.data, BARE_STEPS)

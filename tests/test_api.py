@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 import manip_il
-from manip_il.errors import UsageError
+from manip_il import api
+from manip_il.errors import MismatchError, UsageError
 
 STUB = Path(manip_il.__file__).with_suffix(".pyi")
 
@@ -22,6 +23,14 @@ def test_every_public_name_is_there_and_typed():
 def test_an_option_that_is_not_known_is_an_error(tmp_path: Path):
     with pytest.raises(TypeError, match="epochs"):
         manip_il.dagger(tmp_path / "run", manip_il.make_config("panda", "reach"), epochs=3)
+
+
+def test_a_folder_holds_the_results_of_one_set_of_options(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(api.Run, "results", lambda run: iter([run.config.rounds]))
+    env = manip_il.make_config("panda", "reach")
+    assert [manip_il.dagger(tmp_path, env, rounds=rounds) for rounds in (1, 2)] == [[1], [2]]
+    with pytest.raises(MismatchError, match="seed differs"):
+        manip_il.dagger(tmp_path, env, rounds=2, seed=7)
 
 
 def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
@@ -38,7 +47,7 @@ def test_without_a_policy_the_environment_must_be_given():
 def test_a_policys_rollouts_hold_the_experts_labels_and_its_evaluation_knows_its_task(tmp_path: Path):
     env = manip_il.make_config("panda", "reach")
     demos = manip_il.record(tmp_path / "demos", env, 2)
-    policy = manip_il.train(demos, tmp_path / "clone", policy={"width": 16}, steps=2, batch_size=8)
+    policy = manip_il.train(demos, tmp_path / "clone", seed=1000, policy={"width": 16}, steps=2, batch_size=8)
     made = manip_il.record(tmp_path / "made", env, 2, policy=policy, beta=0.5)
     table = made.columns(["action", "executed_action", "actor", "label_valid"])
     assert set(table["actor"].ravel()) == {0, 1}

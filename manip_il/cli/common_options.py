@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, Open, given
@@ -41,10 +42,16 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
     return make_config(**values)
 
 
+_FILES = (".py", ".yaml", ".yml")  # of a user's own task or robot
+
+
 def own_files(env: EnvConfig) -> str:
-    """Return the options that name a user's own robot and task; no dataset or policy holds their paths."""
+    """Return the options of an environment that no dataset or policy holds: paths, and changed limits."""
     named = {"robot": env.robot, "task": env.task}
-    return "".join(f" --{what}.type={name}" for what, name in named.items() if Path(name).suffix)
+    usual = make_config(env.robot, env.task, env.control_hz, object=env.object)
+    limits = [name for name in ("tolerance", "horizon", "success_steps") if getattr(env, name) != getattr(usual, name)]
+    paths = "".join(f" --{what}.type={quote(name)}" for what, name in named.items() if name.endswith(_FILES))
+    return paths + "".join(f" --env.{name}={getattr(env, name):g}" for name in limits)
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:

@@ -100,6 +100,10 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
         """Run the missing runs and evaluations, compare, print and write the result."""
         match self.sides:
             case [file] if file.suffix in _YAML:
+                plain = CompareOptions(sides=self.sides)
+                for name in ("eval", "checkpoint", "at", "env"):
+                    if getattr(self, name) != getattr(plain, name):
+                        raise UsageError(f"--{name} cannot be combined with a study; set it in {file}")
                 self._run_study(file)
             case [left, right]:
                 self._compare(left, right)
@@ -117,7 +121,8 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
             plan.run(folder, self.engine)
             arms = [replace(read_arm(folder / name), name=name) for name in plan.arms]
             rule, arms = select_rounds(Rule(file.checkpoint, file.at), arms)
-            trials = [self._trial(plan.envs[arm.name], [arm], file.eval.n_episodes) for arm in arms]
+            alike = {arm.name: arms if plan.baseline else [arm] for arm in arms}  # with the same conditions
+            trials = [self._trial(plan.envs[arm.name], alike[arm.name], file.eval.n_episodes) for arm in arms]
             study = Study(self._measure(arms, trials, folder), plan.baseline, rule, file.target)
             result = study.arms[0].members[0].test
             what = f"{result.robot} {result.task}" if plan.baseline else result.robot

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.common_options import SMALL, Pictured, Varied
 from manip_il.cli.options import Given, given
-from manip_il.cli.outputs import Replacing, prepare_output, require_replaceable
+from manip_il.cli.outputs import Replacing, require_replaceable
 from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.evaluation.suites import varied
@@ -61,8 +61,9 @@ class MergeOptions(Replacing):
         from manip_il.data.build import local_id, merge_datasets
 
         with exclusive(self.output):
-            prepare_output(self.output, overwrite=self.overwrite, sources=self.datasets)
-            info = merge_datasets(self.datasets, self.output, repo_id=local_id(self.output.absolute().name))
+            require_replaceable(self.output, self.overwrite, self.datasets)
+            repo_id = local_id(self.output.absolute().name)
+            info = merge_datasets(self.datasets, self.output, repo_id=repo_id, replace=self.overwrite)
         say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.output}")
 
 

@@ -87,7 +87,7 @@ class DemoOptions:
         results = run_rounds(config, folder / "dagger", engine, stages)
         first, best = results[0], best_result(results)
         most = results[-1].labels
-        run = Run(replace(config, label_budget=most), folder / "cloning", engine, stages.watch())
+        run = Run(replace(config, label_budget=most), folder / f"cloning_{most}", engine, stages.watch())
         more = run.demonstrations(math.ceil(ENOUGH * config.demonstrations * most / first.labels))
         policy = run.fit([more]).path
         trials = [
@@ -102,8 +102,9 @@ class DemoOptions:
         )
         rows = list[PolicyRow]()
         for name, path, learnt_from, colour in contestants:
+            place = name if learnt_from is None else f"{name}, {learnt_from}"  # a resumed demo may have more labels
             nominal, disturbed = (
-                one.measure(path, name, folder / "evaluations" / one.suite / name, engine, stages) for one in trials
+                one.measure(path, name, folder / "evaluations" / one.suite / place, engine, stages) for one in trials
             )
             rows.append(PolicyRow(name, nominal, learnt_from, disturbed, colour))
         return [path for _, path, *_ in contestants], rows

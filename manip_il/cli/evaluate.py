@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
@@ -113,7 +114,8 @@ class EvalOptions(Tested, Seeded, Trusting):
                 films = film_outcomes(engine, job, result, self.eval.films, stages)
             self._report(result, folder, *films)
         seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
-        say(f"next: manip-il eval {folder} --replay={seed} --video=replay.mp4")
+        own = f" --task.type={quote(job.env.task)}" if job.env.task.endswith(".py") else ""
+        say(f"next: manip-il eval {quote(str(folder))}{own} --replay={seed} --video=replay.mp4")
 
     def _job(self) -> RolloutJob:
         from manip_il.cli.inputs import open_driver

@@ -52,11 +52,23 @@ class Output(Replacing):
         """
         folder, resume = self.output_dir, getattr(self, "resume", False)
         with exclusive(folder):
-            prepare_output(folder, resume=resume, overwrite=self.overwrite)
+            prepare_output(folder, resume=resume, overwrite=self.overwrite, sources=_inputs(options))
             if resume:
                 check_same_options(folder, options)
             save_options(folder, options)
             yield folder
+
+
+def _inputs(options: Any) -> list[Path]:
+    """Return the paths in a command's options, except its output folder."""
+    found = list[Path]()
+    for one in options_of(type(options)):
+        value = one.value(options)
+        value = value.get("path") if isinstance(value, dict) else value  # `--policy.path` of a fit
+        if one.name != "output_dir":
+            items = value if isinstance(value, list) else [value]
+            found += [Path(item) for item in items if isinstance(item, Path) or (one.is_open and item)]
+    return found
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from manip_il.tasks.config import EnvConfig
 
 SERVO = "servo"  # a value of --vary
 
+_IDLE = ("dynamics", "sensing", "late", "random_actions")  # servos and encoders have options of their own
+
 
 @dataclass(frozen=True)
 class ServeOptions(Varied, Trusting):
@@ -51,6 +53,8 @@ class ServeOptions(Varied, Trusting):
             raise UsageError("--leader=sliders needs a window: a DISPLAY")
         env, _, seen = open_driver(policy, "expert", self.env, trust=self.trust)
         cameras = self.camera_config(env) if self.cameras else seen
+        if idle := [one for one in self.vary if one in _IDLE]:
+            raise UsageError(f"--vary={idle[0]} changes nothing for a served arm; use --servos.*, or --vary=servo")
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)
         session = SessionConfig(**self.session, servos=self.servos, varies=SERVO in self.vary)
         with exclusive(session.output_dir):

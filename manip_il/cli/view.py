@@ -74,7 +74,7 @@ class ViewOptions(Tested, Seeded, Trusting):
             cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if self.output else Look())
         if sliders and not self.env.get("horizon"):
             env = replace(env, horizon=LONGEST_EPISODE)  # people are slower than the expert
-        conditions = suite_conditions(self.suite, env, sees=cameras is not None)
+        conditions = suite_conditions(self.suite, env, sees=in_window or cameras is not None)
         job = RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
         world = make_env(env, observed_cameras(job), conditions)
         seeds = stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any
 
 from manip_il.collect.expert import Expert
@@ -16,9 +17,11 @@ from manip_il.collect.rollout import Environment, Labeller
 from manip_il.data.fingerprint import canonical_json, environment_fingerprint
 from manip_il.data.schema import OPENINGS, SERVOS, RobotTaskSpec
 from manip_il.mdp import STATE_EXTRAS
+from manip_il.robots import ROBOTS
 from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.files import ModelFiles
 from manip_il.robots.spec import model_bytes
-from manip_il.robots.table import is_robot
+from manip_il.robots.table import get_robot, is_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import environment_state_names
@@ -117,9 +120,13 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
     settings, own = asdict(config), dict[str, str]()
     if config.robot not in STOCK:
         task = get_task(config.task, config.object)
-        settings["task"], _, argument = task.name.partition(":")
+        robot = get_robot(config.robot)
+        settings["robot"], (settings["task"], _, argument) = robot.name, task.name.partition(":")
         settings |= {"reward": argument} if argument else {}  # as in older fingerprints, where only carry has it
         own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
+        if robot.name not in ROBOTS:  # what its YAML says and what is found in its model, wherever the files are
+            said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))
+            own |= {"robot_sha256": hashlib.sha256(repr(said).encode()).hexdigest()}
         mesh = Shape.parse(config.object).mesh if config.object else None
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
     if not config.object:  # as in versions without objects

@@ -16,7 +16,7 @@ from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import Episode, Transition
-from manip_il.sim.conditions import Condition, draw
+from manip_il.sim.conditions import MEASURED, Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.shape import draws_shape
 from manip_il.tasks.config import EnvConfig
@@ -68,7 +68,8 @@ class RolloutJob:
             return
         cameras = observed_cameras(self)
         envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(self._lockstep(), len(seeds)))]
-        branch_env = make_env(self.env, self.cameras) if self.label == "branch" else None
+        noise = [one.only(MEASURED) for one in self.conditions]
+        branch_env = make_env(self.env, self.cameras, noise) if self.label == "branch" else None
         steps = run_steps(self, envs, seeds)
         for frames in group_rollouts(map(_without_pictures, steps) if self.cameras is None and cameras else steps):
             drawn = draw(self.conditions, frames[0].seed, self.env.object)
@@ -87,11 +88,14 @@ class RolloutJob:
         if self.label == "last":
             return to_episode(frames, self.round, beta, labelled=False)
         if self.label == "takeover":
-            return to_episode(cut_at_takeover(frames, self.env.horizon), self.round, beta)
+            frames = cut_at_takeover(frames, self.env.horizon)
+            own = next(place for place, frame in enumerate(frames, 1) if frame.done)  # the learner's part decides
+            return to_episode(frames, self.round, beta, path=own)
         frames = labelled(frames, self.query, expert)
         if branch_env is None:
             return to_episode(frames, self.round, beta)
         path = [replace(frame, label=None) for frame in frames]
+        branch_env.start(frames[0].seed)  # which draws the noise of observations
         starts = [frame for frame in frames if frame.label is not None and frame.label.valid]
         found = (branch(branch_env, expert, one.state, one.seed, self.branch_steps) for one in starts)
         return to_episode([*path, *itertools.chain(*found)], self.round, beta, path=len(path))

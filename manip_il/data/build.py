@@ -149,6 +149,7 @@ def merge_datasets(
     *,
     repo_id: str,
     provenance: Mapping[str, Any] | None = None,
+    replace: bool = False,
 ) -> Info:
     """Merge several datasets, in order, into one; equal to `write_dataset` of all their episodes.
 
@@ -165,7 +166,7 @@ def merge_datasets(
         for warning in compare_fingerprints(str(roots[0]), own, str(one.root), one.fingerprint):
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
-    options: dict[str, Any] = {"repo_id": repo_id, "fingerprint": own}
+    options: dict[str, Any] = {"repo_id": repo_id, "fingerprint": own, "replace": replace}
     episodes = itertools.chain.from_iterable(map(_with_films, opened))
     spec = dataclasses.replace(about.spec, video=any(one.spec.video for one in opened))
     return write_dataset(episodes, root, spec, {**(provenance or {}), "merged": sources}, **options)

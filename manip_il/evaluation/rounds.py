@@ -54,7 +54,7 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
     try:
         for record in sorted(records, key=lambda record: record[unit]):
             n = record["validation_episodes"]
-            seconds += record["seconds"]["collect"] + record["seconds"]["fit"]
+            seconds += sum(spent for stage, spent in record["seconds"].items() if stage != "validate")
             if record["validation_success"] is None:
                 continue
             labels = record["labels"] if unit == "round" else 0  # reinforcement learning uses none

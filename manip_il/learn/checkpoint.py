@@ -32,6 +32,7 @@ _FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but n
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = (  # options that define an mlp's architecture
     *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled", "grippers"),
+    "action_space",
 )
 
 

@@ -42,7 +42,7 @@ from manip_il.learn.lerobot_policy import build_policy, build_processors, load_p
 from manip_il.learn.names import OWN_SPACE
 from manip_il.learn.network import threads
 from manip_il.learn.samples import I64, Batch, load_data
-from manip_il.learn.sources import input_columns, recorded_look, row_weights
+from manip_il.learn.sources import check_same_sources, input_columns, recorded_look, row_weights
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
     Writer,
@@ -81,6 +81,8 @@ class Trainer:
         weights: NDArray[np.float64] | None = None,
     ):
         first, spec = datasets[0], datasets[0].spec
+        specs = [one.spec for one in datasets]
+        check_same_sources([one.root for one in datasets], specs, pictures=config.takes_images, language=False)
         self.config, self.output_dir = config, output_dir
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
         assert self.pipeline.policy is not None
@@ -106,7 +108,8 @@ class Trainer:
         self.meta.table = self.data.table
         drawn = row_weights(datasets, shares, self.data.train) if shares else None
         drawn = drawn if weights is None else weights[self.data.train]
-        self._augment = Augment() if config.augments else None
+        shift = 0 if getattr(policy, "heatmap_weight", 0) else Augment.shift  # heat maps do not move with a crop
+        self._augment = Augment(shift) if config.augments else None
         self.origin = self._origin(datasets, shares, space)
         self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(datasets[-1].root)))
         self.pipeline.output_dir = output_dir

@@ -20,6 +20,7 @@ from manip_il.evaluation.film import encode_mp4
 from manip_il.preferences.answers import FORMAT, VERSION
 from manip_il.preferences.pairs import Clips, Pairs
 from manip_il.sim.config import FILM, CameraConfig
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 SIDE = 240  # edge of a film [pixels]
 MOST_FPS = 10  # films play in real time; rendering a picture takes tens of milliseconds
@@ -71,5 +72,6 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
 
 
 def _film(source: EditSource, states: NDArray[np.float64], fps: int) -> bytes:
-    pictures = render_states(source.env, CameraConfig((_CAMERA,), SIDE, SIDE, FILM), states)
-    return encode_mp4(list(pictures[schema.IMAGES + _CAMERA]), fps)
+    camera = STOCK[source.env.robot].cameras[0] if source.env.robot in STOCK else _CAMERA
+    pictures = render_states(source.env, CameraConfig((camera,), SIDE, SIDE, FILM), states)
+    return encode_mp4(list(pictures[schema.IMAGES + camera]), fps)

@@ -123,7 +123,7 @@ def find_ee(robot: Robot) -> EndEffector:
 
 def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Compile the robot and let its fingers settle at a share of the way from closed to open; the arm stays still."""
-    alone = replace(robot, joints=(), home=(), gains=(), forces=(), armature=())
+    alone = replace(robot, joints=(), home=(), gains=(), forces=(), armature=(), lerobot=None)
     spec = arm_spec(alone)
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model = spec.compile()

@@ -7,7 +7,7 @@ the gap between the fingers is measured once they rest. Parallel, hinged and lin
 from __future__ import annotations
 
 import bisect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -37,7 +37,8 @@ class Sweep:
     shares: how far the fingers are open, 0 to 1, for commands and measured positions alike; rising, (c,).
     openings: gaps between the pads at these [m], rising, (c,). middles: offsets along the hand's y of the midpoint
     between the pads [m], (c,); all 0 if both sides move alike. pads: for each finger the indices of its pads among its
-    geoms, nearest to the other finger first; holding: the same for the geoms that may hold an object.
+    geoms, nearest to the other finger first; holding: the same for the geoms that may hold an object. linked: positions
+    of the joints of a linkage that are not driven, by name, (c,).
     """
 
     shares: F64
@@ -45,6 +46,7 @@ class Sweep:
     middles: F64
     pads: tuple[tuple[int, ...], ...]
     holding: tuple[tuple[int, ...], ...]
+    linked: Mapping[str, F64]
 
 
 class Gripper:
@@ -60,6 +62,7 @@ class Gripper:
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
         self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()
+        self._linked = [(model.joint(prefix + name).qposadr[0], at) for name, at in self._sweep.linked.items()]
         fingers = finger_geoms(model, config.fingers, prefix)
         self.geoms = frozenset(geom for finger in fingers for geom in finger)
         self.pads, self._holding = (
@@ -83,6 +86,12 @@ class Gripper:
         """Return the actuators' commands for an opening [m], (g,)."""
         shares, openings = self._points
         return self._closed + float(np.interp(opening, openings, shares)) * self._travel
+
+    def put(self, data: mujoco.MjData, opening: float) -> None:
+        """Place the fingers, a linkage's other joints included, and set their commands to an opening [m]."""
+        data.qpos[self.q] = data.ctrl[self.ctrl] = self.command(opening)
+        for at, positions in self._linked:
+            data.qpos[at] = np.interp(opening, self._sweep.openings, positions)
 
     @property
     def driven(self) -> tuple[F64, F64]:
@@ -161,7 +170,13 @@ def sweep(robot: Robot) -> Sweep:
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
     ]
-    return Sweep(np.array(shares), np.array(openings), np.array(middles), *places)
+    driven = {*robot.joints, *robot.gripper.joints}
+    linked = {
+        joint.name: np.array([pose[joint.qposadr[0]] for pose in poses[shut:]])
+        for joint in map(model.joint, range(model.njnt))
+        if joint.name not in driven
+    }
+    return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=linked)
 
 
 def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[float], list[F64]]:

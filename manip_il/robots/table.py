@@ -48,6 +48,8 @@ def is_robot(name: str) -> bool:
 def read_robot(path: Path) -> Robot:
     """Read a robot's YAML. Raises `UsageError` naming the file and what is wrong in it."""
     try:
+        if path.stem in ROBOTS and path != ROBOTS[path.stem]:
+            raise ManipError(f"a built-in robot is called {path.stem}; rename the file")
         said = _said(path, read_yaml(path, "a robot's YAML"))
         if all(name in said for name in FOUND):
             return Robot(**said)
@@ -87,6 +89,8 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         said["joints"] = arm_joints(said["name"], said["files"], said["hand"], said["gripper"])
     upright = len(said["joints"]) >= _UPRIGHT_JOINTS
     said.setdefault("yaw", YAWS[not upright])
+    if not upright and "orientation" in costs:  # such an arm leans, however much its orientation costs
+        costs = {"leaning": costs["orientation"]} | costs
     said["costs"] = read("costs", Costs, vars(UPRIGHT if upright else SOFT) | costs)
     return said
 

@@ -156,6 +156,7 @@ class Operator:
 
     def _record(self) -> Iterator[None]:
         """Demonstrate; record a failed demonstration again, but keep a policy's attempt as it is."""
+        self._keep = False  # an attempt that Ctrl-C cuts off is not in the program's dataset either
         self._episodes.begin(self._driver)
         yield from self._attempt()
         self._count()

@@ -6,7 +6,7 @@ The drawn values are applied to the model by `variation.py`, to pictures by `vie
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,6 +51,7 @@ _MODEL = (*_BODY, "joint_damping", "actuator_gain")
 _OBJECT = ("knock", "colour", *_BODY)
 PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # only in pictures
 _SEEN = (*PICTURED, "picture_delay")
+MEASURED = ("joint_noise", "position_noise")
 
 
 @dataclass(frozen=True, init=False)
@@ -98,6 +99,10 @@ class Condition:
         if self.ranges and not kept.keys() - {"knock_step"}:
             return None
         return Condition(self.name, **kept)
+
+    def only(self, names: Collection[str]) -> Condition:
+        """Return the condition with the named ranges alone."""
+        return Condition(self.name, **{name: range_ for name, range_ in self.ranges.items() if name in names})
 
     def changes_model(self) -> bool:
         """Return whether the condition changes the physics of the object or the arm."""

@@ -118,7 +118,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         posture = np.asarray(robot.home) + rng.uniform(-1, 1, len(robot.joints)) * _JOINT_JITTER
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
         opening = rng.uniform(scene.gripper.least, scene.gripper.most)
-        data.qpos[scene.gripper.q] = data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
+        scene.gripper.put(data, opening)
         if largest := self.drawn.get("posture"):
             draw_posture(world, rng_for(seed, "posture"), largest)
         world.update()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition
-from manip_il.sim.task import Task
+from manip_il.sim.task import Task, objects_in
 from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]
@@ -64,16 +64,16 @@ def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
-    """Move the task's first object a random distance sideways, to a place within reach, with zero velocity.
+    """Move the first object of the episode a random distance sideways, to a place within reach, with zero velocity.
 
     distance: least and greatest [m]. height: how far up it is moved [m]; above 0 it is also turned at random, and
     falls. A place where it overlaps something is drawn again; nothing moves if there is no object or no free place.
     """
     if not world.scene.task.objects:
         return
-    name = world.scene.task.objects[0]
+    name = objects_in(world.scene.task, world)[0]
     one = world.scene.objects[name]
-    start, half = world.data.qpos[one.q : one.q + 7].copy(), world.extents(name)[2] / 2
+    start, half = world.data.qpos[one.q : one.q + 7].copy(), min(world.extents(name)) / 2
     for _ in range(_MAX_DRAWS):
         angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(*distance)
         pose = start.copy()
@@ -124,8 +124,7 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
 
 def open_gripper(world: World) -> None:
     """Set the gripper's fingers and command to fully open."""
-    gripper, data = world.scene.gripper, world.data
-    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
+    world.gripper.put(world.data, world.gripper.most)
     _settle(world)
 
 

@@ -127,11 +127,14 @@ class Shape:
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Range of its greatest length [m], when scaled, in which it can be grasped however it lies; None if empty."""
+        """Range of twice the greatest number of `size` [m], when scaled, such that it can be grasped however it lies.
+
+        None if it is empty.
+        """
         if self.mesh is not None:
             return None
-        least, between, most = sorted(self.lengths)
-        low, high = most * _THINNEST / least, most * min(_WIDEST / between, LONGEST / most)
+        (least, between, most), edge = sorted(self.lengths), 2 * max(self.size)
+        low, high = edge * _THINNEST / least, edge * min(_WIDEST / between, LONGEST / most)
         return (low, high) if low < high else None
 
 

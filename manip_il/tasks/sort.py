@@ -30,6 +30,7 @@ SENTENCES = (
     "The {colour} cube goes into the {colour} bin.",
 )
 INSIDE = (0.046, 0.068)  # half a bin's inner length and width [m]
+_IN_ROW = 1e-6  # bins farther from their place in the row were moved [m]
 PITCH = 0.105  # spacing of the bins, which stand in a row away from the robot [m]
 SIDE = 0.19  # offset of the row from the workspace's middle, left or right [m]
 SHIFT = 0.08  # largest shift of cubes and bins along x, to where the arm reaches farthest to both sides [m]
@@ -176,6 +177,12 @@ class Sort:
     def objects_in(self, world: World) -> tuple[str, ...]:
         """Return the named cube; the others may lie out of reach."""
         return (asked(world),)
+
+    def unsound(self, world: World) -> str:
+        """Return "the bins do not stand in a row" if they were drawn one by one, else ""."""
+        bins = np.array(sorted(world.pose(one).position.tolist() for one in BINS.values()))
+        row = bins[0] + np.outer(np.arange(len(bins)), [PITCH, 0.0, 0.0])
+        return "" if np.abs(bins - row).max() < _IN_ROW else "the bins do not stand in a row"
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the cubes, a bin for each, and the body that encodes which one is named."""

@@ -8,7 +8,7 @@ Costs are control steps until the task is solved, or the horizon if it is not.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.policy import LearnedPolicy, actions_along
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
+from manip_il.sim.conditions import Condition
 from manip_il.tasks.config import EnvConfig
 
 F64 = NDArray[np.float64]
@@ -120,17 +121,19 @@ def measure_shift(
     u: int,
     episodes: int = EPISODES,
     on_episode: OnEpisode = lambda _: None,
+    conditions: tuple[Condition, ...] = (),
 ) -> Shift:
     """Run the expert and every round's policy on the same seeds, and query the expert in every state.
 
-    u: the expert's recoverability on `env`, see `certify`.
+    conditions: those of the run. u: the expert's recoverability on `env`, see `certify`.
     """
     seeds, scale = stream_seeds("theory", episodes), env_actions(env).scale
     spec, found = env_spec(env), list[RoundShift]()
     hand = [spec.environment_state_names.index(name) for name in _HAND]
-    expert, expert_cost, _ = _run(engine, RolloutJob(env, hold=0), seeds, on_episode)
+    plain = RolloutJob(env, hold=0, conditions=conditions)
+    expert, expert_cost, _ = _run(engine, plain, seeds, on_episode)
     for number, path, datasets in rounds:
-        own, cost, success = _run(engine, RolloutJob(env, PolicyDriver((path,)), hold=0), seeds, on_episode)
+        own, cost, success = _run(engine, replace(plain, driver=PolicyDriver((path,))), seeds, on_episode)
         policy, data = LearnedPolicy.load(path), _training_states(number, datasets)
         wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)
         on_expert = None if policy.cameras else float(_is_wrong(_actions_on(policy, expert), expert, scale).mean())
@@ -170,8 +173,9 @@ def _run(
 
 def _training_states(round_: int, datasets: Sequence[Path]) -> Columns:
     """States that a round's policy was fitted to, without those after success, because rollouts here end at success."""
-    table = joined_columns(datasets, [*_OBSERVED, schema.SUCCESS])
-    rows = np.flatnonzero(~table[schema.SUCCESS].ravel().astype(np.bool_))
+    table = joined_columns(datasets, [*_OBSERVED, schema.SUCCESS, schema.LABEL_VALID])
+    learnt = table[schema.LABEL_VALID].ravel() != 0
+    rows = np.flatnonzero(learnt & ~table[schema.SUCCESS].ravel().astype(np.bool_))
     if len(rows) > MOST_STATES:
         rows = np.sort(rng_for(round_, "states of the data").choice(rows, MOST_STATES, replace=False))
     return {key: table[key][rows] for key in _OBSERVED}

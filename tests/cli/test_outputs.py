@@ -84,6 +84,9 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
     assert (ours / "config.yaml").is_file()
     with pytest.raises(UsageError, match="overlaps"):
         prepare_output(ours, overwrite=True, sources=[ours / "inside"])
+    (ours / "dagger").mkdir()
+    assert main(["theory", str(ours / "dagger"), f"--output_dir={ours}", "--overwrite=true"]) == 2
+    assert (ours / "dagger").is_dir()
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
     (ours / "link").symlink_to(tmp_path / "thesis")

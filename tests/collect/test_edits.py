@@ -74,6 +74,11 @@ def visited(tmp_path_factory) -> EditSource:
     return open_source(write(episodes, tmp_path_factory.mktemp("visited") / "visited", ENV))
 
 
+def test_a_datasets_rate_is_its_environments(tmp_path):
+    env = make_config("panda", "reach", 10)
+    assert open_source(write(recorded(env, 1), tmp_path / "slow", env)).env == env
+
+
 @pytest.mark.slow
 def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_while_recording():
     envs = [make_config(*scene) for scene in SCENES]

@@ -19,9 +19,10 @@ from manip_il.data.schema import ordered_columns
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
+from manip_il.sim.conditions import Condition
 from manip_il.sim.events import STANDARD
 from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
+from manip_il.tasks.envs import env_of, scene_of
 
 from ..learn.tiny_policies import write_checkpoint
 
@@ -108,6 +109,7 @@ def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJo
     free = run(replace(job, label="last"))
     for episode in run(replace(job, label="takeover", query=ONE)).values():
         rolled_in, recovery = parts(episode)
+        assert episode.success == rolled_in.success
         columns = recovery.columns
         assert not labelled(rolled_in).any()
         assert (rolled_in.columns["actor"] == Actor.LEARNER).all()
@@ -116,6 +118,17 @@ def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJo
         assert (columns["actor"] == Actor.EXPERT).all()
         np.testing.assert_array_equal(columns["executed_action"], columns["action"])
         assert len(recovery) >= ENV.horizon  # the expert has a horizon of its own
+
+
+def test_branches_are_observed_with_the_noise_of_the_run(job: RolloutJob):
+    noisy = replace(job, label="branch", query=SELDOM, conditions=(Condition("noise", joint_noise=0.05),))
+    for episode in run(noisy).values():
+        _, *branches = parts(episode)
+        states = [State.from_vector(one.columns["sim_state"][0]) for one in branches]
+        env = env_of(ENV)
+        for one, state in zip(branches, states, strict=True):
+            env.set_state(state)
+            assert 0.01 < np.abs(one.columns["observation.state"][0] - env.observe().state).max() < 0.5
 
 
 def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJob):

@@ -16,7 +16,7 @@ def records(successes: tuple[float, ...] = SUCCESS, labels: int = 100, seconds: 
             "episodes": 3 * (i + 1),
             "validation_success": success,
             "validation_episodes": 10,
-            "seconds": {"collect": seconds / 4, "fit": 3 * seconds / 4, "validate": 100.0},
+            "seconds": {"collect": seconds / 4, "fit": seconds / 2, "redraw": seconds / 4, "validate": 100.0},
         }
         for i, success in enumerate(successes)
     ]

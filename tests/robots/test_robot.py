@@ -9,14 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il.collect.environments import env_fingerprint
 from manip_il.errors import UnknownName, UsageError
-from manip_il.robots import reach
+from manip_il.robots import ROBOTS, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.table import get_robot
 from manip_il.sim.scene import PREFIX
+from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
 
 from ..scenes import drive, started, world_at_home
@@ -54,6 +56,25 @@ def test_a_yaml_is_found_from_the_current_folder(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert get_robot("near.yaml").name == "near"
     assert get_robot("./near.yaml").files.model == tmp_path / "own.xml"
+
+
+def test_an_arm_of_ones_own_is_known_by_what_its_yaml_says(tmp_path: Path):
+    trees = {"one": tree_of(), "same": tree_of(), "other": but(home=[0.1, *tree_of()["home"][1:]])}
+    for name, tree in trees.items():
+        (tmp_path / name).mkdir()
+        write(tmp_path / name, tree=tree)
+    one, same, other = (env_fingerprint(make_config(str(tmp_path / name / "own.yaml"), "reach")) for name in trees)
+    assert one == same
+    assert {key for key in one if one[key] != other[key]} == {"robot_sha256"}
+
+
+def test_a_copy_of_a_built_in_arm_needs_a_name_of_its_own_and_leans_as_it_does(tmp_path: Path):
+    text = ROBOTS["so101"].read_text()
+    (tmp_path / "so101.yaml").write_text(text)
+    with pytest.raises(UsageError, match="a built-in robot is called so101; rename the file"):
+        get_robot(str(tmp_path / "so101.yaml"))
+    (tmp_path / "mine.yaml").write_text(f"{text}\ncosts: {{orientation: 0.03}}\n")
+    assert get_robot(str(tmp_path / "mine.yaml")).leans
 
 
 def but(**changes: Any) -> dict[str, Any]:

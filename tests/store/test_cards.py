@@ -88,14 +88,16 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
     write_checkpoint(run / "best" / "pretrained_model", "act", spec, origin=meta)
     assert "not measured" in cards(run, "policy", "user/act")[CARD].decode()
-    (run / "eval").mkdir()
-    (run / "eval" / "eval.json").write_text(json.dumps(EVALUATION))
+    better = EVALUATION | {"success_rate": 0.97, "n_episodes": 500}
+    for place, more in {"eval": {}, "validation/3": better, "easy": better | {"settings": {"suite": "easy"}}}.items():
+        (run / place).mkdir(parents=True)
+        (run / place / "eval.json").write_text(json.dumps(EVALUATION | more))
     text = cards(run, "policy", "user/act")[CARD].decode()
     data = ModelCard(text).data.to_dict()
     assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("apache-2.0", "lerobot", "robotics")
     assert data["model-index"][0]["results"][0]["metrics"][0]["value"] == pytest.approx(0.84)
     assert "**84.0%** [75.6%, 89.9%] (95% interval, 100 episodes), on unseen seeds" in text
-    assert "--env.task=PandaPickPlace-v0" in text
+    assert "--env.task=PandaPickPlace-v0 \\\n  --env.fps=20" in text
     shutil.rmtree(run / "best")
     with pytest.raises(ManipError, match="no policy in"):
         cards(run, "policy", "user/act")

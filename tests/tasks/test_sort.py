@@ -9,13 +9,15 @@ import pytest
 
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
+from manip_il.collect.scenes import SceneDrawer, Scenes
 from manip_il.mdp import State
 from manip_il.sim.env import environment_state_names
+from manip_il.sim.events import move_object
 from manip_il.sim.task import instruction_in, phases
 from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env
-from manip_il.tasks.sort import BINS, COLOURS, SENTENCES, asked
+from manip_il.tasks.sort import BINS, COLOURS, PITCH, SENTENCES, asked
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
 
@@ -56,6 +58,24 @@ def test_a_restored_state_says_the_same_in_words_and_numbers():
             [numbers[f"cube_from_ee.{axis}"] for axis in "xyz"], cube - env.world.ee.position, atol=1e-6
         )
         np.testing.assert_allclose(numbers["bin_from_cube.x"], bin_at[0] - cube[0], atol=1e-6)
+
+
+def test_a_knock_moves_the_cube_that_is_named():
+    env = make_env("panda", "sort")
+    for name, _, state in starts()[:10]:
+        env.set_state(state)
+        before = env.world.pose(name).position
+        move_object(env.world, np.random.default_rng(0), (0.05, 0.08))
+        assert 0.05 <= np.linalg.norm((env.world.pose(name).position - before)[:2]) <= 0.08
+
+
+def test_redrawn_bins_stand_in_a_row():
+    drawer, env = SceneDrawer(make_config("panda", "sort"), Scenes(None, 20)), make_env("panda", "sort")
+    for number, (_, _, state) in enumerate(starts()[:20]):
+        for frame in drawer.frames(state, number, 0):
+            env.set_state(frame.state)
+            bins = np.array(sorted(env.world.pose(one).position.tolist() for one in BINS.values()))
+            np.testing.assert_allclose(np.diff(bins, axis=0), [[PITCH, 0, 0]] * 2, atol=1e-9)
 
 
 @every_large_robot
