@@ -4,16 +4,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.cli.progress import say, warn
-from manip_il.errors import (
-    FolderExistsError,
-    ManipError,
-    MismatchError,
-    NotFiniteError,
-    RenderError,
-    UnknownName,
-    UsageError,
-    nearest,
-)
+from manip_il.errors import UnknownName, nearest
 from manip_il.evaluation.tables import Table, print_table
 
 
@@ -33,11 +24,3 @@ def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.Captur
     assert main(["data", name]) == main(["robot", "check", f"{name}.yaml"]) == 2
     assert not {"\x1b", "\x07", "\x9b", "\udcff"} & set("".join(capsys.readouterr()))
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
-
-
-@pytest.mark.parametrize(
-    ("code", "kinds"),
-    [(1, (ManipError, MismatchError, NotFiniteError, RenderError)), (2, (UsageError, UnknownName, FolderExistsError))],
-)
-def test_failed_work_exits_1_and_wrong_words_exit_2(code: int, kinds: tuple[type[ManipError], ...]):
-    assert {kind.exit_code for kind in kinds} == {code}

@@ -19,7 +19,7 @@ from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.action_steps import add_steps  # importing it registers our steps for loading
 from manip_il.learn.checkpoint import MEASURED, PROCESSORS, Checkpoint, in_one_line
 from manip_il.learn.lerobot_config import policy_class
-from manip_il.learn.names import MLP
+from manip_il.learn.names import CNN, MLP
 from manip_il.learn.network import warm_start
 
 _DEVICE_STEP = "device_processor"
@@ -29,7 +29,8 @@ _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less variation than th
 def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = None) -> PreTrainedPolicy:
     """Return a LeRobot policy with new weights, those in `config.pretrained_path`, or those of the run to resume.
 
-    An mlp that starts from another mlp's weights takes input statistics from the new data, see `warm_start`. Raises
+    An mlp that starts from another mlp's weights takes input statistics from the new data, see `warm_start`; a cnn
+    takes the range of its actions from these. Raises
     `ManipError` for a checkpoint that cannot be loaded, and if a backbone's weights cannot be downloaded.
     """
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
@@ -42,9 +43,11 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
         what += f" with --policy.pretrained_backbone_weights={weights} (offline, use null)"
     with _lerobot(what):
         policy = make_policy(config, ds_meta=meta)
+    own: Any = policy
     if warm:
-        model: Any = policy.model
-        warm_start(model, Path(str(start)))
+        warm_start(own.model, Path(str(start)))
+    elif config.type == CNN and start is not None and resumed is None:  # acts within the range of the new data
+        own.model.target_low, own.model.target_high = own.target_range
     if weights:  # the checkpoint will have all weights, so loading it needs no network
         config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
     config.pretrained_path = None

@@ -110,6 +110,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     config_class = MLPConfig  # type: ignore[assignment]
     name = "mlp"  # type: ignore[assignment]
+    target_range: tuple[Tensor, Tensor]  # of the training data
 
     def __init__(self, config: MLPConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
@@ -120,6 +121,7 @@ class MLPPolicy(PreTrainedPolicy):
         self._build(config)
         if dataset_meta is not None:
             self._learn_columns(self._columns(config, dataset_meta))
+            self.target_range = self.model.target_low.clone(), self.model.target_high.clone()
 
     @override
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:

@@ -170,13 +170,15 @@ def sweep(robot: Robot) -> Sweep:
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
     ]
-    driven = {*robot.joints, *robot.gripper.joints}
-    linked = {
-        joint.name: np.array([pose[joint.qposadr[0]] for pose in poses[shut:]])
-        for joint in map(model.joint, range(model.njnt))
-        if joint.name not in driven
-    }
+    linked = _linked(robot, model, poses[shut:])
     return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=linked)
+
+
+def _linked(robot: Robot, model: mujoco.MjModel, poses: Sequence[F64]) -> dict[str, F64]:
+    """The positions of the joints that nothing drives, by name, in every pose."""
+    driven = {*robot.joints, *robot.gripper.joints}
+    others = [joint for joint in map(model.joint, range(model.njnt)) if joint.name not in driven]
+    return {joint.name: np.array([pose[joint.qposadr[0]] for pose in poses]) for joint in others}
 
 
 def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[float], list[F64]]:

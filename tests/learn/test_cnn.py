@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from manip_il.errors import MismatchError, UsageError
 from manip_il.learn import mlp
 from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder
 from manip_il.learn.lerobot_config import policy_features
+from manip_il.learn.lerobot_policy import build_policy
 from manip_il.learn.losses import LOSSES
 
 from .conftest import write_table
@@ -230,6 +232,10 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
         new_policy(meta, states=str(meta.root), aux_weight=0.0)
     with pytest.raises(UsageError, match=r"policy\.states cannot be combined with ee_delta"):
         new_policy(meta, states=str(meta.root), action_space="ee_delta")
+    config, wide = policy.config, write_table({**table, "action": 3 * table["action"]}, tmp_path / "wide", spec)
+    config.pretrained_path, config.states = tmp_path, str(wide[0].root)
+    again: Any = build_policy(config, SimpleNamespace(features=meta.features, root=wide[0].root, stats={}))
+    assert (again.model.target_high > policy.model.target_high).any(), "it acts within the range of the new data"
     other = write_table(table, tmp_path / "other", replace(spec, task="lift"))
     with pytest.raises(MismatchError, match="task differs"):
         new_policy(meta, states=str(other[0].root))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from manip_il.collect.environments import env_fingerprint
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UsageError
 from manip_il.robots import ROBOTS, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import Reach
@@ -112,11 +112,6 @@ def test_a_mistake_in_the_yaml_is_one_line(mistake: str, tmp_path: Path):
     for word in words:
         assert word in line
     assert str(path) in line or "robot own" in line  # the one where the YAML is read, the other where the model is
-
-
-def test_a_name_that_is_neither_in_the_table_nor_a_yaml_gets_the_nearest():
-    with pytest.raises(UnknownName, match=r"unknown robot 'pnada'.*did you mean 'panda'"):
-        get_robot("pnada")
 
 
 def test_a_gripper_too_small_for_the_tasks_cube_is_one_line(tmp_path: Path):
