@@ -39,7 +39,7 @@ from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
-from manip_il.learn.names import OWN_SPACE
+from manip_il.learn.names import OWN_SPACE, PLAIN
 from manip_il.learn.network import threads
 from manip_il.learn.samples import I64, Batch, load_data
 from manip_il.learn.sources import check_same_sources, input_columns, recorded_look, row_weights
@@ -81,8 +81,8 @@ class Trainer:
         weights: NDArray[np.float64] | None = None,
     ):
         first, spec = datasets[0], datasets[0].spec
-        specs = [one.spec for one in datasets]
-        check_same_sources([one.root for one in datasets], specs, pictures=config.takes_images, language=False)
+        roots, specs = [one.root for one in datasets], [one.spec for one in datasets]
+        check_same_sources(roots, specs, pictures=config.takes_images, language=config.kind not in PLAIN)
         self.config, self.output_dir = config, output_dir
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
         assert self.pipeline.policy is not None
