@@ -2,7 +2,7 @@
 
 round_003/journals/    every rollout, written as soon as it ends
 round_003/dataset/     the training data; missing if the expert gave no label
-round_003/redrawn/     redrawn scenes of its states, if policies learn from those
+round_003/redrawn/     scenes redrawn from the dataset's states, with --redraw; the policy learns from these
 round_003/policy/      the fit; the other members of an ensemble are policy_1, ...
 round_003/eval.json    the validation
 """

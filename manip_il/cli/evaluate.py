@@ -202,7 +202,7 @@ class EvalOptions(Tested, Seeded, Trusting):
 
 
 def machine() -> str:
-    """Return the OpenGL renderer and the number of cores. Raises what an evaluation here would raise."""
+    """Return the OpenGL renderer and the number of cores. Raises if an environment cannot start or render here."""
     import tempfile
 
     from manip_il.collect.workers import default_workers

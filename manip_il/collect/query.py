@@ -143,7 +143,7 @@ def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
 
 
 def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[Transition]:
-    """Return an episode's frames; for `one`, with the label of a randomly drawn step."""
+    """Return an episode's frames. If the query is `one`, first have the expert label one random step."""
     if query.kind == "one":
         step = drawn_step(frames[0].seed, len(frames))
         frames[step] = replace(frames[step], label=expert.label(frames[step].state))

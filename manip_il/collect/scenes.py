@@ -40,7 +40,7 @@ _TRIES = 5  # scenes drawn for a state before the visited scene itself is used
 class Scenes:
     """How scenes are drawn from a dataset's states. cameras: None for scenes without pictures.
 
-    anew: whether to also draw goals and objects, not only looks. conditions: what the looks are drawn from.
+    anew: whether to also randomise goals and objects, not only appearance. conditions: ranges of the appearance.
     branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
     of the first scene in the random stream, so that several datasets of one seed have different scenes.
     """

@@ -22,8 +22,8 @@ class JoinedDatasets:
     """Several datasets; frames are numbered in the given order.
 
     features: LeRobot's table of the columns and cameras that every dataset has, with equal shapes and without depth.
-    stats: over all frames; cameras have ImageNet's mean and std, as in `lerobot-train`, and otherwise the first
-    dataset's statistics. tasks: each text once.
+    stats: over all frames, but for cameras ImageNet's mean and std, as in `lerobot-train`, and the first dataset's
+    other statistics. tasks: each text once.
     """
 
     def __init__(self, datasets: Sequence[Dataset]):

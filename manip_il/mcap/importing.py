@@ -158,7 +158,7 @@ def _value(where: str, source: TopicSource, content: Any) -> Any:
         with np.errstate(over="ignore"):  # the next line checks for infinity
             numbers = given.astype(source.dtype)
         if not np.isfinite(numbers).all() if numbers.dtype.kind == "f" else (numbers != given).any():
-            raise ValueError(f"{checks.shorten(values)}; expected finite numbers of {source.dtype}")
+            raise ValueError(f"{checks.shorten(values)}; expected finite numbers that fit {source.dtype}")
         return numbers.reshape(source.shape or -1)
     except (ManipError, OverflowError, ValueError) as error:
         raise ManipError(f"{where}: {error}") from error

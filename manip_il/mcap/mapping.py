@@ -24,9 +24,9 @@ class TopicSource:
     """The topic of a column, and which message a frame takes. tolerance: largest time between frame and message [s].
 
     resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one that is not later.
-    Numbers or text are the values at all paths in `field`, in order; shape: by default (values,). Pictures have `video`
-    instead of `field`: true is video, with loss, false is PNG. Raises `UsageError` for options that contradict each
-    other.
+    field: paths to a message's numbers or text, joined in order. shape: of the joined numbers, by default a vector.
+    video: replaces `field` for cameras; true stores lossy video, false PNG. Raises `UsageError` for options that
+    contradict each other.
     """
 
     topic: str

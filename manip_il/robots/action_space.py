@@ -14,7 +14,7 @@ from manip_il.mdp import F64
 
 @dataclass(frozen=True, eq=False)
 class ServoUnits:
-    """Conversion between joints [rad] with an opening [m] and servo units: degrees, 0 to 100 for the gripper.
+    """Conversion of joints [rad] and a gripper opening [m] to servo units (degrees; gripper 0 to 100) and back.
 
     openings: gripper openings [m], rising, (c,). percents: the gripper servo's positions at these, 0 to 100, (c,).
     """

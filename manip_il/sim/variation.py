@@ -77,7 +77,7 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
 
 
 def part(variation: F64, name: str) -> F64:
-    """Return the numbers of a variation (v,) under a name in `_WORLD`, as a view."""
+    """Return the values of one quantity, such as `table` or `clutter`, in a variation (v,), as a NumPy view."""
     return variation[len(variation) - WORLD_SIZE :][_PLACES[name]]
 
 

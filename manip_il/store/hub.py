@@ -54,7 +54,8 @@ class Hub:
             except (RepositoryNotFoundError, RevisionNotFoundError):
                 return None
             if not _COMMIT.fullmatch(head):  # becomes part of paths
-                raise RemoteError(f"{self.name} has the commit {checks.shorten(head)}; is HF_ENDPOINT a Hub?")
+                found = f"the commit {checks.shorten(head)}, not 40 hexadecimal digits"
+                raise RemoteError(f"{self.name} has {found}; is HF_ENDPOINT a Hub?")
             tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
             files = {
                 one.path: File(one.lfs.size, one.lfs.sha256) if one.lfs else File(one.size, git_sha1=one.blob_id)

@@ -83,7 +83,7 @@ class LossCurve:
 
 
 def curves(process: Process, horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[LossCurve]:
-    """Yield the curves of both learners on one process."""
+    """Yield the loss curves of cloning and of DAgger on one process."""
     found: dict[Learner, list[F64]] = {"cloning": [], "DAgger": []}
     for horizon in horizons:
         for learner, policies in _fitted(process, horizon, draws).items():

@@ -136,10 +136,10 @@ class Grid:
         return nodes[np.linalg.norm(self.points[nodes] - position, axis=1) < AHEAD * self.cell]
 
     def snap(self, positions: F64) -> I64:
-        """Return the free nodes, (n,), joined by edges, that follow a path of positions (T, 3) [m].
+        """Return a path of free nodes, (n,), each joined to the next, that follows positions (T, 3) [m].
 
-        Along a straight line their path is no longer than the grid's shortest. Gaps without free nodes are bridged by
-        the shortest path; a path that ends near the goal is extended to it.
+        If the positions lie on a straight line, it is no longer than the shortest path in the grid. Gaps without free
+        nodes are bridged by the shortest path. If the positions end near the goal, it is extended to the goal.
         """
         dense = _dense(positions, self.cell / 4)
         index = np.round((dense - self.origin) / self.cell).astype(np.int64).clip(0, np.array(self.shape) - 1)

@@ -59,7 +59,7 @@ ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  #
 
 @dataclass(frozen=True)
 class Held:
-    """Half the gap between the fingers for one object [m]. open: least that clears it; thin: least that can hold it.
+    """Half gaps between the fingers for one object [m]. open: smallest that clears it; thin: smallest that holds it.
 
     long: whether the object's own x axis is its long one.
     """
