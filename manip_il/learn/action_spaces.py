@@ -81,7 +81,7 @@ class Conversion:
             )
 
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return actions (N, n) (joint targets and openings) expressed in `space`, given measured joint states (N, n)."""
+        """Return actions (N, n) (joint targets and openings) in this space, given measured joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return actions
         targets = actions.copy()
@@ -97,7 +97,7 @@ class Conversion:
         return targets
 
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return actions (N, n) (joint targets and openings) from those expressed in `space`; the inverse of `encode`."""
+        """Return actions (N, n) (joint targets and openings) from those in this space; inverse of `encode`."""
         if self.space == JOINT_TARGET:
             return targets
         actions = targets.copy()
