@@ -107,8 +107,8 @@ def dagger(
     """Run DAgger, or another `method`, in a folder; return the results of all rounds, starting with 0 (cloning).
 
     beta, query: as on the command line, such as `"linear:5"` and `"probability:0.1"`. options: other fields of
-    `RunConfig`. A folder with finished rounds is continued; only `rounds` may then be larger. Raises `UsageError` for
-    options that contradict each other, `MismatchError` for others than the folder's.
+    `RunConfig`. A folder with finished rounds is continued with the same options, except that `rounds` may be larger.
+    Raises `UsageError` for options that contradict each other, `MismatchError` if they differ from the folder's.
     """
     options |= {} if beta is None else {"beta": BetaSchedule.parse(beta)}
     options |= {} if query is None else {"query_rule": parse_query(query)}
@@ -149,9 +149,11 @@ def evaluate(
 
 
 def _check_same(path: Path, config: RunConfig) -> None:
-    """Raise `MismatchError` unless the file holds the same options, apart from `rounds`; write it if it is missing."""
+    """Raise `MismatchError` unless the file, if there is one, holds `config` apart from `rounds`; then write it."""
     now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
-    before = checks.read_json(path, "a run's options") if path.is_file() else now
+    del now["fit"]  # some of whose options may change, such as `log_freq`
+    has_begun = any(path.parent.glob("round_*"))
+    before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
     for key in now:
         if before.get(key) != now[key]:
             raise MismatchError(key, str(path.parent), before.get(key), "this call", now[key])

@@ -104,7 +104,7 @@ def parse_json(what: str, data: str | bytes) -> Any:
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file. what: what the file should be, for the error message."""
+    """Return the object in a JSON file. what: expected content, for the error message."""
     return mapping(str(path), parse_json(str(path), read_bytes(path, what)))
 
 
@@ -119,7 +119,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """Return the value of a YAML file; `UsageError` if it cannot be read. what: what it should be, for the message."""
+    """Return the value of a YAML file; `what` is the expected content. Raises `UsageError` if it cannot be read."""
     try:
         return parse_yaml(read_bytes(path, what, UsageError).decode())
     except ValueError as error:  # UnicodeDecodeError is a ValueError
@@ -127,7 +127,7 @@ def read_yaml(path: Path, what: str) -> Any:
 
 
 def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a file's content; raises `refusal` if it cannot be read. what: what it should be, for the message."""
+    """Return a file's content; raises `refusal` if it cannot be read. what: expected content, for the message."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -166,7 +166,7 @@ def opening(name: str) -> None:
 
 
 def answer_parent() -> None:
-    """Run the function of `in_child`, in the child process."""
+    """In the child process, run the function that `in_child` sent."""
     seconds, function, arguments = pickle.load(sys.stdin.buffer)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_IN_CHILD, MEMORY_IN_CHILD))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

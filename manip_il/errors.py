@@ -74,7 +74,7 @@ def nearest(name: str, known: Iterable[str], most: int = 1) -> str:
 
 
 def printable(text: str) -> str:
-    """Escape control characters, which a terminal would obey, except line breaks and tabs."""
+    """Escape control characters except line breaks and tabs, so that a terminal does not obey them."""
     return "".join(one if one.isprintable() or one in "\n\t" else repr(one)[1:-1] for one in text)
 
 

@@ -162,7 +162,7 @@ class Episode:
 
 
 def require_finite(what: str, values: NDArray[np.generic]) -> None:
-    """Raise `NotFiniteError` naming `what` and the first bad row of (T, ...), unless every value is finite."""
+    """Raise `NotFiniteError` naming `what` and the first bad row, unless all values (T, ...) are finite."""
     if values.dtype.kind != "f":
         return
     if np.isfinite(values).all():

@@ -29,6 +29,7 @@ def test_a_folder_holds_the_results_of_one_set_of_options(tmp_path: Path, monkey
     monkeypatch.setattr(api.Run, "results", lambda run: iter([run.config.rounds]))
     env = manip_il.make_config("panda", "reach")
     assert [manip_il.dagger(tmp_path, env, rounds=rounds) for rounds in (1, 2)] == [[1], [2]]
+    (tmp_path / "round_000").mkdir()
     with pytest.raises(MismatchError, match="seed differs"):
         manip_il.dagger(tmp_path, env, rounds=2, seed=7)
 

@@ -33,7 +33,7 @@ from manip_il.seeding import rng_for, stream_base, stream_seeds
 class Agent:
     """A policy, its environments, and the demonstrations that it imitates, if any.
 
-    number, simulated: iterations and control steps so far; metrics: those of the last iteration. validated_at: control
+    number, simulated: iterations and control steps so far; metrics: of the last iteration. validated_at: control
     steps at the last validation. Raises what `start_conversion` and `read_demonstrations` raise, and `UsageError` for
     options that do not fit the demonstrations.
     """
@@ -87,15 +87,15 @@ class Agent:
         return states[:, :n], states[:, n:], np.concatenate(self.envs.executed).astype(np.float32)
 
     def log_prob(self, rows: Transitions) -> F32:
-        """Return the rows' log-densities under the learner minus their mean [nats], (N,); see `Learner.log_prob`."""
+        """Return log-density plus entropy [nats] of each row's action, (N,); see `Learner.log_prob`."""
         with threads(1):
             return self._learner.log_prob(rows)
 
     def discriminate(self, d: Discriminator, steps: Transitions) -> None:
         """Fit a discriminator to the demonstrations and the agent's steps.
 
-        The demonstrated actions get noise with the learner's initial standard deviation. Without it the discriminator
-        would only detect the learner's exploration noise, and AIRL's densities would be meaningless.
+        The demonstrated actions get noise with the learner's initial standard deviation. Without this noise the
+        discriminator would only detect the learner's exploration noise, and AIRL's densities would be meaningless.
         """
         if self._expert is None:
             raise UsageError("no demonstrations to compare the learner with; give --dataset.root=DIR")

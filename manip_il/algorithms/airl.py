@@ -9,7 +9,10 @@ from manip_il.learn.discriminators import Discriminator
 
 
 def airl(run: Run, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration: roll out the agent, fit f by D = exp f / (exp f + pi), improve the agent by f - log pi."""
+    """Yield each iteration's result: roll out the agent, fit f, improve the agent by the reward f - log pi.
+
+    The discriminator is D = exp f / (exp f + pi), with the learner's density pi.
+    """
     agent = run.agent()
     d = agent.keep(lambda actor: Discriminator(c.discriminator, actor, c.discount))
     yield from run.begin(agent)

@@ -9,7 +9,7 @@ from manip_il.algorithms.run import Run
 
 
 def cloning(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Yield each round: record demonstrations, fit to all of them, validate."""
+    """Yield each round's result: record demonstrations, fit the policy to all so far, validate."""
     data: list[Rollouts] = []
     for i in range(c.rounds + 1):
         data.append(run.demonstrations(c.episodes_per_round if i else c.demonstrations, i))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # so that `manip-il dagger --help` does not import numpy
 
 @dataclass(frozen=True)
 class BetaSchedule:
-    """A schedule `kind:parameter`. In round 0 only the expert drives: beta is 1.
+    """A schedule `kind:parameter` of beta, the share of steps that the expert drives. In round 0 beta is 1.
 
     `constant:0` lets the learner drive alone from round 1 on (the paper's parameter-free choice), `linear:5` falls
     linearly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round.
@@ -57,7 +57,7 @@ class BetaSchedule:
         return self.parameter**round_
 
 
-ALGORITHMS = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}  # keys name modules and functions
+ALGORITHMS = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}  # each key names a module and its function
 EXPERT_DRIVES = ("cloning", "dart")  # only the expert drives, so label, query and beta have no effect
 
 if TYPE_CHECKING:
@@ -77,9 +77,9 @@ class RunConfig(Seeded):
     that replaces cloning in round 0; without datasets, round 0 then has no demonstrations. Later rounds start from its
     weights and keep its architecture.
 
-    query_rule: None for the label mode's default, see `query`. hold: also applies to validation. patience: a rollout
-    without progress only repeats its states. disturbed_share: the disturbances are `manip_il.sim.events.STANDARD`.
-    cameras: those to render; with redraw, pictures are rendered after the rollouts, not recorded in them. conditions:
+    query_rule: None for the label mode's default, see `query`. hold: also applies to validation. patience: ends
+    rollouts that only repeat their states. disturbed_share: the disturbances are `manip_il.sim.events.STANDARD`.
+    cameras: the cameras to render; with redraw, not during the rollouts but for the redrawn scenes. conditions:
     variations of the world, also in validation.
     """
 
@@ -129,7 +129,7 @@ class RunConfig(Seeded):
     def __post_init__(self) -> None:
         check_bounds(self)
         if self.disturbed_share and self.env.robot in STOCK:
-            raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 for {self.env.robot}")
+            raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 for stock robot {self.env.robot}")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
             raise UsageError("redraw is for policies on pictures, with --label=per_state")
         if self.method not in ALGORITHMS:
@@ -165,7 +165,7 @@ class RunConfig(Seeded):
     def query(self) -> Query:
         """The rule that decides when the expert is queried; by default it depends on the label mode.
 
-        `per_state`: in every state; `takeover`: once; `branch`: so often that there are as many labels as steps.
+        `per_state`: in every state; `takeover`: once; `branch`: at random, for about one label per step.
         """
         from manip_il.collect.query import Query
 
@@ -175,7 +175,7 @@ class RunConfig(Seeded):
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
-    """Return how many actions a policy plans at once, and how many frames of an episode's end it does not learn."""
+    """Return how many actions a policy plans at once, and how many last frames of an episode its fit skips."""
     from manip_il.learn.lerobot_config import policy_config
 
     policy = policy_config(fit)

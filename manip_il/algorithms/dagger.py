@@ -9,7 +9,7 @@ from manip_il.algorithms.run import Run
 
 
 def dagger(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Yield each round: roll out the learner, query the expert in the visited states, aggregate, refit, validate."""
+    """Yield each round's result: roll out the learner, query the expert in its states, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)
     yield run.validate(policy)

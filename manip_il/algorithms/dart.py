@@ -17,7 +17,7 @@ from manip_il.learn.policy import LearnedPolicy, actions_along
 
 
 def dart(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Yield each round: demonstrate under noise like the learner's errors, aggregate, refit, validate."""
+    """Yield each round's result: demonstrate under noise like the learner's errors, aggregate, refit, validate."""
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)
     yield run.validate(policy)
@@ -31,8 +31,8 @@ def dart(run: Run, c: RunConfig) -> Iterator[Result]:
 def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tuple[float, ...], ...]:
     """Return the noise of the next round: the covariance (n, n) of the learner's errors on an expert's dataset.
 
-    It is the maximum likelihood fit of a Gaussian with mean zero, as in the paper. Use data that the policy was not
-    fitted to, or its errors are underestimated. trust: see `LearnedPolicy.load`. Raises `ManipError` if there is no
+    The noise is the maximum likelihood fit of a Gaussian with mean zero, as in the paper. Use data that the policy was
+    not fitted to, or its errors are underestimated. trust: see `LearnedPolicy.load`. Raises `ManipError` if there is no
     valid label.
     """
     table = Dataset.open(root).columns((STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX))

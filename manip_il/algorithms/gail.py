@@ -9,7 +9,7 @@ from manip_il.learn.discriminators import Discriminator
 
 
 def gail(run: Run, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration: roll out the agent, fit the discriminator, improve the agent by its reward."""
+    """Yield each iteration's result: roll out the agent, fit the discriminator, use its reward to improve the agent."""
     agent = run.agent()
     d = agent.keep(lambda actor: Discriminator(c.discriminator, actor))
     yield from run.begin(agent)

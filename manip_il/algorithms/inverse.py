@@ -42,7 +42,7 @@ _SIDE = 80  # points along each side of the map
 
 @dataclass(frozen=True)
 class Carried:
-    """An episode's path. positions: those of the object, from its start to the goal, (T, 3) [m]."""
+    """An episode's path. positions: of the object, from its start to the goal, (T, 3) [m]."""
 
     episode: int
     grid: Grid
@@ -125,7 +125,7 @@ class Inverse:
 
     @property
     def excess(self) -> float:
-        """Share by which the demonstrations cost more than the re-planned paths, by these weights."""
+        """Share by which the demonstrations cost more than the re-planned paths, at the learnt weights."""
         shown, planned = self.means
         return float(shown @ self.weights / (planned @ self.weights) - 1)
 

@@ -16,7 +16,7 @@ LONGER = 1.5  # default episode length relative to the longest demonstration
 class LearningConfig(Seeded):
     """Options of a reinforcement learning run. method: `gail`, `airl` or `ppo`. datasets: demonstrations.
 
-    start, reward: `pretrained_model` folders of a clone and of `ppo`'s reward.
+    start, reward: `pretrained_model` folders of the policy to start from and, for `ppo`, of the reward.
     Raises `UsageError` for a number out of range.
     """
 
@@ -37,7 +37,7 @@ class LearningConfig(Seeded):
     )
     log_std: float | None = option(
         None,
-        "log of the initial action noise in standard deviations of the demonstrations; by default -0.5, -1 with --init",
+        "log of initial action noise in standard deviations of demonstrated actions; by default -0.5, -1 with --init",
         at_least=-4,
         at_most=2,
     )
@@ -66,7 +66,7 @@ class LearningConfig(Seeded):
 
     @property
     def warmup_iterations(self) -> int:
-        """Iterations before the actor is updated: an untrained critic would ruin a clone."""
+        """Iterations that update only the critic, because an untrained critic would ruin a cloned actor."""
         if self.warmup is not None:
             return self.warmup
         return 0 if self.start is None else 10

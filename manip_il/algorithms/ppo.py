@@ -11,9 +11,10 @@ from manip_il.learn.transitions import F32
 
 
 def ppo(run: Run, c: LearningConfig, reward: Callable[..., F32] | None = None) -> Iterator[Result]:
-    """Yield each iteration: roll out the agent and improve it by `reward`; the default is the one in `c.reward`.
+    """Yield each iteration's result: roll out the agent and improve it with `reward`.
 
-    reward: maps joint states (N, n), environment states (N, k) and absolute actions (N, n) to rewards (N,).
+    reward: maps joint states (N, n), environment states (N, k) and absolute actions (N, n) to rewards (N,); by default
+    the reward in the folder `c.reward`.
     """
     reward = reward or LearnedReward.load(c.reward or Path())
     agent = run.agent()

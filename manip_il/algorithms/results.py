@@ -25,12 +25,12 @@ VALIDATION = "validation"
 
 @dataclass(frozen=True)
 class Watch:
-    """Callbacks for a run's progress. An exception from one ends the run; files already written remain."""
+    """Callbacks for a run's progress. An exception from a callback ends the run; files already written remain."""
 
     on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
     on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
     on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} for a step without metrics
-    on_step: Callable[[], None] = lambda: None  # for any other step
+    on_step: Callable[[], None] = lambda: None  # for any step without another callback
 
 
 class Stopwatch:
@@ -56,7 +56,7 @@ class Stopwatch:
 class Result:
     """One finished round of imitation, or iteration of reinforcement learning; iteration 0 is the initial policy.
 
-    steps, episodes: simulated so far. metrics: the method's, such as `labels`, the valid labels learnt from so far.
+    steps, episodes: simulated so far. metrics: of the method, such as `labels`, the valid labels learnt from so far.
     policy: the checkpoint. validated: None if no validation was due. seconds: by stage; 0 for stages that were already
     on disk.
     """

@@ -78,7 +78,7 @@ def round_folder(folder: Path, round_: int) -> Path:
 
 
 def mixture(policy: Fitted, beta: float) -> PolicyDriver:
-    """Return a driver: in each step the expert with probability beta, else the learner (Ross et al. 2011)."""
+    """Return a driver: at each step the expert acts with probability beta, else the learner (Ross et al. 2011)."""
     return PolicyDriver(policy.members, beta, policy.trust)
 
 
@@ -127,7 +127,7 @@ def given_rollouts(folder: Path, datasets: Sequence[Path], repo_id: str) -> Roll
 
 
 def merge_rounds(datasets: Sequence[Path], root: Path, repo_id: str, best: int) -> None:
-    """Write all rounds' labels as one dataset, unless it exists. best: the best round, stored in its provenance."""
+    """Write all rounds' labels as one dataset, unless it exists. best: number of the best round, for the provenance."""
 
     def episodes(dataset: Path) -> int:
         return Dataset.open(dataset).info.episodes
@@ -144,7 +144,7 @@ def _count_labels(root: Path) -> int:
 def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
     """Return the scenes to redraw from the states of the last dataset.
 
-    There are as many scenes per state as in round 0; their numbers continue those of earlier rounds.
+    There are as many scenes per state as in round 0. Scene numbers continue from the earlier rounds.
     """
     assert config.cameras is not None
     states = [len(Dataset.open(dataset)) for dataset in datasets]
@@ -166,7 +166,7 @@ def fit_round(
 ) -> Path:
     """Fit a round's policy to datasets, or resume the fit; return the checkpoint's `pretrained_model`.
 
-    member: index in the ensemble. on_log: is called with each step's metrics, {} if there are none.
+    member: index in the ensemble. on_log: called with each step's metrics, {} if there are none.
     """
     from manip_il.learn.train import Trainer  # rollouts alone do not need torch
 
@@ -175,9 +175,10 @@ def fit_round(
 
 
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
-    """Return the options of one round's fit. init_from: the policy that a warm fit starts from.
+    """Return the options of one round's fit. init_from: policy from which a warm fit starts.
 
-    Without it, a fit starts from the run's start policy, if any. member: index in the ensemble; each has its own seed.
+    If None, the fit starts from the run's start policy, if any. member: index in the ensemble; each member has its own
+    seed.
     """
     steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
     if init_from is not None:

@@ -80,13 +80,13 @@ class Run:
         self._fitted: Fitted | None = None
 
     def results(self) -> Iterator[Result]:
-        """Run or resume the method's loop: the function named like the method, in the module of that name."""
+        """Run or resume the loop of `config.method`, such as `dagger.dagger`, and yield its results."""
         name = self.config.method
         loop = getattr(importlib.import_module(f"manip_il.algorithms.{name}"), name)
         return self.follow(loop(self, self.config))
 
     def follow(self, results: Iterator[Result]) -> Iterator[Result]:
-        """Yield the results of a loop over this run's steps, until it ends or the label budget is spent.
+        """Yield the results of a method's loop until the loop ends or the label budget is spent.
 
         Rounds that were already finished are yielded again. At the end, `dataset` holds the labels of all rounds.
         """
@@ -166,7 +166,7 @@ class Run:
         return self._made[round_]
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
-        """Fit the policy, or all members of an ensemble, to rollouts; its round is that of the last rollouts."""
+        """Fit the policy, or all members of an ensemble, to `data`; it belongs to the round of the last rollouts."""
         config, before, round_ = self.config, self._fitted, data[-1].round
         here, members = self._folder(round_), list[Path]()
         if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
@@ -217,7 +217,7 @@ class Run:
     def begin(self, agent: Agent) -> Iterator[Result]:
         """Load the agent's last finished iteration and yield it; without one, yield the initial clone, if any.
 
-        So an iteration gets its line in `metrics.jsonl` even if the run was killed right after saving its checkpoint.
+        An iteration thus gets its line in `metrics.jsonl` even if the run was killed right after saving its checkpoint.
         """
         checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
         if checkpoint is not None:
@@ -237,7 +237,7 @@ class Run:
         return self._iteration(agent, folder / "last" / PRETRAINED_MODEL)
 
     def _iteration(self, agent: Agent, policy: Path) -> Result:
-        """The result of an agent's iteration, with a validation if one is due; iteration 0 is always validated."""
+        """The result of an agent's iteration, validated if validation is due; iteration 0 is always validated."""
         every, validated = self.config.validation_every, None
         due = agent.simulated // every != agent.validated_at // every
         if due or agent.simulated >= self.config.steps or agent.number == 0:
@@ -289,7 +289,7 @@ class Run:
         return max(0, self.config.label_budget - spent)
 
     def _training_dataset(self, rollouts: Rollouts, dataset: Path) -> Path:
-        """A round's training dataset: its own, or redrawn scenes of its states."""
+        """The dataset that a round's policy learns from: the recorded one, or scenes redrawn from its states."""
         root = self._folder(rollouts.round) / REDRAWN
         if not self.config.redraw:
             return dataset

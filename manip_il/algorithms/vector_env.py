@@ -60,7 +60,7 @@ class RobotEpisode:
 
 @dataclass(frozen=True)
 class ActionRange:
-    """Mean, scale and range of raw targets, (n,) each. A normalised action y is the target mean + scale y, clipped."""
+    """Mean, scale and range of raw targets, (n,) each. Normalised y stands for mean + scale y, clipped to the range."""
 
     mean: F32
     scale: F32
@@ -131,7 +131,7 @@ class Unending(gymnasium.Env[F32, Any]):
 class Lockstep(DummyVecEnv):
     """Parallel episodes of equal length. `seed(s)` gives them the seeds s, s + 1, ... at the next `reset`.
 
-    conversion: from the policy's raw targets to actions; it needs the measured joints, which are the first inputs.
+    conversion: turns the policy's raw targets into actions, given the measured joints, which are the first inputs.
     executed: actions (T, B, n) since `reset`.
     """
 
@@ -162,7 +162,7 @@ class Lockstep(DummyVecEnv):
 
     @override
     def step_async(self, actions: F32) -> None:
-        """Step with normalised actions (B, n), which are converted to actions for all episodes at once."""
+        """Step all episodes with normalised actions (B, n), converted to executed actions in one call."""
         targets = self.range.raw(actions).astype(np.float32)
         running = [row for row, one in enumerate(self.envs) if not one.episode.ended]
         executed = np.zeros(targets.shape)

@@ -8,6 +8,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, Open, given
+from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
@@ -42,13 +43,16 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
     return make_config(**values)
 
 
-_FILES = (".py", ".yaml", ".yml")  # of a user's own task or robot
+_FILES = (".py", ".yaml", ".yml")  # suffixes of files with a user's own task or robot
 
 
 def own_files(env: EnvConfig) -> str:
-    """Return the options of an environment that no dataset or policy holds: paths, and changed limits."""
+    """Return as text those options of an environment that no dataset or policy stores: paths, and changed limits."""
     named = {"robot": env.robot, "task": env.task}
-    usual = make_config(env.robot, env.task, env.control_hz, object=env.object)
+    try:
+        usual = make_config(env.robot, env.task, env.control_hz, object=env.object)
+    except ManipError:  # the user's file was edited or deleted meanwhile
+        usual = env
     limits = [name for name in ("tolerance", "horizon", "success_steps") if getattr(env, name) != getattr(usual, name)]
     paths = "".join(f" --{what}.type={quote(name)}" for what, name in named.items() if name.endswith(_FILES))
     return paths + "".join(f" --env.{name}={getattr(env, name):g}" for name in limits)

@@ -65,7 +65,7 @@ class StudyFile(ComparisonOptions):
     arms: Open = field(default_factory=dict[str, Any])
     training_seeds: int = option(3, "runs of every arm", at_least=1, at_most=MAX_SEED, grows=True)
     baseline: str | None = option(None, "the arm to compare others with; by default the first")
-    target: float = option(0.95, "validation success for which the cost is reported", at_least=0.0, at_most=1.0)
+    target: float = option(0.95, "report the cost of this validation success", at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
     )
     env: Given = given(EnvConfig, **OF_POLICY)
     training_seeds: int | None = option(
-        None, "seeds of a study, instead of the file's; a resumed study may have more", at_least=1, free=True
+        None, "number of seeds of a study, instead of the file's; may grow with --resume=true", at_least=1, free=True
     )
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")
@@ -103,7 +103,7 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
                 plain = CompareOptions(sides=self.sides)
                 for name in ("eval", "checkpoint", "at", "env"):
                     if getattr(self, name) != getattr(plain, name):
-                        raise UsageError(f"--{name} cannot be combined with a study; set it in {file}")
+                        raise UsageError(f"options of {name} cannot be combined with a study; set them in {file}")
                 self._run_study(file)
             case [left, right]:
                 self._compare(left, right)
@@ -117,12 +117,14 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
 
         plan = read_plan(path, self.training_seeds, self.trust)
         file = plan.file
-        with self.output.open(file) as folder:
+        with self.output.open(file, path) as folder:
             plan.run(folder, self.engine)
             arms = [replace(read_arm(folder / name), name=name) for name in plan.arms]
             rule, arms = select_rounds(Rule(file.checkpoint, file.at), arms)
-            alike = {arm.name: arms if plan.baseline else [arm] for arm in arms}  # with the same conditions
-            trials = [self._trial(plan.envs[arm.name], alike[arm.name], file.eval.n_episodes) for arm in arms]
+            if plan.baseline:  # all arms have one environment, and the same conditions
+                trials = [self._trial(plan.envs[plan.baseline], arms, file.eval.n_episodes)] * len(arms)
+            else:
+                trials = [self._trial(plan.envs[arm.name], [arm], file.eval.n_episodes) for arm in arms]
             study = Study(self._measure(arms, trials, folder), plan.baseline, rule, file.target)
             result = study.arms[0].members[0].test
             what = f"{result.robot} {result.task}" if plan.baseline else result.robot
@@ -205,7 +207,7 @@ class StudyPlan(NamedTuple):
 def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:
     """Return the study in `path`; raises a one-line `UsageError` if something is invalid.
 
-    training_seeds: replaces the number in the file. trust: as `--trust` of every run.
+    training_seeds: replaces the number in the file. trust: `--trust` for every run.
     """
     from manip_il.evaluation.arm import require_same_env
 

@@ -43,7 +43,8 @@ class DaggerOptions(Varied, Trusting):
     env: Given = given(EnvConfig)
     method: Method = option(
         "dagger",
-        "who drives after round 0: the learner, the expert, or the expert with noise like the learner's errors",
+        "who drives after round 0: the learner (dagger), the expert (cloning), or the expert with noise like the "
+        "learner's errors (dart)",
     )
     dataset: DatasetRoots = group(DatasetRoots([]))
     settings: Given = given(RunConfig, prefix="")
@@ -147,7 +148,7 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
 
 
 def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, **parts: Any) -> None:
-    """Write the report in `folder` on the policies of `run`: their table, and success over costs.
+    """Write to `folder` the report on the policies of `run`: their table, and curves of success over cost.
 
     kind: the algorithm's name. parts: see `run_report`.
     """

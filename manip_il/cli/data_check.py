@@ -117,7 +117,7 @@ class ScoreOptions(OfDataset):
         else:
             raise ManipError(f"{self.dataset} has no progress column; give --reward=FOLDER")
         scores = scoring.Scores(str(self.dataset), self.reward, data, found)
-        with self.output.open(self) as folder:
+        with self.output.open(self, Path(self.reward).expanduser()) as folder:
             scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
             worst = [scoring.worst_table(scores)]
             publish(folder / scoring.FILE_NAME, scores.to_json(), worst, *scoring.fact_lines(scores))

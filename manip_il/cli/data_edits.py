@@ -27,7 +27,7 @@ _RUN = "dataset"  # folder of a DAgger run with the states of all rounds
 class BuildOptions(Replacing):
     """Build a LeRobot dataset from a folder of journals.
 
-    The same journals give the same bytes as manip-il record.
+    The dataset has the same bytes as the one that manip-il record writes with these journals.
     """
 
     example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
@@ -88,7 +88,7 @@ class Edit(Replacing):
     ) -> Generator[tuple[EditSource, EditTarget]]:
         """Yield the dataset to read and the new dataset's locked folder, and show progress.
 
-        root: the dataset, by default `source`. pieces: number of steps of the progress, by default one per episode.
+        root: the dataset, by default `source`. pieces: total of the progress bar, by default the number of episodes.
         """
         from manip_il.collect.edits import EditTarget, open_source
         from manip_il.collect.workers import default_workers
@@ -160,11 +160,13 @@ class RedrawOptions(Edit, Varied, Seeded):
         """Draw all scenes; TARGET appears when it is complete."""
         from manip_il.collect.edits import redraw_dataset
         from manip_il.collect.scenes import CHUNK, Scenes
+        from manip_il.tasks.stock.envs import check_cameras
 
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
         with self.open("redrawn", root, -(-self.frames // CHUNK)) as (source, target):
             conditions = varied(self.vary, source.env, sees=True)
-            cameras = self.camera_config(source.env)  # refuses environments without cameras, also for states alone
+            cameras = self.camera_config(source.env)
+            check_cameras(source.env.robot, cameras)  # also for states alone
             cameras = cameras if self.pictures else None
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)

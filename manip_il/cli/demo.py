@@ -32,9 +32,9 @@ FIT: Given = {"steps": 3_000, "batch_size": 256}
 class DemoOptions:
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
-    Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
-    the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows the result. The policy is an mlp; for
-    other policies use manip-il train and manip-il dagger.
+    Compares the expert, the cloned policy, a policy cloned from as many labels as DAgger used, and DAgger's best round
+    on the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows the result. The policies are mlps;
+    for other kinds use manip-il train and manip-il dagger.
     """
 
     example: ClassVar[str] = "manip-il demo --output_dir=runs/demo"

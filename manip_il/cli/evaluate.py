@@ -108,7 +108,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         engine.warm_up(learned=self.policy.path is not None)  # meanwhile this process checks the policy
         job, suite, width = self._job(), self.suite, self.until_width
         with self.output.open(self) as folder:
-            finished_episodes(folder, job, suite)  # raises if they are another policy's
+            finished_episodes(folder, job, suite)  # raises if the folder has another policy's episodes
             with Stages(f"finished episodes, in {folder}") as stages, engine:
                 result = measure(engine, job, seeds, name, folder, stages, suite=suite, until_width=width)
                 films = film_outcomes(engine, job, result, self.eval.films, stages)

@@ -30,7 +30,7 @@ _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 def round_policy(settings: Open) -> tuple[Open, Path | None]:
     """Return the policy options of the later rounds, and the `pretrained_model` folder to start from, if any.
 
-    The options of a starting mlp are listed explicitly, because they are needed before LeRobot is imported.
+    For an mlp to start from, its options replace `path`, because they are needed before LeRobot is imported.
     """
     if "path" not in settings:
         return settings, None
@@ -90,10 +90,10 @@ def differences(dataset: Dataset) -> list[str]:
 def open_driver(
     policy: Path | None, kind: str, env: Given | EnvConfig, *, trust: bool = False, device: str = "cpu"
 ) -> tuple[EnvConfig, Driver, CameraConfig | None]:
-    """Return the environment, the checked driver and the cameras whose pictures it takes.
+    """Return the environment, the checked driver and the cameras whose pictures the driver takes.
 
-    policy: a checkpoint or a run, else `kind`: expert, random or sliders. env: an environment, or options, completed
-    from the policy. device: where a checkpoint runs. Raises what `check_policy` raises.
+    policy: a checkpoint or a run; if None, `kind` drives: expert, random or sliders. env: an environment, or options
+    that the policy's checkpoint completes. device: where a checkpoint runs. Raises what `check_policy` raises.
     """
     if policy is None:
         return env_config(env) if isinstance(env, dict) else env, driver_of(kind), None
@@ -103,9 +103,9 @@ def open_driver(
 
 
 def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False) -> CameraConfig | None:
-    """Return the cameras whose pictures the policy takes, if any; warn if its task or model differs.
+    """Return the cameras whose pictures the policy takes, if any; warn if its task or model differs from `env`.
 
-    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if it needs `trust`.
+    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if loading it needs `trust`.
     """
     path, origin, cameras = checkpoint.path, checkpoint.origin, checkpoint.cameras
     spec = env_spec(env, cameras)

@@ -94,7 +94,7 @@ class GailOptions(Learning):
 class AirlOptions(GailOptions):
     """Imitate demonstrations by adversarial inverse reinforcement learning (AIRL).
 
-    Like `manip-il rl gail`, with a discriminator in the form of a reward: exp f / (exp f + pi).
+    Like `manip-il rl gail`, with the discriminator exp f / (exp f + pi): f is a learnt reward, pi the policy's density.
     """
 
     method: ClassVar[str] = "airl"

@@ -26,7 +26,7 @@ EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
 
 class Command(NamedTuple):
-    """target: `module:OptionsClass` in `manip_il.cli`, imported when the command runs."""
+    """A command. target: `module:OptionsClass` in `manip_il.cli`, imported when the command runs."""
 
     target: str
     summary: str

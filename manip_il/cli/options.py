@@ -1,9 +1,9 @@
 """Options of commands: the fields of their dataclasses, the values that a type accepts, and their names in help.
 
-A field's type is int, float, bool, str, Path, a `Literal` of names, a list of those, one of those or None, a class with
-`parse` and `str` (`linear:5`), another dataclass (a group, `--dataset.root`), or `Open`: a dict of a group whose
-options only another program knows (`--policy.*`). `given(Config)` is a dict of those options of `Config` that the user
-gave; the command makes a `Config` from them.
+A field's type is int, float, bool, str, Path or a `Literal` of names; one of these or None; a list of one of these; a
+class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a dict of a
+group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of `Config` that
+the user gave; the command makes a `Config` from them.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **ow
 class Option:
     """One option of a command. default: `MISSING` if the user must give a value.
 
-    path: attributes and keys from the command's options to its value. metadata: `help`, one line; `positional` for a
-    value without a name; `command_line_only` for an option that no file may set; `exists` for a path to read: its
-    prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free` and `grows` for an option
-    that a resumed run may change (see `check_same_options`).
+    path: attributes and keys that lead from the command's options to its value. metadata: `help`, one line;
+    `positional` for a value without a name; `command_line_only` for an option that no file may set; `exists` for a path
+    that must exist, with its prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free`
+    and `grows` for an option that a resumed run may change (see `check_same_options`).
     """
 
     name: str  # dotted: `dataset.root`
@@ -73,12 +73,12 @@ class Option:
 
     @property
     def is_list(self) -> bool:
-        """Whether it takes several values."""
+        """Whether the option takes several values."""
         return typing.get_origin(self.type) is list
 
     @property
     def is_open(self) -> bool:
-        """Whether it is a group of options whose names only another program knows."""
+        """Whether the option is a group of options whose names only another program knows."""
         return typing.get_origin(self.type) in (dict, Mapping)
 
     def value(self, options: Any) -> Any:
@@ -89,7 +89,7 @@ class Option:
 
 
 def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()) -> list[Option]:
-    """Return all options of a dataclass, groups expanded, shared options last. base: an instance with the defaults."""
+    """Return all options of a dataclass, groups expanded, keyword-only ones last. base: instance with the defaults."""
     found: list[Option] = []
     for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
         inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
@@ -115,7 +115,7 @@ def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
 
 
 def type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
-    """Return the type of one field of a dataclass; the names in other fields' types need not exist at run time."""
+    """Return the type of one field of a dataclass. The annotations of its other fields are not evaluated."""
     home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
     return eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
 
@@ -140,7 +140,7 @@ def _plain(value: Any) -> Any:
 
 
 def command_line() -> str:
-    """Return the command that was typed, to copy."""
+    """Return the command as typed, quoted for a shell."""
     return shlex.join(["manip-il", *sys.argv[1:]])
 
 
@@ -163,7 +163,7 @@ def metavar(option_type: Any) -> str:
 
 
 def from_word(option_type: Any, word: str) -> Any:
-    """Return a word of the command line as YAML would read it, with `null` and comma-separated lists."""
+    """Return the value of a command-line word: None for `null`, texts for a list type, else the word itself."""
     if (some := without_none(option_type)) is not option_type:
         return None if word.lower() in ("null", "none") else from_word(some, word)
     if typing.get_origin(option_type) is not list:

@@ -45,14 +45,14 @@ class Output(Replacing):
     output_dir: Path = option(MISSING, "output folder", free=True)
 
     @contextmanager
-    def open(self, options: Any) -> Generator[Path]:
+    def open(self, options: Any, *sources: Path) -> Generator[Path]:
         """Lock and prepare the folder, and write the options to `config.yaml`; a resumed run must have the same ones.
 
         Raises what `prepare_output` and `check_same_options` raise.
         """
         folder, resume = self.output_dir, getattr(self, "resume", False)
         with exclusive(folder):
-            prepare_output(folder, resume=resume, overwrite=self.overwrite, sources=_inputs(options))
+            prepare_output(folder, resume=resume, overwrite=self.overwrite, sources=[*_inputs(options), *sources])
             if resume:
                 check_same_options(folder, options)
             save_options(folder, options)
@@ -64,10 +64,11 @@ def _inputs(options: Any) -> list[Path]:
     found = list[Path]()
     for one in options_of(type(options)):
         value = one.value(options)
-        value = value.get("path") if isinstance(value, dict) else value  # `--policy.path` of a fit
+        if isinstance(value, dict):  # `--policy.path` and `--policy.states` of a fit
+            value = [value[name] for name in ("path", "states") if isinstance(value.get(name), str)]
         if one.name != "output_dir":
             items = value if isinstance(value, list) else [value]
-            found += [Path(item) for item in items if isinstance(item, Path) or (one.is_open and item)]
+            found += [Path(item).expanduser() for item in items if isinstance(item, Path) or one.is_open]
     return found
 
 
@@ -146,10 +147,10 @@ def save_options(folder: Path, options: Any) -> None:
 
 
 def check_same_options(folder: Path, options: Any) -> None:
-    """Raise `MismatchError` naming the option, unless the run in `folder` was started with the same options.
+    """Raise `MismatchError`, which names the option, unless the run in `folder` was started with the same options.
 
     Options with `free` in their metadata may differ, those with `grows` may increase. A missing or empty folder is
-    accepted; one without `config.yaml` is not ours (`UsageError`).
+    accepted; any other one without `config.yaml` is a `UsageError`.
     """
     path = folder / CONFIG_FILE
     # A run that was killed at the start leaves at most a partial file with a hidden name.

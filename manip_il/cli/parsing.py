@@ -70,9 +70,9 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
 
 
 def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: dict[str, _Value] | None = None) -> T:
-    """Read options from trees read from YAML; later trees override earlier ones, and `words` override all.
+    """Read options from trees of YAML; later trees override earlier ones, and `words` override all.
 
-    layers: pairs of a tree's origin, for error messages, and the tree. Raises `UsageError` as `parse` does.
+    layers: pairs (origin, tree); error messages name the origin. Raises `UsageError` as `parse` does.
     """
     known, raw = {option.name: option for option in options_of(cls)}, dict[str, _Value]()
     for origin, tree in layers:
@@ -111,7 +111,7 @@ def dump_yaml(options: Any) -> str:
 
 
 def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _Value]:
-    """Return each option's value as given."""
+    """Return each option's value as given on the command line."""
     raw: dict[str, _Value] = {}
     places = [option for option in known.values() if option.positional]
     rest = list(words)

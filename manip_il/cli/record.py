@@ -38,7 +38,7 @@ class RecordOptions(Varied, Seeded, Resumable):
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
     Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
-    --resume=true continues a recording, which may then have more episodes.
+    --resume=true continues a recording; --dataset.num_episodes may then be larger.
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"

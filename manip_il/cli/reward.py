@@ -27,7 +27,7 @@ class OfPairs:
 class IrlOptions(OfDataset, Seeded):
     """Learn the weights of a reward from a dataset of demonstrations of the task carry.
 
-    Writes reward.json, for --task.type=carry:FILE, and report.html: the weights and the cost over the table.
+    Writes reward.json, for --task.type=carry:FILE, and report.html, with the weights and maps of the cost.
     """
 
     example: ClassVar[str] = "manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl"

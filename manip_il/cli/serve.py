@@ -18,16 +18,16 @@ from manip_il.tasks.config import EnvConfig
 
 SERVO = "servo"  # a value of --vary
 
-_IDLE = ("dynamics", "sensing", "late", "random_actions")  # servos and encoders have options of their own
+_IDLE = ("late", "random_actions")  # suites that a served arm does not show
 
 
 @dataclass(frozen=True)
 class ServeOptions(Varied, Trusting):
     """Run a simulated SO-101 behind serial ports, which LeRobot's own programs open like those of a real arm.
 
-    Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that program on them and
-    presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded again.
-    --vary also takes servo. A policy at the leader (--leader=runs/lift) sets the default task and cameras.
+    Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that program on the ports
+    and presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded
+    again. --vary also takes servo. A policy as the leader (--leader=runs/lift) sets the default task and cameras.
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 class TheoryOptions:
     """Compare the proven bounds of cloning and DAgger with exactly solved MDPs, linear systems and the arm.
 
-    Writes report.html and theory.json. SOURCE is a run of `manip-il dagger`, whose distribution shift is compared round
-    by round with the theorem's bound.
+    Writes report.html and theory.json. SOURCE is a run of `manip-il dagger`: for every round, the policy's
+    distribution shift and its excess cost are measured, and the cost is compared with DAgger's bound.
     """
 
     example: ClassVar[str] = "manip-il theory runs/dagger --output_dir=runs/theory"
     source: Path | None = option(None, "a run of manip-il dagger, to measure its rounds", positional=True, exists="")
     episodes: int = option(50, "episodes of the expert and of every round's policy", at_least=2)
-    cases: int = option(30, "wrong actions of each kind, to measure what one costs the expert", at_least=1)
+    cases: int = option(30, "wrong actions of each kind, to measure how many steps one costs the expert", at_least=1)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: Output = group(Output(Path("runs/theory")), prefix="")
 
@@ -52,8 +52,10 @@ class TheoryOptions:
         from manip_il.theory.shift import find_rounds, measure_shift
 
         rounds = find_rounds(run)
-        env = read_arm(run).members[0].env()
+        member = read_arm(run).members[0]
+        env = member.env()
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
         with progress(count, f"theory {run}") as bar, self.engine.open() as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.step())
-            return measure_shift(engine, env, rounds, certificate.mu or 0, self.episodes, lambda _: bar.step())
+            u, conditions = certificate.mu or 0, member.conditions
+            return measure_shift(engine, env, rounds, u, self.episodes, lambda _: bar.step(), conditions)

@@ -67,7 +67,7 @@ class TrainOptions(Seeded, Trusting):
         language = config.kind not in PLAIN
         datasets = open_datasets(self.dataset.root, pictures=config.takes_images, language=language)
         for one in datasets:
-            input_columns(config, one.root, one.info)  # raises if the dataset lacks one
+            input_columns(config, one.root, one.info)  # raises if the dataset lacks an input
         # Imported after the datasets are checked: these take seconds.
         from manip_il.learn.lerobot_config import lerobot_options
         from manip_il.learn.samples import rabc_weights

@@ -147,7 +147,7 @@ class McapImportOptions:
     """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in order of file names.
 
     The mapping names the topic and field of every column, and how its messages are resampled to the dataset's rate:
-    nearest or previous, with a tolerance in seconds. A longer gap is an error.
+    nearest or previous, with a tolerance in seconds. A gap longer than the tolerance is an error.
     """
 
     example: ClassVar[str] = "manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"

@@ -48,7 +48,7 @@ class ViewOptions(Tested, Seeded, Trusting):
     first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
-    n_episodes: int | None = option(None, f"episodes; by default unlimited, {IN_A_FILE} in a file", at_least=1)
+    n_episodes: int | None = option(None, f"episodes; by default unlimited, or {IN_A_FILE} with --output", at_least=1)
     output: Path | None = option(None, "write a Rerun file, FILE.rrd, instead of showing episodes")
 
     def run(self) -> None:

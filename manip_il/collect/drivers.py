@@ -54,7 +54,7 @@ class Driver:
         return "mixture" if self.policies and self.beta > 0 else self.kind
 
     def start(self, setting: Setting) -> Act:
-        """Return the function that acts, for the episodes of one process."""
+        """Return the function that chooses actions, for the episodes of one process."""
         raise NotImplementedError
 
 
@@ -91,7 +91,7 @@ class NoisyExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class RandomDriver(Driver):
-    """Draws joint targets uniformly within the longest step of the measured joints, and any gripper opening."""
+    """Draws joint targets uniformly within the longest step from the measured joints, and any gripper opening."""
 
     kind = "random"
 
@@ -105,8 +105,8 @@ class RandomDriver(Driver):
 class PolicyDriver(Driver):
     """Executes the policy's action, or with probability beta the expert's: pi_i = beta pi* + (1 - beta) pi_hat.
 
-    policies: the first one drives; a query rule may compare the others with it. trust: whether models that the
-    checkpoints name may be loaded. device: torch device of the policies. (Ross et al. 2011)
+    policies: the first one drives; a query rule may compare the others with it. trust: whether to load models
+    that the checkpoints name. device: torch device of the policies. (Ross et al. 2011)
     """
 
     kind = "policy"

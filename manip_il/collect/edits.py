@@ -70,8 +70,8 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
     given = env_spec(env)
     for what in ("robot", "task", "object"):
         if getattr(given, what) != getattr(spec, what):
-            raise MismatchError(what, str(root), getattr(spec, what), "the given one", getattr(given, what))
-    lacks = given.sim_state_size - spec.sim_state_size  # states of older versions hold fewer drawn numbers
+            raise MismatchError(what, str(root), getattr(spec, what), f"the given {what}", getattr(given, what))
+    lacks = given.sim_state_size - spec.sim_state_size  # number of values that states of older versions lack
     if lacks not in (0, *OLDER):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", given.sim_state_size)
     here, there = env_fingerprint(env), dataset.fingerprint
@@ -99,8 +99,8 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     """Write `source` with the expert's label of every state; all other columns and pictures stay the same.
 
     States in which the expert was not queried get a label, too. Returns the number of frames whose label changed in its
-    action by more than `NOTICEABLE`, in phase, or in validity. Raises what reading and `rewrite_columns` raise, and
-    `ManipError` if a worker dies.
+    action by more than `NOTICEABLE`, in phase, or in validity. Raises what `Dataset.read_episodes` and
+    `rewrite_columns` raise, and `ManipError` if a worker dies.
     """
     scale, dataset = env_actions(source.env).scale, source.dataset
     changed = 0
@@ -125,7 +125,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
 def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget) -> Info:
     """Write `source` with the pictures of these cameras instead of its own; all other columns stay the same.
 
-    Raises `RenderError` if there is no OpenGL, and what reading and `write_dataset` raise.
+    Raises `RenderError` if there is no OpenGL, and what `Dataset.read_episodes` and `write_dataset` raise.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
     spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
@@ -231,7 +231,7 @@ def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> 
 
 
 def _leads(source: EditSource, columns: Columns) -> NDArray[np.float64]:
-    """Return recorded labels minus the expert's, (T, n): the servos' sag if `serve --log=` recorded them, else 0."""
+    """Return recorded minus expert labels, (T, n), which is the servos' sag, in logs of `serve --log=`; else 0."""
     action = columns[schema.ACTION].astype(np.float64)
     if source.dataset.provenance.get("driver") != SERVED:
         return np.zeros_like(action)

@@ -37,7 +37,7 @@ from manip_il.tasks.stock.envs import check_cameras, described_stock, make_stock
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 from manip_il.tasks.table import TASKS, get_task, is_task, source_hash
 
-_TURNED = ("carry", "insert", "press")  # their furniture is drawn as it is turned, unlike in the version before
+_TURNED = ("carry", "insert", "insert_tight", "press")  # tasks whose furniture older versions rendered without its yaw
 
 
 def is_known(robot: str, task: str, shape: str = "") -> bool:
@@ -124,12 +124,12 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         settings["robot"], (settings["task"], _, argument) = robot.name, task.name.partition(":")
         settings |= {"reward": argument} if argument else {}  # as in older fingerprints, where only carry has it
         own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
-        if robot.name not in ROBOTS:  # what its YAML says and what is found in its model, wherever the files are
+        if robot.name not in ROBOTS:  # hashes its values, not the paths of its files
             said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))
             own |= {"robot_sha256": hashlib.sha256(repr(said).encode()).hexdigest()}
         mesh = Shape.parse(config.object).mesh if config.object else None
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
-    if not config.object:  # as in versions without objects
+    if not config.object:  # as in fingerprints of versions that had no `object`
         del settings["object"]
     made = described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)
     return environment_fingerprint(model_bytes(made.model), settings) | own

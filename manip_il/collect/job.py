@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # torch is imported only if a learner drives
     from manip_il.learn.policy import LearnedPolicy
 
 LOCKSTEP = 25  # environments that share one call of the policy
-OWN_MODELS = 8  # the same if each environment needs its own model, which is 26 MB for the Panda
+OWN_MODELS = 8  # lockstep limit if each environment has its own model (26 MB for the Panda)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class RolloutJob:
 
     hold: end an episode this many steps after success; None: at the horizon. patience: end it after this many steps
     without progress. label: what the expert returns in the states that `query` selects. branch_steps: length of a
-    branch. conditions: randomisation of the world, alternating by seed. batch: largest number of episodes that share
+    branch. conditions: randomisations of the world, taken in turn by seed. batch: largest number of episodes that share
     a policy call; does not change outcomes. cameras: recorded in every step; None for none. A policy always gets the
     pictures that it needs.
     """
@@ -89,13 +89,13 @@ class RolloutJob:
             return to_episode(frames, self.round, beta, labelled=False)
         if self.label == "takeover":
             frames = cut_at_takeover(frames, self.env.horizon)
-            own = next(place for place, frame in enumerate(frames, 1) if frame.done)  # the learner's part decides
+            own = next(place for place, frame in enumerate(frames, 1) if frame.done)  # the learner's frames decide
             return to_episode(frames, self.round, beta, path=own)
         frames = labelled(frames, self.query, expert)
         if branch_env is None:
             return to_episode(frames, self.round, beta)
         path = [replace(frame, label=None) for frame in frames]
-        branch_env.start(frames[0].seed)  # which draws the noise of observations
+        branch_env.start(frames[0].seed)  # draws the noise of its observations
         starts = [frame for frame in frames if frame.label is not None and frame.label.valid]
         found = (branch(branch_env, expert, one.state, one.seed, self.branch_steps) for one in starts)
         return to_episode([*path, *itertools.chain(*found)], self.round, beta, path=len(path))

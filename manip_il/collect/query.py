@@ -1,7 +1,7 @@
 """When the expert is queried, and what it returns.
 
 A rule is written `kind` or `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`. `rollout` applies it
-in every step to the learner's actions; the expert is queried for labels nowhere else. Differences between actions are
+in every step to the learner's actions; `labelled` applies `one` after the episode. Differences between actions are
 divided by each dimension's longest step, and the largest quotient is compared with the bound, so that a bound means the
 same for every robot.
 """
@@ -26,8 +26,8 @@ F64 = NDArray[np.float64]
 LabelMode = Literal["per_state", "takeover", "branch", "last"]
 """What the expert returns when it is queried.
 
-`per_state`: its label. `takeover`: it drives to the end, with its own horizon. `branch`: it drives some steps in a copy
-of the simulator. `last`: only the label of the last state, for its phase.
+`per_state`: its label. `takeover`: the expert drives to the end, with its own horizon. `branch`: the expert drives some
+steps in a copy of the simulator. `last`: only the label of the last state, which tells the phase reached.
 """
 _STREAM = "ask"  # random stream; another name would draw other states
 
@@ -122,7 +122,7 @@ RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | N
 
 
 def parse_query(text: str) -> Query:
-    """Parse a rule; `UnknownName` for an unknown kind, `UsageError` for an invalid or missing bound."""
+    """Parse a rule. Raises `UnknownName` for an unknown kind, `UsageError` for an invalid or missing bound."""
     kind, colon, bound = text.partition(":")
     try:
         return Query(kind, float(bound) if colon else None)
@@ -133,7 +133,7 @@ def parse_query(text: str) -> Query:
 def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
     """Return the rule by which a rollout queries the expert.
 
-    For `one` without takeover it never queries: `labelled` labels the drawn step when the episode is over.
+    For `one` without takeover this rule never queries: `labelled` labels the drawn step when the episode is over.
     """
     if label == "last":
         return lambda turns, actions: [turn.step == setting.horizon - 1 for turn in turns]

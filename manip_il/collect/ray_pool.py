@@ -61,7 +61,7 @@ class RayPool:
 
     @property
     def count(self) -> int:
-        """Number of tasks that run at once; grows with the cluster."""
+        """Number of tasks that can run at once; grows with the cluster."""
         return self._most or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
@@ -116,7 +116,7 @@ def run_there(
     mesh: Files | None,
     *policies: Files,
 ) -> bytes:
-    """Run seeds on a node; return episodes and journal contents, packed. Raises `ManipError` unless versions agree."""
+    """Run seeds on a node; return packed episodes and journals. Raises `ManipError` unless the node runs `version`."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
@@ -135,8 +135,8 @@ def run_there(
         return zstandard.compress(pickle.dumps(found), _LEVEL)
 
 
-# The engine counts deaths, so Ray must not retry. The remote function has another name than the plain one, so that Ray
-# pickles the latter by name and each node runs its own version, which `run_there` then compares.
+# The engine counts deaths, so Ray must not retry. The remote function has another name than `run_there`, so that Ray
+# pickles `run_there` by name. So each node runs the `run_there` of its own version, which compares the versions.
 _run_remote = ray.remote(num_cpus=1, max_retries=0)(run_there)
 
 

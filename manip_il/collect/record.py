@@ -30,9 +30,9 @@ def collect(
 ) -> Iterator[tuple[Journal, Episode]]:
     """Run the seeds that have no journal in `journals` yet; each finished episode is written at once.
 
-    Yields the result of `read_journal` in seed order, as soon as all earlier seeds are done. A seed that repeatedly
-    kills its worker is left out with a warning. on_episode: called when an episode is on disk; an exception in it ends
-    the run, and finished episodes stay on disk.
+    Yields what `read_journal` returns for each seed, in seed order, as soon as all earlier seeds are done. A seed that
+    repeatedly kills its worker is left out with a warning. on_episode: called when an episode is on disk; an exception
+    in it ends the run, and finished episodes stay on disk.
     """
     journal, waiting, on_disk = journal_of(journals, job), deque(seeds), set(list_seeds(journals))
 

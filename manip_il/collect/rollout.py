@@ -1,7 +1,7 @@
 """The only loop that steps environments, as a generator of transitions.
 
 Environments run in lockstep, so that a learner acts in all of them in one batch. Recording, labelling and evaluation
-consume its transitions and are not branches inside it. Only `_choose` queries the expert.
+consume its transitions and are not branches inside it. In this loop only `_choose` queries the expert.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def rollout(
     """Run one episode per seed, `len(envs)` at a time; yield the transition of every step.
 
     An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on other episodes.
-    gate: when the labeller is queried; None for never. first: the start state of every episode, instead of its seed's.
+    gate: when the labeller is queried; None for never. first: start state of every episode; None: drawn by seed.
     """
     waiting = iter(seeds)
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]

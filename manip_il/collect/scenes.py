@@ -1,4 +1,4 @@
-"""New scenes from visited states: randomise goals, untouched objects and looks, then label and render.
+"""New scenes from visited states: randomise goals, untouched objects and appearance, then label and render.
 
 The expert is a function of the state, so it can label scenes that were never visited.
 """
@@ -42,7 +42,7 @@ class Scenes:
 
     anew: whether to also randomise goals and objects, not only appearance. conditions: ranges of the appearance.
     branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
-    of the first scene in the random stream, so that several datasets of one seed have different scenes.
+    of the first scene in the random stream, so that datasets redrawn with the same seed can differ.
     """
 
     cameras: CameraConfig | None
@@ -59,10 +59,10 @@ class Scenes:
         return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
     def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
-        """Yield, for every `CHUNK` scenes, the number of the first scene, the visited states and their leads.
+        """Yield, for every `CHUNK` scenes, the number of the first scene, the visited states and their label offsets.
 
-        states: rows of `sim_state` (S, m), used in turn, in an order drawn from the seed. leads: what is added to the
-        label of each state, (S, n).
+        states: rows of `sim_state` (S, m), used in an order drawn from the seed, repeatedly if scenes outnumber them.
+        leads: offset added to the label of each state's scene, (S, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
         for at in range(0, self.frames, CHUNK):
@@ -81,8 +81,8 @@ class SceneDrawer:
     def frames(self, visited: State, number: int, seed: int, lead: F64 | float = 0.0) -> list[Transition]:
         """Return the frames of a new scene: one labelled frame, or the frames of a branch; [] without a valid label.
 
-        visited: the state that the scene is drawn from. number: scene number in the random stream. seed: value of the
-        `seed` column. lead: added to the label of a single frame, (n,).
+        visited: the state that is changed into the scene. number: scene number in the random stream. seed: value of the
+        `seed` column. lead: offset added to the label of a single frame, (n,).
         """
         rng = rng_for(number, "redraw")
         visited = self._with_look(replace(visited, streak=0, ever=False), number)
@@ -100,8 +100,8 @@ class SceneDrawer:
         return list(branch(self._env, self._expert, state, seed, self._scenes.branch_steps))
 
     def _with_look(self, state: State, number: int) -> State:
-        """Return the state with randomised looks, if the environment has any."""
-        if not isinstance(self._env, ManipEnv):  # its looks are fixed
+        """Return the state with a randomised appearance, if the environment supports it."""
+        if not isinstance(self._env, ManipEnv):  # its appearance is fixed
             return state
         conditions, shape = self._scenes.conditions, self._shape
         drawn = draw(conditions, number, shape) if conditions else {}
@@ -116,10 +116,10 @@ class SceneDrawer:
         )
 
     def redrawn(self, visited: State, rng: np.random.Generator) -> State | None:
-        """Return a scene with new goals and new places of untouched objects; None if it is impossible."""
+        """Return a scene with new goals and new places of untouched objects; None if the drawn places overlap."""
         if isinstance(self._env, AlohaEnv):
             return self._env.redrawn(visited, rng)
-        assert isinstance(self._env, ManipEnv)  # the only other kind with cameras
+        assert isinstance(self._env, ManipEnv)  # the only other class that has cameras
         world, task = self._env.world, self._env.scene.task
         world.restore(visited.physics, visited.variation)
         free, markers = self._untouched(world), _markers(world.model)

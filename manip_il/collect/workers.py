@@ -3,8 +3,8 @@
 Each seed of a job always gives the same episode. So if a worker dies, its unfinished seeds simply run again, each
 alone, which identifies the seed that kills workers.
 
-Processes are forked from a server that has only imported what they need: they share neither OpenGL nor threads, and
-torch, which takes seconds, is imported once. They end with the process that started them, even if that is killed.
+Processes are forked from a server that has only imported what they need. So they inherit neither OpenGL nor
+threads, and torch (seconds) is imported once. They end with the process that started them, even if that is killed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from manip_il.mdp import Episode
 if TYPE_CHECKING:
     from manip_il.collect.ray_pool import RayPool
 
-MOST_DEATHS = 3  # the run fails if so many seeds in a row kill their worker
+MOST_DEATHS = 3  # the run fails when this many seeds in a row kill their worker
 Backend = Literal["local", "ray"]
 Seeds = tuple[int, ...]
 Pool = Union["LocalPool", "RayPool"]
@@ -217,7 +217,7 @@ def _wait_for_parent() -> None:
 
 
 def run_seeds(job: RolloutJob, seeds: Sequence[int], journal: Journal | None) -> Iterator[Episode]:
-    """Yield the episodes of some seeds when they have ended and are in the journal."""
+    """Yield each seed's episode when it has ended and is in the journal."""
     for episode in job.run(seeds):
         if journal is not None:
             journal.write(episode)
@@ -235,7 +235,7 @@ def run_task(job: RolloutJob, seeds: Seeds, journal: Journal | None) -> list[Epi
 
 
 def split(job: RolloutJob, seeds: Sequence[int], workers: int) -> deque[Seeds]:
-    """Return tasks of one seed or, if a learner drives, of a lockstep batch that leaves no worker idle."""
+    """Split seeds into tasks: of one seed or, if a learner drives, of a batch small enough to keep all workers busy."""
     size = 1 if job.policy is None else max(1, min(job.batch, -(-len(seeds) // workers)))
     return deque(tuple(seeds[i : i + size]) for i in range(0, len(seeds), size))
 

@@ -52,7 +52,7 @@ class Recording:
     labels: int | None = None
 
     def write(self, journals: Path) -> None:
-        """Write `recording.json` next to the journals."""
+        """Write `recording.json` into the folder of journals."""
         write_json(journals / RECORDING, asdict(self))
 
     @classmethod
@@ -85,8 +85,10 @@ class Recording:
             for journal, rollout in itertools.chain([first], rollouts):
                 name = f"the journal of seed {rollout.seed}"
                 if journal.spec != about.spec:
-                    raise MismatchError("spec (robot, task or cameras)", name, journal.spec, "the first", about.spec)
-                for line in compare_fingerprints(name, journal.fingerprint, "the first", about.fingerprint):
+                    raise MismatchError(
+                        "spec (robot, task or cameras)", name, journal.spec, "the first journal", about.spec
+                    )
+                for line in compare_fingerprints(name, journal.fingerprint, "the first journal", about.fingerprint):
                     _LOG.warning("%s", line)
                 if self._is_full(found, labels):
                     continue
@@ -132,10 +134,10 @@ def local_id(folder: str) -> str:
 
 
 def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, int]:
-    """Build a LeRobot dataset from a folder of journals, in seed order; equal to the one that `record` writes.
+    """Build a LeRobot dataset from a folder of journals, in seed order, equal to the dataset that `record` writes.
 
-    Returns what `Recording.make` returns. Raises what reading raises, `ManipError` if there is no journal,
-    `FolderExistsError` if `root` is not empty, unless `replace` swaps it for the new one at the end.
+    Returns and raises what `Recording.make` does. Also raises `ManipError` if journals are missing or damaged,
+    and `FolderExistsError` if `root` is not empty; with `replace` the new dataset takes its place instead.
     """
     recording = Recording.read(journals)
     if not (paths := list_episodes(journals)):

@@ -36,7 +36,7 @@ I64 = NDArray[np.int64]
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
 _PIECE_BYTES = 32 * 1024 * 1024  # size of the pictures that a thread decodes at once
-_PIECE = 32  # least number of pictures decoded at once, because decoding starts at the key frame before them
+_PIECE = 32  # least number of pictures decoded at once, because each piece is decoded from the key frame before it
 _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # no tracks in other files
@@ -152,7 +152,7 @@ def decode_picture(content: bytes | None) -> Pictures:
     """
     with Image.open(BytesIO(content or b""), formats=("PNG", "JPEG")) as picture:
         if picture.mode != "RGB":
-            raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
+            raise ValueError(f"the picture has colour mode {picture.mode}; expected RGB")
         return np.asarray(picture)
 
 

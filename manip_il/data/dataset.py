@@ -134,7 +134,7 @@ class Dataset:
 
     @cached_property
     def tasks(self) -> dict[int, str]:
-        """The text of every `task_index`."""
+        """Task texts by `task_index`."""
         return read_tasks(self.root)
 
     @property
@@ -254,7 +254,7 @@ class Dataset:
 
 
 def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read columns, (T,) or (T, d), of several datasets in sequence, numbering frames and episodes throughout.
+    """Read and concatenate columns, (T,) or (T, d), of several datasets; frames and episodes are renumbered.
 
     Raises what `Dataset.columns` raises.
     """

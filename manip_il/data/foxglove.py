@@ -1,4 +1,4 @@
-"""Messages that Foxglove shows without settings, one per frame and topic; decoding of their pictures.
+"""Encode columns as messages that Foxglove shows without settings, one per frame and topic; decode pictures.
 
 Schemas: Foxglove's own in protobuf (`JointStates`, `RawImage`, `Log`), LeRobot's scalars in JSON.
 Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd, which exploits the
@@ -35,7 +35,7 @@ Times = Sequence[int]  # [ns], one per frame
 Messages = Iterator[Message | str]  # one per frame, all of one class; scalars are JSON texts
 
 NANOSECONDS = 1_000_000_000
-IMAGE_TOPICS = "/observation/images/"  # precedes a camera's name, as in LeRobot
+IMAGE_TOPICS = "/observation/images/"  # prefix of a camera's topic, as in LeRobot
 _JOINT_TOPICS = {"/joint_states": s.STATE, "/action": s.ACTION, "/executed_action": s.EXECUTED_ACTION}
 _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 

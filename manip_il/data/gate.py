@@ -31,8 +31,8 @@ _BATCH = 64  # rows in memory at once
 def check_arrived(root: Path, *, strict: bool = True) -> None:
     """Open every file of a dataset in a child process. Raises `ManipError` naming a file that is refused.
 
-    strict: refuse damaged files, too; otherwise only files that are not regular, crash the process, or need too much
-    memory or time.
+    strict: refuse damaged files, too; otherwise refuse only files that are not regular, or that crash the process or
+    need too much memory or time.
     """
     checks.in_child(str(root), open_files, root, strict)
 
@@ -82,7 +82,7 @@ def _is_picture(column: pa.Field, pictures: Collection[str]) -> bool:
 
 
 def _check_types(schema: pa.Schema, pictures: int) -> None:
-    """Raise `ValueError` if readers would decode more than `pictures` columns, or any column as other than images."""
+    """Raise `ValueError` if readers would decode more than `pictures` columns, or one as anything but an image."""
     about = (schema.metadata or {}).get(b"huggingface", b"").decode(errors="replace")
     decoded = [name for name in re.findall(r'"_type"\s*:\s*"(.*?)"', about) if name not in _PLAIN]
     if decoded != ["Image"] * len(decoded) or len(decoded) > pictures:
@@ -99,4 +99,4 @@ def _check_cells(key: str, cells: pa.Array, prefixes: tuple[bytes, ...], first: 
     begins: list[bytes | None] = pc.binary_slice(content, 0, 8).to_pylist()  # pyright: ignore[reportAttributeAccessIssue]
     for row, found in enumerate(begins, first):
         if not (found or b"").startswith(prefixes):
-            raise ValueError(f"column {key!r} has no PNG or JPEG in row {row:,}; expected the bytes of one")
+            raise ValueError(f"column {key!r} has no PNG or JPEG in row {row:,}; expected a picture file's bytes")

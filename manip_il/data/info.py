@@ -43,7 +43,7 @@ class Feature:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for each value: from the file (a list, or lists by group), else `<column>.<index>`."""
+        """A name for each value: from `info.json` (a list, or lists by group), else `<column>.<index>`."""
         names: Any = self.names
         groups = cast(dict[str, Any], names).values() if isinstance(names, dict) else [names]
         found = [str(name) for group in groups if isinstance(group, list) for name in cast(list[Any], group)]
@@ -57,7 +57,7 @@ class Feature:
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """Height and width [pixels], found by `names`; without names, the first two sizes of `shape`."""
+        """A picture's height and width [pixels]: the axes with these names, else the first two axes of `shape`."""
         names = cast(list[Any], self.names) if isinstance(self.names, list) else []
         if "height" in names and "width" in names and len(names) == len(self.shape):
             return self.shape[names.index("height")], self.shape[names.index("width")]

@@ -1,6 +1,6 @@
 """Paths of a LeRobot v3.0 dataset and the Arrow types of its columns (lerobot 0.6.1, `datasets/utils.py`).
 
-Copied here, and compared with the library by tests, because importing `lerobot.datasets` imports torch (seconds).
+Copied here (and tests compare the two), because importing `lerobot.datasets` imports torch, which takes seconds.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def tasks_table(instructions: Sequence[str]) -> pa.Table:
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
-    """Return path, chunk index and file index of the `number`-th file. names: the template's other fields."""
+    """Return path, chunk index and file index of file `number`. names: values of the template's other fields."""
     chunk, file = divmod(number, CHUNKS_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **names), chunk, file
 

@@ -31,8 +31,8 @@ I64, F64 = NDArray[np.int64], NDArray[np.float64]
 class ParquetFiles:
     """Numbered parquet files, one open at a time; when it is full, the next one is started.
 
-    group_rows: least number of rows in a row group, except a file's last. A writer keeps a description of every row
-    group in memory until the file is closed, so many small groups would need more memory than the rows themselves.
+    group_rows: least number of rows in a row group; a file's last one may have fewer. A writer keeps a description of
+    every row group in memory until the file is closed, so many small groups would need more memory than the rows.
     """
 
     def __init__(self, folder: Path, template: str, group_rows: int = 1):
@@ -117,7 +117,7 @@ def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Return a dataset's tasks by index. Their texts are in pandas' index column, which may have no name."""
+    """Return the task texts by `task_index`. The file has them in pandas' index column, which may have no name."""
     path = root / layout.TASKS
     with reading(path):
         table = read_file(path, pq.read_schema(path).names)

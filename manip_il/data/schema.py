@@ -93,12 +93,12 @@ class RobotTaskSpec:
 
     @property
     def image_keys(self) -> dict[str, str]:
-        """Column -> camera."""
+        """Columns of pictures: column -> camera."""
         return {IMAGES + camera: camera for camera in self.cameras}
 
     @property
     def keypoint_keys(self) -> dict[str, str]:
-        """Column -> camera; {} if no points are named."""
+        """Columns of keypoints: column -> camera; {} if there are no keypoints."""
         return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
 
 
@@ -142,13 +142,13 @@ def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
 def check_same_spec(left_name: str, left: Any, right_name: str, right: RobotTaskSpec, also: Sequence[str] = ()) -> None:
     """Raise `MismatchError` unless actions and observations have the same meaning on both sides.
 
-    The task may differ, so that a policy can be tried on another one. left: a spec, or an object with its fields. also:
-    other fields that must agree.
+    The task may differ, so that a policy can be tried on another task. left: a spec, or an object with its fields.
+    also: other fields that must agree.
     """
     for what in (*MUST_AGREE, *also):
         ours, theirs = getattr(left, what), getattr(right, what)
         if ours != theirs:
-            if what == "environment_state_names":  # a long list, of which the first difference is enough
+            if what == "environment_state_names":  # the list is long: show only the first difference
                 ours, theirs = next(pair for pair in zip_longest(ours, theirs) if pair[0] != pair[1])
             none = OWN_OBJECT if what == "object" else "none"
             raise MismatchError(what, left_name, ours or none, right_name, theirs or none)

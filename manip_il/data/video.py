@@ -1,7 +1,7 @@
 """Encode pictures with LeRobot's settings; every episode is appended to a file that stays open.
 
-LeRobot writes one file per episode and then copies all earlier ones into a new file. Its settings are copied here, and
-compared with the library by tests, because importing `lerobot.configs.video` imports torch (seconds).
+LeRobot writes one file per episode and then copies all earlier episodes into a new file. Its settings are copied here
+(and tests compare the two), because importing `lerobot.configs.video` imports torch, which takes seconds.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 
-# Default crf and preset. LeRobot's own default is libsvtav1; h264 needs a sixth of its time for the same error, so that
-# encoding keeps up with rendering on one core.
+# Codec -> default crf and preset. LeRobot's own default is libsvtav1. h264 takes a sixth of its time for equal error,
+# so that encoding keeps up with rendering on one core.
 CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvtav1": (30, 12)}
 
 
@@ -22,7 +22,7 @@ class VideoConfig:
 
     vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
     pix_fmt: str = option("yuv420p", "pixel format")
-    g: int | None = option(2, "frames between key frames")  # most frames that are decoded to read one
+    g: int | None = option(2, "frames between key frames")  # to read one frame, at most this many are decoded
     crf: float | None = option(None, "quality: lower is better, files larger; by default 23 (h264) or 30 (libsvtav1)")
     preset: int | str | None = option(None, "the codec's speed preset; by default ultrafast (h264) or 12 (libsvtav1)")
 
@@ -36,7 +36,7 @@ class VideoConfig:
         object.__setattr__(self, "preset", preset if self.preset is None else self.preset)
 
     def options(self) -> dict[str, str]:
-        """Return the codec's options. One thread: a second saves no time, and changes the bytes of h264."""
+        """Return the codec's options. It runs in one thread: two would save no time, but change the bytes of h264."""
         named = {"g": self.g, "crf": self.crf, "preset": self.preset}
         options = {name: str(value) for name, value in named.items() if value is not None}
         if self.vcodec == "libsvtav1":

@@ -59,7 +59,7 @@ def _explain(root: Path, problem: Exception) -> Finding:
     text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
     text = text.partition("; run `manip-il data check")[0].replace(f"{root}/", "").removeprefix(f"{root}: ")
     text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as after a crash of the recorder")
-    place = [str(root), *_FILE.findall(text)][-1]  # the last one is the file
+    place = [str(root), *_FILE.findall(text)][-1]  # the last path is the file's
     return Finding(place, text.replace(f"cannot read {place}: ", "cannot be read: "))
 
 
@@ -101,7 +101,7 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
 def _rebuild(root: Path, kept: Path) -> str:
     """Build the dataset from its journals, unless they hold fewer episodes than it does."""
     journals, fresh = journals_of(root), root.with_name(f".{root.name}.rebuilt.partial")
-    held = 0  # if it cannot be read
+    held = 0  # if the dataset cannot be read
     with suppress(ManipError):
         held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
     try:
@@ -111,8 +111,9 @@ def _rebuild(root: Path, kept: Path) -> str:
     if info.episodes < held:
         shutil.rmtree(fresh)
         return f"not rebuilt: {journals.name} holds {info.episodes} episodes, but {held} are still readable"
-    with suppress(ManipError, LookupError):  # if it cannot be read
-        was, now = ((one.spec, one.provenance["seeds"][0]) for one in map(Dataset.open, (root, fresh)))
+    with suppress(ManipError, LookupError):  # if the dataset cannot be read
+        both = map(Dataset.open, (root, fresh))
+        was, now = ((one.spec.robot, one.spec.fps, one.provenance["seeds"][0]) for one in both)
         if was != now:
             shutil.rmtree(fresh)
             return f"not rebuilt: {journals.name} holds another recording; move it elsewhere"

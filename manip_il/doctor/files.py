@@ -117,7 +117,7 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
 
 
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:
-    """Return how stored statistics differ from a column's (N, n), or a matrix's along its last axis; "" if equal."""
+    """Return how stored statistics differ from those of `values` (N, n), or along a matrix's last axis; "" if equal."""
     flat = values if stored["mean"].size == values.shape[1] else values.reshape(-1, feature.shape[-1])
     for name, share in _TOLERANCES.items():
         tolerance = share * np.abs(flat).max(axis=0) + 1e-9

@@ -102,13 +102,13 @@ def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: ND
         measures = (("starts at", starts, apart), ("correlates with its action by", agree, against[:, place]))
         for what, values, odd in measures:
             if odd.any():
-                means = f"{values[odd, place].mean():.3g}, in others {values[~odd, place].mean():.3g}"
+                means = f"{values[odd, place].mean():.3g}, in other episodes {values[~odd, place].mean():.3g}"
                 text = f"{name} {what} {means}: its zero or sign differs"
                 yield of_episodes(dataset.root, s.STATE, text, np.array([*rows])[odd])
 
 
 def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
-    """Return which numbers (E,) are outliers, by a gap wider than `least` and than `times` the range on either side."""
+    """Return which values (E,) are outliers: beyond a gap wider than `least` and `times` the range of either side."""
     ranked = np.sort(values)
     cut = int(np.argmax(np.diff(ranked)))
     gap, extent = ranked[cut + 1] - ranked[cut], max(ranked[cut] - ranked[0], ranked[-1] - ranked[cut + 1])
@@ -162,8 +162,8 @@ def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
-    """Check some pictures of up to `_EPISODES` episodes: black or frozen ones, and swapped cameras."""
-    table, _ = dataset.episodes, dataset.data_files  # raises as in other checks, so that an error is reported once
+    """Find black or frozen pictures and swapped cameras, from some pictures of up to 100 episodes."""
+    table, _ = dataset.episodes, dataset.data_files  # first, so that a broken file raises as in other checks
     chosen = np.flatnonzero(table.length > 1)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(_EPISODES, len(chosen))).astype(int)]
     rows = np.linspace(table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1)

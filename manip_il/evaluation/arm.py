@@ -17,6 +17,7 @@ from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.runner import FOLDER, Progress, Trial
 from manip_il.learn.checkpoint import policy_sha256
+from manip_il.sim.conditions import Condition
 from manip_il.tasks.config import EnvConfig
 
 _SEED_FOLDER = re.compile(r"seed_(\d+)")
@@ -69,6 +70,11 @@ class Member:
         found = EvalResult.read(_round_folder(self.path, self.history[0]))
         return found.settings.env(found.robot, task or found.task)
 
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """Conditions under which a run was validated."""
+        return EvalResult.read(_round_folder(self.path, self.history[0])).settings.conditions
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         rounds, chosen = [one.to_json() for one in self.history], self.chosen and self.chosen.to_json()
@@ -115,7 +121,7 @@ def read_arm(path: Path) -> Arm:
 
 
 def require_pair(left: Arm, right: Arm) -> None:
-    """Raise `UsageError` unless two arms can be compared: both or neither evaluated, equal training seeds.
+    """Raise `UsageError` unless two arms can be compared: both or neither are evaluations, with equal training seeds.
 
     Two single policies can be compared whatever their seeds.
     """

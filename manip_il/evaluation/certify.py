@@ -53,7 +53,7 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """The cases of one kind. kind, words: short and full name; horizon: [control steps].
+    """The cases of one kind. kind, words: its short and full name; horizon: [control steps].
 
     left_out: number of episodes without a case, because the undisturbed run failed, or the perturbation could not be
     placed or changed nothing.
@@ -136,10 +136,10 @@ def certify(
     seed: int = 0,
     on_episode: Callable[[Episode], object] = lambda _: None,
 ) -> Certificate:
-    """Measure the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
+    """Measure the expert on `env` with `cases` episodes per kind of perturbation, on seeds of the stream `certificate`.
 
     The step of a perturbation is drawn uniformly from those that the undisturbed run takes until the task is solved;
-    from that step on, the expert has a whole horizon. on_episode: called with every episode as it ends.
+    from that step on, the expert has a whole horizon to solve it. on_episode: called with every episode as it ends.
     """
     seeds = stream_seeds("certificate", cases, seed)
 

@@ -49,7 +49,7 @@ class Comparison:
 
     @classmethod
     def of(cls, left: Arm, right: Arm) -> Comparison:
-        """Compare two arms. Also raises `ManipError` unless all their policies have run the same episodes."""
+        """Compare two arms. Raises what `Comparison` does, and `ManipError` unless all ran the same episodes."""
         members = (*left.members, *right.members)
         if len({frozenset(episode.seed for episode in one.test.episodes) for one in members}) > 1:
             raise ManipError(
@@ -76,7 +76,7 @@ class Comparison:
 
     @property
     def difference(self) -> float:
-        """Mean difference over training seeds, in [-1, 1]."""
+        """Difference in success rate, averaged over training seeds, in [-1, 1]."""
         return fmean(pair.difference for pair in self.pairs)
 
     @property
@@ -99,13 +99,13 @@ class Comparison:
 
     @property
     def significant(self) -> bool:
-        """Whether one is better by the exact test and, if there are several training seeds, by the t interval."""
+        """Whether one arm is better by the exact test and, with several training seeds, also by the t interval."""
         low, high = self.interval
         return self.p_value < 1 - CONFIDENCE and (len(self.pairs) == 1 or low > 0 or high < 0)
 
     @property
     def verdict(self) -> str:
-        """A sentence that says which is better, or that neither is shown to be, with difference, interval and p."""
+        """A sentence: which arm is better, or that neither is shown to be better, with difference, interval and p."""
         n, sign = len(self.pairs), -1 if self.difference < 0 else 1
         leads = sum(sign * pair.difference > 0 for pair in self.pairs)
         tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
@@ -264,7 +264,7 @@ def _head(cost: Cost) -> str:
 
 
 def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:
-    """Return the mean amount without its unit, which is in the column's head."""
+    """Return the mean amount without its unit, which is in the column's header."""
     return format_amount(cost, fmean(one.amount(cost) for one in rounds if one)).removesuffix(f" {cost}")
 
 

@@ -34,7 +34,7 @@ def eval_report(
     films: Sequence[Film] = (),
     no_films: str = "",
 ) -> Report:
-    """Return the report of an evaluation. no_films: the reason if there are none."""
+    """Return the report of an evaluation. no_films: why there are no films, or empty."""
     fails = failures_sections(
         [("failed episodes", result.episodes)], result.task, "Where it fails", start_map(result.episodes)
     )

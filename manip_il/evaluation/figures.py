@@ -50,7 +50,7 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture in a report. svg: its file; words: alternative text; width: its natural width [px]."""
+    """A picture in a report. svg: the file's content; words: alternative text; width: natural width [px]."""
 
     svg: bytes
     words: str
@@ -167,7 +167,7 @@ def _draw_curves(axis: Any, curves: Sequence[Curve], cost: Cost, target: float |
             continue
         for x, y in lines:
             axis.plot(x, y, color=curve.colour, lw=0.9, alpha=0.4)
-        # Only rounds that every seed has: otherwise the mean would jump where a seed ends.
+        # Only rounds that every seed's run has: otherwise the mean would jump where a run ends.
         xs, ys = ([*map(fmean, zip(*part, strict=False))] for part in zip(*lines, strict=True))
         axis.plot(xs, ys, lw=1.8, ms=5, **style)
     if target is not None:

@@ -87,7 +87,7 @@ def film_outcomes(
 def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
     """Return an MP4 that browsers play: H.264, 4:2:0.
 
-    frames: at least one, uint8 (height, width, 3), both even, as 4:2:0 requires.
+    frames: at least one, uint8 (height, width, 3); height and width must be even for 4:2:0.
     """
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:

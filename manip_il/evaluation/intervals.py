@@ -103,7 +103,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class PairCounts:
-    """Two policies, left and right, on the same `n` episodes, counted by which succeeded."""
+    """Numbers of episodes that both, one or neither of two policies, left and right, solved."""
 
     both: int
     only_left: int
@@ -112,7 +112,7 @@ class PairCounts:
 
     @classmethod
     def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> PairCounts:
-        """Count the outcomes (left, right) of episodes, at least one."""
+        """Count the outcomes (left, right) of one or more episodes."""
         pairs = Counter(outcomes)
         return cls(pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])
 
@@ -150,7 +150,7 @@ class PairCounts:
 
 
 def sign_flip_exact(differences: Sequence[int]) -> float:
-    """Return the two-sided p of the hypothesis that each difference, one per test episode, could have had either sign.
+    """Return the two-sided p of the hypothesis that both signs of each test episode's difference are equally likely.
 
     differences: right's successes minus left's in an episode, summed over training seeds. As it is the sum whose sign
     is flipped, outcomes of different training seeds in one episode need not be independent. With one training seed this

@@ -152,12 +152,12 @@ class EvalResult:
 
     @property
     def success(self) -> Proportion:
-        """Episodes that succeeded at some time."""
+        """Share of episodes that succeeded at some time."""
         return Proportion.of([episode.success for episode in self.episodes], self.until_width is not None)
 
     @property
     def success_at_end(self) -> Proportion:
-        """Episodes that were at the goal when they ended."""
+        """Share of episodes that were at the goal when they ended."""
         return Proportion.of([episode.success_at_end for episode in self.episodes], self.until_width is not None)
 
     @cached_property
@@ -242,7 +242,7 @@ class EvalResult:
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     """Return all episodes of the parts (name -> part), in the order of their seeds.
 
-    Raises `MismatchError` if policy or environment differ, and `ManipError` for a seed that two of them ran, or for a
+    Raises `MismatchError` if policy or environment differ, and `ManipError` for a seed that two parts ran, or for a
     part whose number of episodes depended on its outcomes.
     """
     (first, one), *others = parts.items()
@@ -256,7 +256,7 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
 
 
 def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:
-    """Raise `MismatchError` for the first attribute in which two objects differ. left, right: what they are called."""
+    """Raise `MismatchError` for the first attribute in which two objects differ. left, right: names of the objects."""
     for name in names:
         ours, theirs = getattr(one, name), getattr(other, name)
         if ours != theirs:

@@ -45,8 +45,8 @@ _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 class TaskCheck:
     """Result of one task with a robot.
 
-    starts: number of starts drawn before one failed. refused: why that one failed, or why there is no scene. clean,
-    noisy: evaluations of the expert, as it is and with a tenth of its actions random; None if not run.
+    starts: number of starts drawn before the first failure. refused: why that start failed, or why there is no scene.
+    clean, noisy: evaluations of the expert without and with a tenth of its actions random; None if not run.
     """
 
     name: str
@@ -71,8 +71,8 @@ class TaskCheck:
 class RobotCheck:
     """Measurements of a robot. name: as given by the user.
 
-    opening: largest opening of the gripper [m]. table: share of the workspace, on the table, that the hand, pointing
-    down, reaches.
+    opening: largest opening of the gripper [m]. table: share of the workspace on the table that the hand reaches
+    while it points down.
     """
 
     name: str
@@ -100,7 +100,7 @@ class RobotCheck:
 def check_robot(
     name: str, tasks: Sequence[str], episodes: int, engine: Engine, on_result: Callable[[EpisodeResult], object]
 ) -> RobotCheck:
-    """Measure a robot, given by name or YAML, on tasks. episodes: number per task, run without and with random actions.
+    """Measure a robot, given by name or YAML, on tasks. episodes: per task, first without, then with random actions.
 
     on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
     """
@@ -141,7 +141,7 @@ def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
 def check_report(
     check: RobotCheck, pictures: Sequence[Film], no_pictures: str, command: str, config: Mapping[str, Any]
 ) -> Report:
-    """Return the HTML report of a check. no_pictures: the reason if there are none."""
+    """Return the HTML report of a check. no_pictures: why there are no pictures, or empty."""
     lead = () if pictures else (f"No pictures: {no_pictures}",)
     tasks = (
         f"Starts: how many of {STARTS} were drawn before one found no place within reach. Random actions: a tenth of "
@@ -213,7 +213,7 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
             "is green nowhere, turn the gripper on the hand by gripper.quaternion."
         )
     for task in check.failed:
-        if task.refused and check.table:  # otherwise the advice on the whole workspace covers it
+        if task.refused and check.table:  # if no point is within reach, the first line says so
             lines.append(f"{task.name}: {task.refused}.")
         elif task.clean is not None:
             success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
@@ -231,7 +231,7 @@ def looks(name: str) -> tuple[Film, ...]:
     scene = scene_of(name, "reach")
     data, gripper = mujoco.MjData(scene.model), scene.gripper
     data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
-    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(gripper.most)
+    gripper.put(data, gripper.most)
     mujoco.mj_forward(scene.model, data)
     (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
     corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]

@@ -78,7 +78,8 @@ class Rule:
     """The rule that chooses the round of each run, fixed before any test episode.
 
     checkpoint: the last round, or the one with the highest validation success (the later one if equal). at: `end`
-    allows all rounds; a cost allows rounds that used at most `limit` of it, the largest amount that every run reached.
+    allows all rounds; a cost, such as `labels`, allows rounds that used at most `limit` of it. limit: the largest
+    amount of this cost that every run reached.
     """
 
     checkpoint: Literal["best", "last"] = "best"
@@ -86,7 +87,7 @@ class Rule:
     limit: float | None = None
 
     def limited(self, histories: Mapping[str, History]) -> Rule:
-        """Return the rule with the limit for these runs, name -> rounds. Raises `UsageError` if one has no rounds."""
+        """Return the rule with the limit that all runs reached. Raises `UsageError` for a run without rounds."""
         if self.at == "end":
             return self
         if name := next((name for name, rounds in histories.items() if not rounds), None):

@@ -66,7 +66,7 @@ def evaluate(
     done: Mapping[int, EpisodeResult] | None = None,
     until_width: float | None = None,
 ) -> EvalResult:
-    """Run `job` on every seed, to the horizon unless it has a `hold`; episodes are in the order of `seeds`.
+    """Run `job` on every seed, to the horizon unless the job has a `hold`; episodes are in the order of `seeds`.
 
     suite: name of the job's conditions. done: seed -> result of an earlier run. until_width: stop once the width of the
     interval is at most this; checked after every `CHECK_EVERY` seeds in order, independently of the workers. on_result:
@@ -167,7 +167,7 @@ def measure(
     suite: str = NOMINAL.name,
     until_width: float | None = None,
 ) -> EvalResult:
-    """Return a job's evaluation in `folder`, after running what is missing; every episode is saved as it ends.
+    """Return a job's evaluation in `folder`, after running the missing episodes; each is saved as it ends.
 
     Raises what `finished_episodes` raises.
     """

@@ -23,7 +23,7 @@ _PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at
 
 @dataclass(frozen=True)
 class Table:
-    """Columns and rows of text; an empty cell was not measured. The first column names the row.
+    """Columns and rows of text; an empty cell means not measured. The first column names the row.
 
     colours: one per row, such as `#0072b2`; empty for none.
     """

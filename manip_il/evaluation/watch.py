@@ -77,7 +77,7 @@ class RerunLog:
     Raises `OSError` if the file cannot be written.
     """
 
-    act = None  # it does not drive the robot
+    act = None  # a log does not drive the robot
 
     def __init__(self, env: EnvConfig, output: Path | None = None):
         if output:

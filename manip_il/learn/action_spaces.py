@@ -81,7 +81,7 @@ class Conversion:
             )
 
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return actions (N, n) (joint targets and openings) in this space, given measured joint states (N, n)."""
+        """Convert actions (N, n), joint targets and openings, to this space, given measured joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return actions
         targets = actions.copy()
@@ -97,7 +97,7 @@ class Conversion:
         return targets
 
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
-        """Return actions (N, n) (joint targets and openings) from those in this space; inverse of `encode`."""
+        """Convert targets (N, n) in this space to actions (N, n), joint targets and openings; inverse of `encode`."""
         if self.space == JOINT_TARGET:
             return targets
         actions = targets.copy()
@@ -129,8 +129,8 @@ class Conversion:
 def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = None) -> Conversion:
     """Return the conversion to a space for data of `spec`. start: the checkpoint that a fit continues from, if any.
 
-    Raises `MismatchError` naming both sides if the space is not `joint_target` and the data's actions are not joint
-    targets, or if it is `ee_delta` and the data's joint names are not the robot's, and what `Conversion` raises.
+    Raises `MismatchError` for a space other than `joint_target` if the data's actions are not joint targets, and for
+    `ee_delta` if the data's joint names are not the robot's. Also raises what `Conversion` raises.
     """
     grippers = start.grippers if start is not None else GRIPPERS.get(spec.action_meaning, LAST)
     found = Conversion(space, spec.robot if space == EE_DELTA else "", grippers)

@@ -105,10 +105,11 @@ def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
 
 
 def _jitter(values: Tensor, factors: Tensor) -> None:
-    """Scale values 0 to 255 (B, 3, H, W) to [0, 1] in place, by factors (B, 3) of saturation, contrast, brightness.
+    """Jitter pictures (B, 3, H, W) in place; values 0 to 255 become 0 to 1.
 
-    Saturation blends with the grey picture, contrast with its mean, brightness with black: together
-    `own * picture + shared * grey + level`, without a matrix product, whose precision torch may lower.
+    factors: saturation, contrast, brightness, (B, 3). Saturation blends with the grey picture, contrast with its mean,
+    brightness with black. The sum is `own * picture + shared * grey + level`, which needs no matrix product, whose
+    precision torch may lower.
     """
     saturation, contrast, brightness = factors.view(-1, 3, 1, 1).unbind(1)
     grey = values[:, 0] * _GREY[0]

@@ -77,7 +77,7 @@ class Origin:
         look: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> Origin:
-        """Return the origin of a policy trained on data of `spec`. more: `datasets` and `action_space`."""
+        """Return the origin of a policy trained on data of `spec`. more: other fields of `Origin`."""
         pictured = observation != "state"
         return cls(
             **{name: getattr(spec, name) for name in ("task", *MUST_AGREE)},
@@ -211,7 +211,7 @@ class Checkpoint:
                 raise MismatchError(what, "the policy", needed, environment, has.get(what))
 
     def require_trust(self, trust: bool) -> None:
-        """Raise `ManipError` unless `trust` is given or the policy and its processors load nothing by name."""
+        """Raise `ManipError` if the policy or its processors load models by name, unless `trust` is given."""
         steps = [step for steps in self.processors.values() for step in steps]
         require_trust(self.config, str(self.path), trust, steps)
 
@@ -257,10 +257,10 @@ def in_one_line(what: str) -> Iterator[None]:
 def require_trust(
     settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Raise `ManipError`, naming what would be loaded, unless a policy loads nothing by name or `trust` is given.
+    """Raise `ManipError`, listing the names, if a policy loads models or files by name, unless `trust` is given.
 
     settings: the policy's options with `type`, as in `config.json`. source: where they come from, for the message.
-    steps: those of its processors.
+    steps: the processors' steps.
     """
     kind, named = settings["type"], list[Any]()
     if kind not in PLAIN or settings.get("vision_encoder_name"):

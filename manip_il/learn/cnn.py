@@ -1,6 +1,6 @@
 """The `cnn` policy in LeRobot's form: one action from joint state and the keypoints of every camera.
 
-Options, policy and processors are in one module, which LeRobot treats as a package, as with the `mlp`.
+Options, policy and processors are in one module that LeRobot can treat as a package: see `manip_il.learn.mlp`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lerobot.configs import PreTrainedConfig
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, interpolate
 
-from manip_il.data.dataset import Dataset, joined_columns
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset, joined_columns
 from manip_il.data.lerobot_layout import INDEX
 from manip_il.data.schema import (
     ACTION,
@@ -58,7 +58,7 @@ class CNNConfig(MLPConfig):
     a second perceptron predicts it from joints and keypoints; this is the weight of its loss, the mean absolute error
     in standard deviations. The action is predicted from joints, keypoints and this predicted state; the true state is
     never used to act. scales: as in the mlp, but for the offsets in the environment state (predicted, or true if it is
-    an input); scaled: indices of these offsets in it. heatmap_weight: weight of the cross-entropy [nats] between heat
+    an input); scaled: their indices in that state. heatmap_weight: weight of the cross-entropy [nats] between heat
     maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a
     keypoint of its own in addition to `keypoints`; 0: off. states: a dataset without pictures. If given, the mlp's
     network predicts the action from joints and predicted state alone. It is trained on the true states of this dataset
@@ -110,7 +110,7 @@ class CNNPolicy(MLPPolicy):
     `observation.images.<camera>` (B, 3, H, W), from 0 to 1. Pictures that are larger than in training, as those of
     `lerobot-eval` may be, are reduced to that size by averaging.
 
-    dataset_meta: as for the mlp. In training, the environment state is then also predicted from the keypoints
+    dataset_meta: as for the mlp. In training, the environment state is also predicted from the keypoints
     (`CNNConfig.aux_weight`), and named points of the scene have heat maps (`heatmap_weight`); each frame's ground truth
     is looked up by the batch's `index`.
     """
@@ -165,14 +165,14 @@ class CNNPolicy(MLPPolicy):
             shape = Shape.of(vars(config) | {"scaled": tuple(n + i for i in self.offsets)})
             self.model = MLPNetwork(n + size, n, shape)
         else:
-            shape = Shape.of(vars(config) | {"scales": (), "scaled": ()})  # this class scales the offsets itself
+            shape = Shape.of(vars(config) | {"scales": (), "scaled": ()})  # the cnn scales the offsets itself
             self.model = MLPNetwork(self.seen_size + size + len(config.scales) * len(self.offsets), n, shape)
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return the action network's inputs, (B, d): given states, keypoints, predicted state, offsets at each scale.
+        """Return the action network's inputs, (B, d): measured inputs, keypoints, predicted state, scaled offsets.
 
-        If `states` is given, return only joint state and predicted state.
+        With the option `states`, return only joint state and predicted state.
         """
         keypoints = [
             encoder(self._at_size(key, batch)) for encoder, key in zip(self.encoders, self.cameras, strict=True)
@@ -251,13 +251,13 @@ class CNNPolicy(MLPPolicy):
 
     @override
     def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
-        """Return the columns of the environment state, if it is an input or predicted, that are offsets."""
+        """Return the indices of the offsets in the environment state, if that is an input or is predicted."""
         reads = ENVIRONMENT_STATE in self.inputs or cast(CNNConfig, config).aux_weight > 0
         return offsets_of(features if reads else {})
 
     @override
     def _more_columns(self) -> Sequence[str]:
-        """Return the columns of the true state, and of the named points' positions if heat maps are trained."""
+        """Return the names of the columns of the true state and, if heat maps are trained, of the named points."""
         return [ENVIRONMENT_STATE, *self._place_columns()]
 
     @override
@@ -265,7 +265,8 @@ class CNNPolicy(MLPPolicy):
         if states := cast(CNNConfig, config).states:
             pictures = self._roots(dataset_meta)[0]
             found, own = (Dataset.open(Path(root).expanduser()).spec for root in (states, pictures))
-            check_same_spec(states, found, str(pictures), own, ["task"])
+            also = () if UNKNOWN_TASK in (found.task, own.task) else ("task",)
+            check_same_spec(states, found, str(pictures), own, also)
         return super()._columns(config, dataset_meta)
 
     def _place_columns(self) -> list[str]:
@@ -293,7 +294,7 @@ class CNNPolicy(MLPPolicy):
     def _learn_states(self, columns: Table, truth: Tensor | None, more: Path) -> None:
         """Compute the action network's statistics from joints and true state, and keep all labelled states.
 
-        more: the dataset of states.
+        more: folder of the dataset of states.
         """
         if truth is None:
             raise UsageError("policy.states needs a dataset with observation.environment_state, and aux_weight > 0")
@@ -346,7 +347,7 @@ class KeypointEncoder(nn.Module):
     Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own initialisation
     every softmax began as the picture's mean, and a goal of 5 pixels was not found in 1,100 steps; now 300 suffice.
 
-    channels: those of the layers; the first two halve the picture's sides. keeps_maps: whether `maps` holds the
+    channels: number in each layer; the first two layers halve the picture's sides. keeps_maps: whether `maps` holds the
     logarithms of the last pictures' heat maps, (B, K, height, width), while training.
     """
 

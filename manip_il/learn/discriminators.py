@@ -76,7 +76,7 @@ class Discriminator(nn.Module):
     def fit(
         self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32] | None, rng: np.random.Generator
     ) -> dict[str, float]:
-        """Take an iteration's gradient steps; return their mean loss, and the accuracies before them.
+        """Take an iteration's gradient steps; return the mean loss, and both accuracies before the first step.
 
         log_probs: the log-densities, under the learner's policy, of the expert's and of the learner's actions, (N,)
         each, if the discriminator `asks_density`.
@@ -101,7 +101,7 @@ class Discriminator(nn.Module):
         return loss.item()
 
     def _gradient_penalty(self, expert: Batch, learner: Batch, rng: np.random.Generator) -> Tensor:
-        """Return the mean (|gradient of logit| - 1)^2 at points between both batches (Gulrajani et al. 2017)."""
+        """Return the mean (|gradient of logit| - 1)^2 at random points between the batches (Gulrajani et al. 2017)."""
         share = torch.from_numpy(rng.random((len(expert[0]), 1), dtype=np.float32))
         mixed = [a * share + b * (1 - share) for a, b in zip(expert[:3], learner[:3], strict=True)]
         inputs = [one.requires_grad_() for one in mixed]

@@ -112,7 +112,7 @@ class EpisodePolicy:
         return torch.cat([self._memories[episode][ACTION].popleft() for episode in episodes])
 
     def _plan(self, block: Mapping[int, tuple[int, int]]) -> None:
-        """Compute the plans of the episodes in these rows, each with its seed."""
+        """Compute the next plans of some episodes. block: row of the network's batch -> (episode, seed)."""
         policy: Any = self.module
         model, config = policy.diffusion, policy.config
         weight = next(model.parameters())

@@ -28,10 +28,10 @@ from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 
 TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
-SERVO_TOLERANCE = 1e-3  # the same for servos' units [degrees]
+SERVO_TOLERANCE = 1e-3  # largest difference for robots in servos' units [degrees]
 _OPSET = 17
 _ROWS = 64  # observations on which file and checkpoint are compared
-_JOINT_UNITS = {OPENINGS: ("rad", "m"), SERVOS: ("deg", "0 to 100"), TWO_ARMS: ("rad", "0 to 1")}  # joints, grippers
+_JOINT_UNITS = {OPENINGS: ("rad", "m"), SERVOS: ("deg", "0 to 100"), TWO_ARMS: ("rad", "0 to 1")}  # (joints, grippers)
 _UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
 _UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
 
@@ -63,7 +63,7 @@ class PolicyFunction(nn.Module):
 
 
 def export_onnx(path: Path) -> tuple[bytes, float]:
-    """Return the policy in a `pretrained_model` folder as ONNX, and the largest difference between their actions.
+    """Return the policy in a `pretrained_model` folder as ONNX, and the largest change in its actions by the export.
 
     Raises `ManipError` for a policy that cannot be exported or whose file would act differently from the checkpoint,
     and what `LearnedPolicy.load` raises.
@@ -85,7 +85,7 @@ def export_onnx(path: Path) -> tuple[bytes, float]:
         torch.onnx.export(
             function,
             tuple(map(torch.from_numpy, example.values())),
-            content,  # pyright: ignore[reportArgumentType]  # it takes any writable file
+            content,  # pyright: ignore[reportArgumentType]  # the parameter takes any writable file
             input_names=list(example),
             output_names=[ACTION],
             dynamic_axes={name: {0: "batch"} for name in (*example, ACTION)},

@@ -122,7 +122,7 @@ class FitConfig:
 
     @property
     def observes(self) -> str:
-        """The requested member of `OBSERVATIONS`, else the checkpoint's, else that of the policy's kind."""
+        """The requested member of `OBSERVATIONS`, else the checkpoint's, else images for cnn, else state."""
         return self.observation or (self.start.observation if self.start else "images" if self.kind == CNN else "state")
 
     @property

@@ -119,7 +119,7 @@ def policy_features(
 ) -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
     """Return LeRobot's input and output features of a policy, from the `features` of `info.json`.
 
-    Pictures, (H, W, 3) in the table, are (3, H, W) for a policy.
+    Pictures, (H, W, 3) in `info.json`, are (3, H, W) for a policy.
     """
     typed = dataset_to_policy_features({key: features[key] for key in (*inputs, ACTION)})
     typed = {key: PolicyFeature(feature.type, tuple(feature.shape)) for key, feature in typed.items()}
@@ -148,9 +148,9 @@ def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[Tra
     """Return a fit's options in LeRobot's form (policy, optimiser, schedule, logger, ...), and its action space.
 
     LeRobot writes these as `train_config.json`, apart from the dataset and the folder, which are not known yet.
-    action_meaning: that of the data; actions that are not joint targets are by default learnt unchanged. Raises what
+    action_meaning: as in the dataset; actions other than joint targets are by default learnt unchanged. Raises what
     `policy_config` raises, `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot does not
-    know, `MismatchError` for an initial checkpoint that learnt in another action space.
+    know, `MismatchError` for an initial checkpoint with another action space.
     """
     policy = policy_config(fit)
     space = _action_space(policy, fit, action_meaning)

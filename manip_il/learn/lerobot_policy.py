@@ -30,8 +30,8 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
     """Return a LeRobot policy with new weights, those in `config.pretrained_path`, or those of the run to resume.
 
     An mlp that starts from another mlp's weights takes input statistics from the new data, see `warm_start`; a cnn
-    takes the range of its actions from these. Raises
-    `ManipError` for a checkpoint that cannot be loaded, and if a backbone's weights cannot be downloaded.
+    takes the range of its actions from the new data. Raises `ManipError` for a checkpoint that cannot be loaded, and
+    if a backbone's weights cannot be downloaded.
     """
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
     warm = config.type == MLP and start is not None and resumed is None
@@ -57,7 +57,7 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = Non
 def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion | None = None) -> tuple[Any, Any]:
     """Return new LeRobot pre- and postprocessors with the dataset's statistics.
 
-    conversion: done by the processors, if given; the statistics must then be those of the converted actions.
+    conversion: added to the processors, if given; the statistics must then be those of the converted actions.
     """
     before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
     if conversion is not None:

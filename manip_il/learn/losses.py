@@ -123,8 +123,8 @@ class CategoricalHead(Head):
 
     A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother et al., Stop
     regressing, ICML 2024, section 3.1), so that neighbouring bins count as near. `pad` bins of the same width at
-    either end hold what is smeared past the range; without them a target at its end, such as a joint step at its limit,
-    would be pulled inwards. With `sigma` 0 there are no such bins, and a target is split between the two nearest bin
+    either end hold what is smeared past the range; without them a target at the end of the range would be
+    pulled inwards. With `sigma` 0 there are no such bins, and a target is split between the two nearest bin
     centres (two-hot, as in Schrittwieser et al., MuZero, 2020, appendix F). Either way the expectation over the bin
     centres is the target.
 

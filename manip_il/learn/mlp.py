@@ -110,7 +110,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     config_class = MLPConfig  # type: ignore[assignment]
     name = "mlp"  # type: ignore[assignment]
-    target_range: tuple[Tensor, Tensor]  # of the training data
+    target_range: tuple[Tensor, Tensor]  # (low, high) in the training data
 
     def __init__(self, config: MLPConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)

@@ -3,5 +3,5 @@
 JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
 MLP, CNN = OWN_SPACE = ("mlp", "cnn")  # policies whose network converts actions itself, by default from joint_delta
 CONVERTED = (*OWN_SPACE, "act", "diffusion", "vqbet")  # policies whose actions may be converted
-PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load nothing by name
+PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load no models by name
 OBSERVATIONS = ("state", "images", "both")  # in addition to the joints: the true poses, pictures, or both

@@ -178,13 +178,13 @@ class MLPNetwork(nn.Module):
         return self.head.nll(self.layers(x), y)
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
-        """Return targets (B, n) for actions (B, n): relative to the measured joints if the network adds these."""
+        """Return absolute actions (B, n) minus the measured joints that the network adds to its output."""
         return actions - self.added * inputs[:, : self.n]
 
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
         """Return actions, (B, n), each bit-identical whatever the other rows are."""
-        rows = len(inputs)  # padded with zeros to whole blocks
+        rows = len(inputs)  # will be padded with zeros to a multiple of `ROWS`
         padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
         padded[:rows] = inputs
         return torch.cat([self.actions(block) for block in padded.split(ROWS)])[:rows]
@@ -199,7 +199,7 @@ class MLPNetwork(nn.Module):
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads inside. They wait by spinning: two on one free core are far slower than one."""
+    """Let torch use `count` threads inside. Waiting threads spin, so on one free core two are far slower than one."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -222,7 +222,7 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     The input statistics stay those of the new data: the first layer compensates for the difference. (An
     input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
     The range of the targets is also that of the new data; their mean and scale are copied, as they are
-    only the unit of the outputs. Raises `MismatchError` for other shapes, `ManipError` for a file that cannot be read.
+    only the unit of the outputs. Raises `MismatchError` if shapes differ, `ManipError` for a file that cannot be read.
     """
     saved = read_weights(pretrained_model)
     kept = {name: getattr(network, name).clone() for name in ("input_mean", "input_scale", "target_low", "target_high")}

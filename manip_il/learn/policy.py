@@ -138,7 +138,7 @@ class _Perceptron:
             self.module = MLPNetwork(width, checkpoint.action, Shape.of(checkpoint.config))
             self.module.load_state_dict(read_weights(checkpoint.path))
         self.module.to(device).eval()
-        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network does the others itself
+        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network does joint_delta
         self._conversion = Conversion(space, checkpoint.robot)
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:

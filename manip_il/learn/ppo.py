@@ -180,7 +180,7 @@ class Learner:
         return Transitions(states.astype(np.float32), actions.astype(np.float32), next_states.astype(np.float32))
 
     def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
-        """Take an iteration's gradient steps on what `collect` returned; rewards: (N,) in its order. Returns metrics.
+        """Take an iteration's gradient steps, given the rewards (N,) of the steps from `collect`. Returns metrics.
 
         actor: whether to update the actor as well as the critic. remaining: share of the run that is left; the
         learning rate is multiplied by it, but by no less than `LAST_LR`.
@@ -197,9 +197,9 @@ class Learner:
         return {**found, "log_std": self.policy.log_std.mean().item()}
 
     def log_prob(self, rows: Transitions) -> F32:
-        """Return the log-density of every row's action under the actor minus its expectation [nats], (N,).
+        """Return log pi + H of every row, (N,): its action's log-density plus the actor's entropy [nats].
 
-        That is log pi + H with the entropy H; 0 in the absorbing state, where no action is sampled.
+        It is 0 in the absorbing state, where no action is sampled.
         """
         obs = torch.from_numpy(np.pad(rows.states, ((0, 0), (0, EXTRA - 1))))
         with torch.no_grad():
@@ -242,9 +242,9 @@ def seed_generators(seed: int) -> None:
 
 
 def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec) -> Conversion:
-    """Return the conversion of the actor's actions: that of the clone in `start`, else that of `space` or `ee_delta`.
+    """Return the conversion of the actor's actions: as in the clone `start`, else to `space`, by default `ee_delta`.
 
-    Raises `UsageError` if `start` is not an mlp with one of the losses `_CENTRED`, `MismatchError` if it was trained
+    Raises `UsageError` if `start` is not an mlp with loss mse, l1 or gaussian, `MismatchError` if it was trained
     for another robot, task or action space, and what `conversion_for` raises.
     """
     if start is None:
@@ -265,7 +265,7 @@ def start_conversion(start: Path | None, space: str | None, spec: RobotTaskSpec)
 def start_policy(
     start: Path | None, conversion: Conversion, spec: RobotTaskSpec, rows: tuple[F32, F32] | None
 ) -> MLPPolicy:
-    """Return an mlp with a Gaussian loss. rows: raw inputs (N, d) and targets (N, n) for the statistics of a new one.
+    """Return an mlp with a Gaussian loss. rows: raw inputs (N, d) and targets (N, n), for a new mlp's statistics.
 
     A clone keeps its own statistics and acts as before. Weights are drawn from torch's global generator.
     """

@@ -174,7 +174,7 @@ class LearnedReward:
         return cls(network, origin)
 
     def check_fits(self, name: str, spec: RobotTaskSpec) -> None:
-        """Raise `MismatchError` unless a dataset's columns and task are those of this reward. name: the reward's."""
+        """Raise `MismatchError` unless task and columns in `spec` are this reward's. name: of `spec` in the message."""
         if self.origin.task != spec.task:
             raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
         self.origin.check_fits(spec)

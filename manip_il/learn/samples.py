@@ -55,7 +55,7 @@ class Windows:
         return np.searchsorted(self.episodes, self.episodes, side="right") - 1
 
     def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
-        """Return the row numbers of a column's windows, (B, K), and its padding mask, (B, K), as `<column>_is_pad`.
+        """Return the row numbers of a column's windows, (B, K), and `<column>_is_pad` -> its padding mask, (B, K).
 
         For a column without a window, return `samples` themselves, (B,), and no mask.
         """
@@ -128,8 +128,8 @@ def load_data(
 ) -> Samples:
     """Return the samples of the concatenated datasets for a policy whose features have been set.
 
-    meta: the datasets; its statistics are updated to the encoded actions. encode: maps actions (N, n) and states (N, n)
-    to targets; None if the targets are the datasets' actions. on_frames: called with the number of newly
+    meta: the datasets; its statistics become those of the encoded actions. encode: maps actions (N, n) and states
+    (N, n) to targets; None if the targets are the datasets' actions. on_frames: called with the number of newly
     decoded frames. Raises `NotFiniteError` and what `Windows.usable` raises.
     """
     features = [*(policy.input_features or {}), ACTION]
@@ -162,7 +162,7 @@ def load_data(
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Return whether each frame counts in the loss, (N,), by its `label_valid`; all do without such a column."""
+    """Return whether each frame counts in the loss, (N,), by its `label_valid`; all count without such a column."""
     if LABEL_VALID not in table:
         return np.ones(len(table[ACTION]), dtype=bool)
     return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
@@ -185,8 +185,8 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
 def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
     """Return the weight of every frame, (N,), at most 1, from the progress in a file.
 
-    The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9), which multiplies
-    losses by them; here samples are drawn in proportion: the same gradient, without computing what has no weight.
+    The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9). LeRobot
+    multiplies losses by them; here samples are drawn in proportion to them, which gives the same mean gradient.
 
     episodes: the dataset's `episode_index`, (N,). ahead: number of frames that an action spans. Raises `ManipError` if
     the file cannot be read or every frame weighs 0, `MismatchError` if it is for another dataset.

@@ -58,12 +58,12 @@ _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
 class Trainer:
-    """Policy, processors, optimiser and data of one run that clones the labels of datasets.
+    """Policy, processors, optimiser and data of one run of behaviour cloning on labelled datasets.
 
     shares: share of the samples from each dataset. weights: how often each frame is drawn, relative to the others,
-    (N,); without either, each is drawn once per epoch. on_frames: called with the number of newly decoded pictures. On
-    one CPU the same data, config and threads give the same bits, resumed or not. If started by `accelerate launch` or
-    `torchrun`, every process takes `batch_size` samples per step.
+    (N,); without either, each frame is drawn once per epoch. on_frames: called with the number of newly decoded
+    pictures. On one CPU the same data, config and threads give the same bits, resumed or not. If started by
+    `accelerate launch` or `torchrun`, every process takes `batch_size` samples per step.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data that are not
     finite, and `ManipError` for features that the policy refuses.
@@ -135,7 +135,7 @@ class Trainer:
         )
 
     def _build(self, config: PreTrainedConfig, checkpoint: Path | None) -> None:
-        set_seed(self.config.seed % 2**32)  # more is too large for NumPy
+        set_seed(self.config.seed % 2**32)  # NumPy takes no larger seeds
         before = checkpoint / PRETRAINED_MODEL if checkpoint is not None else None
         policy = build_policy(config, self.meta, before)
         optimizer, scheduler = make_optimizer_and_scheduler(self.pipeline, policy)
@@ -154,7 +154,7 @@ class Trainer:
         """Take the remaining steps, with metrics and checkpoints; return the last checkpoint's `pretrained_model`.
 
         on_step: called after every step, with the metrics if there are any, else with {}; an exception from it ends
-        the fit, `KeyboardInterrupt` once a checkpoint is saved. Raises `NotFiniteError` for a loss that is not finite.
+        the fit (after `KeyboardInterrupt` a checkpoint is saved). Raises `NotFiniteError` if the loss is not finite.
         """
         main = self.accelerator.is_main_process
         metrics = metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
@@ -260,18 +260,18 @@ def _portable(path: Path) -> Path:
 
 
 def _on_this_cpu() -> str:
-    """Return half precision if the processor has it, else single."""
+    """Return the precision to train in: bf16 if the processor supports it, else no (single precision)."""
     return "bf16" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "no"  # pyright: ignore[reportPrivateUsage]
 
 
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:
-    """Return an accelerator as in lerobot-train: half precision by the policy's `dtype`, else by its `use_amp`."""
+    """Return an accelerator as in lerobot-train. The policy's `dtype`, if any, or else `use_amp` sets the precision."""
     precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
     if not hasattr(policy, "dtype") and policy.use_amp:
         precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
     if not torch.distributed.is_initialized():  # accelerate keeps the precision of the first fit in a process
         AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
-    ours = policy.type in OWN_SPACE  # their buffers are equal in every process, but for the cnn's mean error
+    ours = policy.type in OWN_SPACE  # with equal buffers in every process, except the cnn's mean error
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,

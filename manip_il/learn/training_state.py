@@ -62,7 +62,7 @@ def new_checkpoint(final: Path) -> Generator[Path]:
     """
     with new_folder(final, replace=True) as new:  # replaces the folder of a run killed before it switched `last`
         yield new
-        for path in new.rglob("*.safetensors"):  # else other users, such as a container's, cannot read them
+        for path in new.rglob("*.safetensors"):  # without this, other users, such as a container's, could not read them
             path.chmod(new.stat().st_mode & 0o666)
     link = final.parent / ".last.tmp"
     link.unlink(missing_ok=True)
@@ -81,9 +81,9 @@ def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -
 
 @contextmanager
 def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
-    """Yield the functions to call with each record: for the metrics file, and for the other requested outputs.
+    """Yield functions to call with each record, which write it to the metrics file and other requested outputs.
 
-    step: where the fit resumes. curves: whether to write to TensorBoard. pipeline: has the options for Weights &
+    step: steps already taken. curves: whether to write to TensorBoard. pipeline: has the options for Weights &
     Biases. Raises `UsageError` if a requested output's package is not installed.
     """
     with ExitStack() as stack:
@@ -105,7 +105,7 @@ def json_lines(path: Path, step: int) -> Writer:
 
 @contextmanager
 def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
-    """Yield a function that adds a point to every curve."""
+    """Yield a function that adds a record's numbers to their curves."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -121,7 +121,7 @@ def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
 
 
 def _weights_and_biases(config: TrainPipelineConfig) -> Writer:
-    """Return a function that adds a point with LeRobot's own logger."""
+    """Return a function that logs a record with LeRobot's own logger."""
     try:
         importlib.import_module("wandb")  # LeRobot's logger imports it, with a less helpful error
         from lerobot.common.wandb_utils import WandBLogger

@@ -6,7 +6,7 @@ actor-critic, ICLR 2019, section 4.2; Orsini et al., What matters for adversaria
 section 4). So an episode that has ended continues in an absorbing state, marked by a flag, until step H.
 Demonstrations are padded in the same way.
 
-An episode ends as many steps after success as the demonstrations do, `hold`. It must not continue at the goal instead:
+An episode ends `hold` steps after success, as the demonstrations do. It must not continue at the goal instead:
 nobody demonstrated how to stay there for long, so the learner's many states there would look unlike the demonstrations'
 few, and arriving late would pay off. The learner spends the same share of time in the absorbing state as the
 demonstrations if and only if it arrives as fast as they do.

@@ -60,7 +60,7 @@ class ManipILEnv(EnvConfig):
     tolerance: float = option_of(SimConfig, "tolerance")
     success_steps: int = option_of(SimConfig, "success_steps")
     object: str = option_of(SimConfig, "object")
-    reward: str = ""  # for the task carry; only in files of older versions
+    reward: str = ""  # option of older versions, refused with a hint
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -92,9 +92,9 @@ class ManipILEnv(EnvConfig):
 
     @override
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Return LeRobot's environments, in processes forked from one that has done the slow imports.
+        """Return the environments in LeRobot's form, in processes forked from a server that has done the slow imports.
 
-        Python 3.12 intends to preload the running command itself, but fails to (its fork server drops the path).
+        Python 3.12 should preload the running command by itself, but fails because its fork server drops the path.
         """
         commands = [name for name in _COMMANDS if name in sys.modules]
         multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
@@ -120,7 +120,7 @@ class ManipILEnv(EnvConfig):
         return CameraConfig(names, self.observation_height, self.observation_width)
 
     def _features(self) -> dict[str, PolicyFeature]:
-        """Return the features by the environment's names; cameras by their columns, as LeRobot's recorder requires."""
+        """Return the features by observation name, but cameras by column, as LeRobot's recorder requires."""
         simulation, cameras = self._simulation(), self._cameras()
         joints = (len(get_robot(simulation.robot).joint_names),)
         features = {
@@ -137,7 +137,7 @@ class ManipILEnv(EnvConfig):
 
 
 class FilmedEnv(ManipEnv):
-    """The environment; without `film` it renders small black pictures for lerobot-eval, which always films."""
+    """`ManipEnv` for lerobot-eval, which always films: without `film`, the film's pictures are small and black."""
 
     def __init__(self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any):
         task = get_task(config.task, config.object)

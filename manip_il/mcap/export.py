@@ -117,5 +117,5 @@ def _is_joints(column: Feature) -> bool:
 
 
 def _topic(key: str) -> str:
-    """Return a column's topic, with slashes instead of dots, at which Foxglove's paths would split it."""
+    """Return a column's topic, with slashes instead of dots, because Foxglove splits paths at dots."""
     return "/" + key.replace(".", "/")

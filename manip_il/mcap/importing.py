@@ -86,7 +86,7 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
 
 
 def pick(where: str, source: TopicSource, stamps: I64, times: I64) -> I64:
-    """Return the index of the message in `stamps`, (N,), for each frame in `times`, (T,).
+    """Return, for each frame time in `times`, (T,), the index of its message in `stamps`, (N,).
 
     Both are ascending [ns], and no frame is before the first message. Raises `ManipError` with `where`, the time of
     the gap and the tolerance if a frame's message is farther away in time than the tolerance.
@@ -99,8 +99,8 @@ def pick(where: str, source: TopicSource, stamps: I64, times: I64) -> I64:
     if far.any():
         frame = int(np.argmax(far))
         place = f"{(times[frame] - times[0]) / NANOSECONDS:g} s (stamp {times[frame]} ns, frame {frame})"
-        remedy = "raise the tolerance in the mapping, or leave out this file"
-        raise ManipError(f"{where}: a gap at {place}; {source.resample} allows {source.tolerance:g} s: {remedy}")
+        remedy = "between frame and message: raise the tolerance in the mapping, or leave out this file"
+        raise ManipError(f"{where}: a gap at {place}; {source.resample} allows {source.tolerance:g} s {remedy}")
     return chosen
 
 
@@ -149,16 +149,16 @@ def _value(where: str, source: TopicSource, content: Any) -> Any:
     try:
         values = [one for path in source.paths for one in values_at(path, content)]
         if source.width not in (None, len(values)):
-            raise ValueError(f"{len(values)} values; expected {source.width}")
+            raise ValueError(f"the message has {len(values)} values; expected {source.width}")
         if not all(isinstance(one, str if source.dtype == TEXT else int | float) for one in values):
-            raise ValueError(f"{checks.shorten(values)}; expected {source.dtype}")
+            raise ValueError(f"the message has {checks.shorten(values)}; expected values of type {source.dtype}")
         if source.dtype == TEXT:
             return values[0]
         given = np.array(values, object)
         with np.errstate(over="ignore"):  # the next line checks for infinity
             numbers = given.astype(source.dtype)
         if not np.isfinite(numbers).all() if numbers.dtype.kind == "f" else (numbers != given).any():
-            raise ValueError(f"{checks.shorten(values)}; expected finite numbers that fit {source.dtype}")
+            raise ValueError(f"the message has {checks.shorten(values)}; expected finite {source.dtype} numbers")
         return numbers.reshape(source.shape or -1)
     except (ManipError, OverflowError, ValueError) as error:
         raise ManipError(f"{where}: {error}") from error

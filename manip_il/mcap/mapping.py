@@ -23,9 +23,9 @@ TASK = "task"  # key of a frame's task text
 class TopicSource:
     """The topic of a column, and which message a frame takes. tolerance: largest time between frame and message [s].
 
-    resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one that is not later.
-    field: paths to a message's numbers or text, joined in order. shape: of the joined numbers, by default a vector.
-    video: replaces `field` for cameras; true stores lossy video, false PNG. Raises `UsageError` for options that
+    resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one not after the frame.
+    field: paths to a message's numbers or text, joined in order. shape: that of the joined values, by default a vector.
+    video: for cameras, instead of `field`; true stores lossy video, false PNG. Raises `UsageError` for options that
     contradict each other.
     """
 
@@ -85,11 +85,11 @@ class Mapping:
             if key in (*INDEX_FEATURES, TASK):
                 raise UsageError(f"LeRobot fills in {key} itself; leave it out")
             if source.video and self.fps % 1:
-                raise UsageError(f"LeRobot writes videos at whole rates, not {self.fps}; {key} needs video: false")
+                raise UsageError(f"LeRobot needs a whole fps for videos, not {self.fps}; {key} needs video: false")
 
     @property
     def sources(self) -> dict[str, TopicSource]:
-        """All columns, and `task` if its texts come from a topic."""
+        """The topics of all columns, and of `task` if its texts come from a topic."""
         return ({TASK: self.task} if isinstance(self.task, TopicSource) else {}) | self.features
 
 

@@ -30,7 +30,7 @@ def check_path(path: str) -> None:
 def values_at(path: str, message: Any) -> list[Any]:
     """Return the values at a path, in order; if it ends at a list, the list's elements.
 
-    message: a protobuf or ROS 2 message, or parsed JSON. Raises `ManipError` naming a step that does not exist.
+    message: a protobuf or ROS 2 message, or parsed JSON. Raises `ManipError` naming the part of `path` that is missing.
     """
     nodes = [message]
     for selector, name in _STEP.findall(path):

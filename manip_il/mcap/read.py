@@ -72,7 +72,7 @@ def read_pictures(path: Path, topic: str, stamps: Sequence[int]) -> Iterator[U8]
 
 
 class _OtherFactory(DecoderFactory):
-    """Decodes JSON; raises for any encoding that earlier factories do not decode."""
+    """Last decoder factory to be asked: decodes JSON and raises `ValueError` for any other encoding."""
 
     @override
     def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
@@ -90,7 +90,7 @@ def _picture(message: Any) -> U8:
         return decode_picture(bytes(message.data))
     encoding = getattr(message, "encoding", "none")  # RawImage of Foxglove, Image of ROS
     if encoding not in _CHANNELS:
-        raise ValueError(f"a picture encoded as {encoding!r}; expected {' or '.join(_CHANNELS)}, PNG or JPEG")
+        raise ValueError(f"the picture is encoded as {encoding!r}; expected {' or '.join(_CHANNELS)}, PNG or JPEG")
     height, width, step = message.height, message.width, message.step or message.width * 3
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)  # rows may be padded
     return np.ascontiguousarray(rows[:, : width * 3].reshape(height, width, 3)[:, :, _CHANNELS[encoding]])

@@ -4,7 +4,7 @@ Teachers compare clips by true progress (B-Pref, Lee et al. 2021, section 3):
 
     P(left is better) = sigmoid(beta (G(left) - G(right))),    G(clip) = sum over its steps of progress
 
-A clip's return is the sum of progress over its steps; B-Pref sums the task's reward. Progress is a property of the
+The return G sums true progress over the clip's steps; B-Pref sums the task's reward. Progress is a property of the
 state, so a clip is better if it is closer to success or gets there faster.
 """
 
@@ -32,7 +32,7 @@ _ROUNDING = 1e-9  # returns that differ by less than this are equal
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer about a pair. pair: its number. when: ISO 8601; None if a simulated teacher answered."""
+    """An answer about a pair. pair: the pair's number. when: time in ISO 8601; None if a simulated teacher answered."""
 
     pair: int
     answer: str
@@ -57,12 +57,12 @@ class Preferences:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Preferences:
-        """Return the inverse of `to_json`."""
+        """Return the preferences that `to_json` has written."""
         return cls(data["pairs"], data["who"], tuple(Answer(**one) for one in data["answers"]))
 
     @classmethod
     def read(cls, path: Path, pairs: Sequence[Pairs]) -> Preferences:
-        """Return the answers in a file, numbered by the pairs of all files together (`join_pairs`).
+        """Return the answers in a file, with pair numbers that count across the pairs of all files, as in `join_pairs`.
 
         Raises `ManipError` for a file without answers, `MismatchError` for answers about other pairs.
         """
@@ -77,7 +77,7 @@ class Preferences:
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """All answers except skips. pair: numbers of the pairs, (A,); better: values of `BETTER` for the left clip, (A,).
+    """All answers except skips. pair: numbers of the pairs, (A,); better: the answers as numbers, see `BETTER`, (A,).
 
     skipped: number of `skip` answers. contradictory: number of pairs with both a left and a right answer.
     """

@@ -23,7 +23,7 @@ class FittedReward:
     """A fit, and its agreement on held-out pairs; each network of the ensemble holds out some.
 
     answered: agreement with the answers that are not `equal`; true: agreement with true progress, without pairs that
-    differ by less than `TIE`; None if there is no progress.
+    differ by less than `TIE`; None if the datasets have no progress.
     """
 
     fit: Fit

@@ -25,7 +25,7 @@ _ROUNDS = "round_*/dataset"  # a run's datasets
 class Frames:
     """The frames of a dataset, or of several joined: states (N, n), environment states (N, k), actions (N, n).
 
-    actions: the executed ones. episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
+    actions: as executed. episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
     if the dataset has no such column.
     """
 
@@ -84,7 +84,7 @@ def read_all(roots: Sequence[Path]) -> list[Frames]:
 
 
 def find_datasets(folders: Sequence[Path]) -> list[Path]:
-    """Return the datasets in folders: those of every round for a run, otherwise the folder itself."""
+    """Return the datasets in folders: for a run the datasets of all its rounds, otherwise the folder itself."""
     found: list[Path] = []
     for folder in folders:
         found += [path for path in sorted(folder.glob(_ROUNDS)) if (path / INFO).is_file()] or [folder]

@@ -39,7 +39,7 @@ class Source:
 
 
 class Clip(NamedTuple):
-    """The start of a clip: indices of the source, of its episode, and of the episode's frame."""
+    """The start of a clip: indices of the source, of an episode in it, and of the clip's first frame in the episode."""
 
     source: int
     episode: int
@@ -77,7 +77,7 @@ class Pairs:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Pairs:
-        """Return the inverse of `to_json`."""
+        """Return the pairs that `to_json` has written."""
         plain = {name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen") if name in data}
         sources = tuple(Source(**one) for one in data["sources"])
         return cls(**plain, sources=sources, pairs=tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"]))
@@ -154,7 +154,7 @@ def read_clips(pairs: Pairs) -> Clips:
     for source in pairs.sources:
         root = Path(source.root)
         if not root.is_dir():
-            raise ManipError(f"{root} with the clips of the pairs is missing; run in the folder where they were chosen")
+            raise ManipError(f"{root} with the pairs' clips is missing; run in the folder where the pairs were chosen")
         if (found := dataset_sha256(root)) != source.sha256:
             raise MismatchError(f"sha256 of {root}", "the file of pairs", source.sha256[:12], "the dataset", found[:12])
     return Clips(pairs, tuple(read_all([Path(source.root) for source in pairs.sources])))
@@ -170,7 +170,7 @@ def choose_pairs(
 ) -> Clips:
     """Choose pairs of clips of `length` control steps from datasets; episodes shorter than a clip are ignored.
 
-    With `reward`, draw `POOL` times as many, and keep those on which its networks disagree most, by the standard
+    With `reward`, draw `POOL` times as many pairs, and keep those on which its networks disagree most, by the standard
     deviation of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021). Raises `MismatchError`
     unless datasets and reward have the same task, `ManipError` if there are too few pairs.
     """
@@ -204,7 +204,7 @@ def choose_pairs(
 
 
 def disagreement(clips: Clips, members: Members) -> F64:
-    """Return the standard deviation over an ensemble of P(left is better), for each pair, (P,)."""
+    """Return the standard deviation of P(left is better) over the networks of an ensemble, one per pair, (P,)."""
     rows = clips.rows
     rewards = members(clips.inputs[rows.reshape(-1)])
     returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
@@ -212,7 +212,7 @@ def disagreement(clips: Clips, members: Members) -> F64:
 
 
 def _draw(frames: Sequence[Frames], length: int, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
-    """Distinct pairs of clips; all sources appear equally often, paired with others or with themselves."""
+    """Distinct pairs of clips; all sources appear equally often. Both clips may be from one source."""
     found = dict[tuple[Clip, Clip], None]()
     sources = [number for number, one in enumerate(frames) if one.lengths.max() >= length]
 

@@ -1,7 +1,7 @@
 """Scores of a dataset's frames and episodes by a reward, and the file of sample weights for LeRobot's RA-BC.
 
 RA-BC learns from frames after which progress rises. A frame's own score does not tell whether to learn from it, because
-failing episodes also approach the goal at first. The episode's end does, so the progress written is
+failing episodes also approach the goal at first. The score at the episode's end does, so the progress written is
 
     progress_t = t (score of the episode - bar),    bar = upper quartile of the episodes' scores - BELOW
 
@@ -59,7 +59,7 @@ class Scores:
 
     @property
     def succeeded(self) -> NDArray[np.bool_] | None:
-        """Whether each episode succeeded at some step, (E,); None if the dataset has no such column."""
+        """Whether each episode succeeded at some step, (E,); None if the dataset has no success column."""
         if self.data.success is None:
             return None
         return np.logical_or.reduceat(self.data.success, self.data.firsts)
@@ -151,7 +151,7 @@ def worst_table(scores: Scores) -> Table:
 
 
 def fact_lines(scores: Scores) -> list[str]:
-    """Return how many episodes are kept, and how well the score detects failed ones."""
+    """Return lines that say how many episodes are kept, and how well the score detects failed episodes."""
     kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
     lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}; frames of the others have weight 0"]
     if scores.auc is not None:

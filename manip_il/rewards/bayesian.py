@@ -1,11 +1,10 @@
 """Bayesian inverse reinforcement learning (Ramachandran & Amir 2007): a posterior of the weights.
 
 Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Likelihood: the demonstrator chooses among
-its own path and those that are cheapest for some other weights ("tastes"), in proportion to exp(-w . features). So it
-chooses between sensible paths, and is likelier to take a better one; the sum over the paths is exact, and small enough
-for chains of tens of thousands of steps. Tastes are drawn from the prior, then from the posterior, which finds paths of
-nearly equal cost. The posterior is sampled by random-walk Metropolis in log w; its steps are tuned in warm-ups, then
-fixed.
+its own path and those that are cheapest for some other weights ("tastes"), in proportion to exp(-w . features). All
+these paths are sensible, and better ones are more likely; the sum over them is exact, and short enough for chains of
+tens of thousands of steps. Tastes are drawn from the prior, then from the posterior, which finds paths of nearly equal
+cost. The posterior is sampled by random-walk Metropolis in log w; its steps are tuned in warm-ups, then fixed.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from manip_il.rewards.paths import Demonstration, add_rivals, rivals
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
-TASTES = 60  # drawn from the prior for each demonstration
+TASTES = 60  # weights drawn from the prior, the same for all demonstrations
 CHAINS = 4
 _ROUNDS, _MORE = 3, 30  # rounds of drawing tastes from the posterior, and tastes per round
 _DRAWS, _WARM_UP = 10_000, 2_000  # steps of a chain and of each warm-up
 _FIRST, _FITS = 0.3, 2  # initial step size, and number of warm-ups; each one tunes the steps
-_STEP = 2.38  # random walk's step in deviations, before division by sqrt(dimension) (Roberts et al. 1997)
+_STEP = 2.38  # random walk's step in standard deviations, before division by sqrt(dimension) (Roberts et al. 1997)
 
 
 @dataclass(frozen=True)
 class Choices:
-    """The paths that the demonstrators chose among, for all demonstrations in order.
+    """The paths that the demonstrators chose among, one block of rows per demonstration.
 
-    excess: a path's features minus those of the demonstration, (m, K) [m]; first a row of zeros, the demonstration's.
-    starts: first row of each demonstration, (D,).
+    excess: a path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros, is the demonstration.
+    starts: first row of each block, (D,).
     """
 
     excess: F64
@@ -42,7 +41,7 @@ class Choices:
 
     @classmethod
     def of(cls, sums: Sequence[F64]) -> Choices:
-        """Return the choices with features (m, K) for each demonstration, the chosen path's first."""
+        """Return the choices from each demonstration's feature sums (m, K), the chosen path in the first row."""
         starts = np.cumsum([0, *map(len, sums[:-1])]).astype(np.int64)
         return cls(np.concatenate([one - one[0] for one in sums]), starts)
 
@@ -68,7 +67,7 @@ class Posterior:
 
     @property
     def mean(self) -> F64:
-        """Mean weights, (K,) [1/m]: their cheapest path has the least expected cost."""
+        """Posterior mean of the weights, (K,) [1/m]. The path that is cheapest for it has the least expected cost."""
         return self.pooled.mean(axis=0)
 
     @property
@@ -82,7 +81,7 @@ class Posterior:
         return np.sqrt((half - 1) / half + between / np.maximum(within, np.finfo(float).tiny))
 
     def ratios(self, base: int, level: float) -> F64:
-        """Return the credible interval of each weight divided by that of feature `base`, (K, 2)."""
+        """Return the credible intervals, (K, 2), of each weight's ratio to the weight of feature `base`."""
         ratios = self.pooled / self.pooled[:, [base]]
         return np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T
 
@@ -97,7 +96,7 @@ def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: flo
 
 
 def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
-    """Return the posterior; each demonstration was chosen among itself and the cheapest paths for sampled weights."""
+    """Return the posterior, given that each demonstration was chosen over the cheapest paths for sampled weights."""
     features = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
     for _ in range(_ROUNDS):

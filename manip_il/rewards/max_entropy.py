@@ -135,7 +135,7 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
     """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: see `PRIOR` [1/m].
 
-    The search starts above `least_weights`, first on some of the demonstrations, and continues on all of them.
+    The search starts from weights above `least_weights`. It fits some of the demonstrations first, then all of them.
     """
     least = least_weights(demonstrations)
     weights = np.maximum(2 * least, least.max() / 2)

@@ -39,8 +39,8 @@ def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) 
 def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> F64:
     """Return the weights (K,) of maximum margin planning: the mean over the second half of projected subgradient steps.
 
-    Every weight is at least 0; that of length is at least 1, which sets the scale. The step sizes are AdaGrad's. The
-    first steps use some of the demonstrations, the others all.
+    Every weight is at least 0; the weight of length is at least 1, which sets the scale. The step sizes are AdaGrad's.
+    The first steps use some of the demonstrations, the later ones all.
     """
     least = np.eye(demonstrations[0].problem.features.shape[1])[LENGTH]
     weights = least

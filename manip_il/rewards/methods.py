@@ -21,9 +21,9 @@ _TASTES = 20  # random weights whose paths show whether a feature matters
 class Learnt:
     """The weights that a method found.
 
-    weights: (K,), divided by that of length. open: features in which all demonstrations agree, so that their weights
-    are not identified. intervals: the weights' credible intervals, (K, 2), or None; chains: the sampling's quality, in
-    words.
+    weights: (K,), divided by the weight of length. open: features in which all demonstrations agree, so that the
+    features' weights are not identified. intervals: the weights' credible intervals, (K, 2), or None. chains: quality
+    of the sampling, in words.
     """
 
     method: str

@@ -1,6 +1,6 @@
 """Paths to a goal on a graph whose edges have features: weights turn features into costs, Dijkstra finds cheap paths.
 
-Demonstrations are such paths. Weights are inferred from them by comparison with the alternatives.
+Demonstrations are paths to the goal. Weights are inferred by comparing each demonstration with alternative paths.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import dijkstra
 from manip_il.errors import ManipError
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
-NOWHERE = -1  # next node if there is none
+NOWHERE = -1  # stands for "no next node"
 LENGTH = 0  # feature that every edge has; other weights are given relative to its weight
 _EVERY, _FEW = 5, 5  # the first stage takes every fifth demonstration, if that leaves at least five
 _DIGITS = 6  # decimals [m] to which the features of equal paths agree
@@ -31,7 +31,7 @@ class PathProblem:
     """S nodes, E edges with K features each, one goal.
 
     edges: (E, 2), from and to, each pair once, without self-loops. features: (E, K), 0 or more; the first one is the
-    edge's length [m], above 0; another may be, for example, its length above a thing on the table [m].
+    edge's length [m], above 0; another may be the part of this length that lies above an object on the table [m].
     """
 
     edges: I64
@@ -41,7 +41,7 @@ class PathProblem:
 
     @cached_property
     def numbers(self) -> Any:
-        """Edge numbers, counted from 1, as a sparse matrix from -> to, (S, S)."""
+        """Edge numbers, counted from 1, as a sparse matrix (S, S), rows: from, columns: to."""
         return csr_array((np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes))
 
     def costs(self, weights: F64) -> F64:
@@ -49,7 +49,7 @@ class PathProblem:
         return self.features @ weights
 
     def matrix(self, values: F64) -> Any:
-        """Return values of the edges (E,) as a sparse matrix from -> to, (S, S). Zeros are stored too."""
+        """Return the edges' values (E,) as a sparse matrix (S, S), rows: from, columns: to. Zeros are stored, too."""
         numbers = self.numbers
         return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
@@ -122,7 +122,7 @@ class Demonstration:
 
 
 def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstration]]:
-    """Return the demonstrations to fit in turn: first a fifth, unless that is too few, then all."""
+    """Return the sets of demonstrations to fit in turn: first every fifth one, unless these are too few, then all."""
     few = demonstrations[::_EVERY]
     return [few, demonstrations] if len(few) >= _FEW else [demonstrations]
 
@@ -137,7 +137,7 @@ def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
 
 
 def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64) -> list[F64]:
-    """Add the alternatives for more `tastes` (n, K); return the sums (m, K) of each demonstration's alternatives."""
+    """Return `sums` with the alternatives for further `tastes` (n, K) added: (m, K) per demonstration, as `rivals`."""
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
         more = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]
@@ -148,7 +148,7 @@ def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tas
 
 
 def open_features(demonstrations: Sequence[Demonstration], sums: Sequence[F64]) -> list[int]:
-    """Return the features in which no demonstration differs from its alternatives `sums` (m, K).
+    """Return the indices of the features in which no demonstration differs from its alternatives `sums` (m, K).
 
     The weights of these features are not identified.
     """

@@ -59,7 +59,7 @@ class ActionSpace:
 
     @cached_property
     def gripper(self) -> int:
-        """Index of the gripper's opening."""
+        """Index of the gripper's opening in an action."""
         return int(np.flatnonzero(~self.relative)[0])
 
     def join(self, arm: F64, opening: float) -> F64:

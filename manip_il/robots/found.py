@@ -22,7 +22,7 @@ from manip_il.robots.spec import arm_spec, bare_spec, require
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
 FREQUENCY = 2 * math.pi * 6.0  # natural frequency of a joint with its motor as a spring [rad/s]
-_AT_OBJECT = 0.7  # share of the way from closed to open at which `ee` is found: roughly that around an object
+_AT_OBJECT = 0.7  # share of the way from closed to open at which `ee` is found: about as open as around an object
 _SETTLE, _STEP = 1000, 0.002  # physics steps, and their length [s]
 FROM_TIP = 0.012  # distance of the frame `ee` from the fingertips [m]
 _CLEAR = 0.006  # clearance of the fingertips over the table with `ee` at its lowest [m]
@@ -40,7 +40,7 @@ _DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: Mapping[str, Any]) -> Robot:
-    """Return a robot with a YAML's fields and the rest found in its model. Raises `UsageError` if one is not found."""
+    """Complete a YAML's fields from the robot's model; return the robot. Raises `UsageError` if one is not found."""
     files, names = said["files"], said["joints"]
     spec = bare_spec(said["name"], files, said["hand"], said["gripper"])
     require(said["name"], "joint", names, spec.joints)

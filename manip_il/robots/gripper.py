@@ -25,14 +25,14 @@ TOUCH = 0.0015  # a finger this near to an object touches it [m]
 _COMMANDS = 15  # commands of the sweep from closed to open
 _SETTLE = 250  # physics steps at each command
 _STEP = 0.002  # [s]
-_PAD = 0.004  # a geom this much farther from the other finger than the nearest at the tip is no pad [m]
+_PAD = 0.004  # a geom this much farther from the other finger than the nearest geom at the tip is no pad [m]
 _LOPSIDED = 0.004  # if only one of two fingers moves, the middle of the pads moves by more than this [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Measured relation of command and opening.
+    """Measured relation between command and opening.
 
     shares: how far the fingers are open, 0 to 1, for commands and measured positions alike; rising, (c,).
     openings: gaps between the pads at these [m], rising, (c,). middles: offsets along the hand's y of the midpoint
@@ -58,7 +58,7 @@ class Gripper:
         self.ctrl = np.array([model.actuator(prefix + name).id for name in config.joints], dtype=np.int64)
         self._closed, self._open = np.asarray(config.closed), np.asarray(config.open)
         self._travel = self._open - self._closed
-        weights = 1 / (self._travel * len(self._travel))  # of each joint in the share of the way to open
+        weights = 1 / (self._travel * len(self._travel))  # of the joints in how far the gripper is open, 0 to 1
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
         self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()

@@ -47,7 +47,7 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """A grid of points and an error for each: how far from it the downward hand ends up.
+    """A grid of points and an error for each: how far from the point the downward hand ends up.
 
     origin: the grid's first point, (3,) [m]. errors: (x, y, z) [m].
     """
@@ -72,7 +72,7 @@ class Reach:
         return self.origin.tolist()
 
     def error(self, position: Sequence[float] | F64) -> float:
-        """Return how far from `position` (3,) [m] the hand ends up [m], plus its distance from the map if outside."""
+        """Return how far from `position` (3,) [m] the hand ends up [m], plus how far `position` is outside the map."""
         place = (np.asarray(position) - self.origin) / _CELL
         last = np.array(self.errors.shape) - 1
         inside = np.minimum(np.maximum(place, 0.0), last)
@@ -169,7 +169,7 @@ def _solve(robot: Robot) -> Reach:
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
-    """Return the pose error [m] with which inverse kinematics from home ends, and the joints there, (arm,) [rad].
+    """Return the pose error [m] at which inverse kinematics from home stops, and its last joints, (arm,) [rad].
 
     The error includes the angle, converted to a length.
     """

@@ -1,4 +1,4 @@
-"""A robot, an arm with a gripper, as dataclasses: one per section of its YAML, with the names of its MJCF."""
+"""A robot, an arm with a gripper, as dataclasses: one per section of its YAML, which refers to its MJCF by name."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class GripperConfig:
     """The driven joints, their positions when the gripper is closed and open, and the bodies that touch objects.
 
     closed, open: [m] if a joint slides, [rad] if it turns. finger_mass: replaces every finger's mass [kg]. force: limit
-    of a driven joint, by default 40 N if it slides and 10 N m if it turns. files: of the gripper's own model, if it has
-    one, whose names then begin with `gripper/`; position [m] and quaternion (wxyz): where it is in the hand's body.
+    of a driven joint, by default 40 N if it slides and 10 N m if it turns. files: the gripper's own model, if any; its
+    names then begin with `gripper/`. position [m], quaternion (wxyz): the gripper's pose in the hand's body.
     """
 
     joints: tuple[str, ...]
@@ -86,7 +86,7 @@ class TableTop:
 class CameraPose:
     """Position of a camera and its target in the world, (3,) [m], and its vertical field of view [deg].
 
-    z = 0 is the table's top, x points away from the robot. Looking straight down, x is up in the picture.
+    z = 0 is the table's top, x points away from the robot. If the camera looks straight down, x is up in its picture.
     """
 
     position: tuple[float, float, float]
@@ -134,7 +134,7 @@ class LeRobotConfig:
     def __post_init__(self) -> None:
         checks.name("robot_type", self.robot_type)
         if len(set(self.gripper)) != 2:
-            raise ManipError(f"gripper is {list(self.gripper)}; expected two positions, at 0 and at 100 [rad]")
+            raise ManipError(f"gripper is {list(self.gripper)}; expected two joint positions [rad], for 0 and for 100")
 
     def percent(self, joint: F64) -> F64:
         """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint [rad]."""
@@ -193,7 +193,7 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of `observation.state` and `action`: arm joints, then the gripper."""
+        """Names of the entries of `observation.state` and `action`: arm joints, then the gripper."""
         return self.lerobot.names if self.lerobot is not None else (*self.joints, "gripper")
 
     @property

@@ -44,7 +44,7 @@ def angle_ahead(rotation: F64) -> float:
 
 
 def angle_across(rotation: F64) -> float:
-    """Return the yaw [rad] of a hand (3, 3), from its fingers' direction of motion; it may lean."""
+    """Return the yaw [rad] of a hand (3, 3), which may lean, from the direction in which its fingers move."""
     return math.atan2(rotation[0, 1], -rotation[1, 1])
 
 
@@ -59,7 +59,7 @@ def angle_off_vertical(rotation: F64) -> float:
 
 
 def angle_from_down(rotation: F64, yaw: float) -> float:
-    """Return `angle_between` a rotation (3, 3) and `hand_down(yaw)` [rad]."""
+    """Return the angle [rad] between a rotation (3, 3) and `hand_down(yaw)`."""
     (xx, xy, _), (yx, yy, _), (_, _, zz) = rotation.tolist()
     trace = math.cos(yaw) * (xx - yy) + math.sin(yaw) * (xy + yx) - zz
     return math.acos(min(1.0, max(-1.0, (trace - 1) / 2)))

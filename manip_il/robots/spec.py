@@ -160,7 +160,7 @@ def model_bytes(model: mujoco.MjModel) -> bytes:
 
 
 def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
-    """Raise `UnknownName` for a name that no element in `there` has. kind: of the elements, such as joint."""
+    """Raise `UnknownName` for a name that no element in `there` has. kind: what the elements are, such as joint."""
     known = [one.name for one in there if one.name and one.name != "world"]
     for name in names:
         if name not in known:

@@ -41,19 +41,19 @@ def get_robot(name: str) -> Robot:
 
 
 def is_robot(name: str) -> bool:
-    """Return whether a robot ships or an installed package provides it."""
+    """Return whether a robot of this name ships or an installed package provides it."""
     return name in ROBOTS or bool(entry_points(group=GROUP, name=name))
 
 
 def read_robot(path: Path) -> Robot:
     """Read a robot's YAML. Raises `UsageError` naming the file and what is wrong in it."""
     try:
-        if path.stem in ROBOTS and path != ROBOTS[path.stem]:
+        if path.stem in ROBOTS and path.resolve() != ROBOTS[path.stem].resolve():
             raise ManipError(f"a built-in robot is called {path.stem}; rename the file")
         said = _said(path, read_yaml(path, "a robot's YAML"))
         if all(name in said for name in FOUND):
             return Robot(**said)
-        from manip_il.robots.found import complete  # here: mink is slow to import; shipped YAMLs are complete
+        from manip_il.robots.found import complete  # imported here: mink is slow, and a shipped YAML is complete
 
         return complete(said)
     except ValueError as error:  # MuJoCo's, for a model that it reads but cannot compile

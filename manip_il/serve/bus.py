@@ -62,11 +62,11 @@ Calibration = dict[str, dict[str, int]]
 class Bus:
     """Servos on a pseudo-terminal, answered by a thread of their own.
 
-    calibration: the registers that the servos keep without power, by joint name. bus[NAME]: a register of every servo,
-    (n,), by LeRobot's name. path: device file, for any program that uses serial ports. lock: held while a packet is
-    answered; hold it to read several registers at the same moment. connected: indices of the joints whose servos are on
-    the bus. commands: number of sync writes received. on_read: called when one packet reads the positions of several
-    servos, which a client does once per control step.
+    calibration: the registers that the servos keep without power, by joint name. bus[NAME]: values of one
+    register of all servos, (n,), by LeRobot's NAME. path: device file, for any program that uses serial ports. lock:
+    held while a packet is answered; hold it to read several registers at the same moment. connected: indices of the
+    joints whose servos are on the bus. commands: number of sync writes received. on_read: called when one packet reads
+    the positions of several servos, which a client does once per control step.
     """
 
     def __init__(self, calibration: Calibration):
@@ -137,7 +137,7 @@ class Bus:
         while not self._closing.is_set():
             if select.select([self._master], [], [], 0.1)[0]:
                 os.write(self._master, self.feed(os.read(self._master, 4096)))
-            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # does not stop root
+            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # root may open it
 
     @property
     def _is_in_use(self) -> bool:

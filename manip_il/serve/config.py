@@ -63,7 +63,7 @@ class SessionConfig(Seeded):
     speed: float = option(
         1.0, "how fast time passes in the world; 2: twice as fast as real time", at_least=0.1, at_most=10
     )
-    servo: Literal["sts3215", "ideal"] = option("sts3215", "how the servos move")
+    servo: Literal["sts3215", "ideal"] = option("sts3215", "servo model; ideal: without play, delay and friction")
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
         "solved", "without a COMMAND, when to draw a new world: on Enter, or also one second after the task is solved"

@@ -24,8 +24,8 @@ from manip_il.tasks.envs import env_of
 class ServedEpisodes:
     """Episodes of a station; those to keep are written as journals to a folder, for `manip-il data build`.
 
-    folder: None to write none. seed: of the stream of worlds, as `--seed`; worlds that have a journal in the folder are
-    not drawn again. leader: the function that moves the leader. driver: who moves the follower now.
+    folder: None to write no journals. seed: seed of the stream of worlds, `--seed`; worlds with a journal in the folder
+    are not drawn again. leader: the function that moves the leader. driver: who moves the follower now.
     """
 
     def __init__(self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover):
@@ -53,7 +53,7 @@ class ServedEpisodes:
         self.drive(driver)
 
     def drive(self, driver: Actor) -> None:
-        """Set who moves the follower from now on: the leader, if `driver` is the expert, or a program's policy."""
+        """Set who moves the follower from now on: the leader if `driver` is the expert, else the program's policy."""
         leads = driver is Actor.EXPERT
         self._station.mover = self._leader if leads else lambda: None
         self.driver = driver if not leads or self._leader == self._station.expert else Actor.LEARNER

@@ -238,7 +238,7 @@ def _start(command: Sequence[str]) -> tuple[int, int]:
 
 
 def weigh_session(weight: str = "-20") -> str:
-    """Set the nice value (`weight`) of this process's session if permitted, and return the former one; "" if not.
+    """Give this process's session the nice value `weight` and return the former one, or "" if this is not permitted.
 
     Linux first shares CPU time among sessions (autogroups). The program and its servos run in two sessions, and each
     must answer the other within milliseconds. Real-time priority would block the kernel's own threads, which carry

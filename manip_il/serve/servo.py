@@ -32,7 +32,7 @@ class Follower:
         self._at, self._on, self._coming = np.zeros(len(self.q)), np.zeros(len(self.q), bool), deque[F64]()
 
     def reset(self, config: ServoConfig) -> None:
-        """Use servos with these parameters, at the current joint positions."""
+        """Use servos with these parameters, whose goals are the current joint positions."""
         self.config = config
         for model in (self._world.scene.model, self._world.model):
             model.body_gravcomp[model.jnt_bodyid[:]] = 0.0
@@ -44,7 +44,7 @@ class Follower:
 
     @property
     def offset(self) -> float:
-        """Angle by which the encoders read more than the joints [rad]."""
+        """Encoder angle minus joint angle [rad]."""
         return math.radians(self.config.offset)
 
     def _gain(self) -> F64:
@@ -56,7 +56,7 @@ class Follower:
         return self._world.data.qfrc_bias[self._dof] / self._gain()
 
     def goal(self) -> F64:
-        """Return the last joint goals of the servos [rad], (n,)."""
+        """Return the servos' last goals as joint angles, without the encoders' offset [rad], (n,)."""
         return self._bus.goals() - self.offset
 
     def command(self) -> None:

@@ -1,4 +1,4 @@
-"""A session of the virtual arm: everything that `manip-il serve` opens, in order."""
+"""A session of the virtual arm: open the ports, cameras, leader and program of `manip-il serve`, and close them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def serve(
 ) -> None:
     """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
 
-    cameras: those to serve; None for none. conditions: how worlds vary. policy: folder of the policy that moves the
+    cameras: the cameras to serve, if any. conditions: how worlds vary. policy: folder of the policy that moves the
     leader, if any; it must fit environment and cameras. trust: whether the policy's models and code may be loaded.
     say: called with lines for the user. Raises `UsageError` for a robot without Feetech servos or a port that is taken,
     `MismatchError` for a policy that does not fit, `RenderError` for a window without a display, `ManipError` if the
@@ -106,7 +106,7 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
 
 
 def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | None) -> Mover:
-    """Return a function that moves the leader by a policy, which sees the cameras' last pictures."""
+    """Return a function that moves the leader as a policy commands. The policy sees the cameras' last pictures."""
     seed = None
 
     def move() -> F64:
@@ -121,7 +121,7 @@ def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | Non
 
 
 def slider_mover(station: Station) -> Mover:
-    """Open a window; return a function that moves the leader to its sliders. Raises `RenderError` without a display."""
+    """Open a window with sliders that move the leader; return the mover. Raises `RenderError` without a display."""
     env, window = station.env, Window(station.env.scene, _UNPACED, sliders=True)
     order, seed = np.array([*env.scene.arm_ctrl, *env.scene.gripper.ctrl]), None
 

@@ -35,7 +35,7 @@ class Read(NamedTuple):
     """The world and the follower at the moment when a client reads it.
 
     told: the follower's target after `commands` commands. sag: how far the follower hangs below its target. Both are
-    joints [rad], (n,).
+    joint angles [rad], (n,).
     """
 
     state: State
@@ -49,9 +49,9 @@ class Station:
 
     `NAME.json` beside each port is its calibration in LeRobot's format: the registers that the servos keep without
     power. on_read: called, from another thread, whenever a client reads the follower's position. mover: called every
-    control step; returns the joints to which the weightless leader moves [rad], (n,), or None to leave it. hand: joints
-    at which a hand holds both arms still [rad], (n,), or None. clock: paces the control steps. Raises `UsageError` for
-    a robot without Feetech servos.
+    control step; returns the joints to which the weightless leader moves [rad], (n,), or None to leave it. hand: joint
+    angles at which a hand holds both arms still [rad], (n,), or None. clock: paces the control steps. Raises
+    `UsageError` for a robot without Feetech servos.
     """
 
     def __init__(self, env: ManipEnv, config: SessionConfig):
@@ -98,7 +98,7 @@ class Station:
         write_file(self._config.output_dir / f"{name}.json", content.encode())
 
     def look(self) -> Read:
-        """Return what a client reads now."""
+        """Return the world and the follower as a client reads them now."""
         with self.buses["follower"].lock:
             return Read(self._shown, self.follower.goal(), self._sag, self.buses["follower"].commands)
 
@@ -110,7 +110,7 @@ class Station:
     def expert(self) -> F64 | None:
         """Return the joints [rad], (n,), to which the expert moves the leader; None if the state has no valid label.
 
-        They are the label's joints plus the follower's sag and the offset of its servos.
+        These are the label's joints plus the follower's sag and the offset of its servos.
         """
         label = self._expert.label(self.env.get_state(), self.env.world)
         return self.to_joints(label.action) + self.follower.sag() + self.follower.offset if label.valid else None

@@ -56,7 +56,7 @@ MEASURED = ("joint_noise", "position_noise")
 
 @dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high) of the quantities below, both ends included, or single numbers; those not named are nominal.
+    """Ranges (low, high), both ends included, or single numbers, for the quantities below; all others are nominal.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of its full range.
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
@@ -101,7 +101,7 @@ class Condition:
         return Condition(self.name, **kept)
 
     def only(self, names: Collection[str]) -> Condition:
-        """Return the condition with the named ranges alone."""
+        """Return the condition with only the named ranges."""
         return Condition(self.name, **{name: range_ for name, range_ in self.ranges.items() if name in names})
 
     def changes_model(self) -> bool:
@@ -137,7 +137,7 @@ def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
 
 
 def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> dict[str, Any]:
-    """Return the values drawn for the episode of a seed, by name. `turn_of` returns its condition.
+    """Return the values drawn for the episode of a seed, by name, from the condition that `turn_of` returns.
 
     shape: as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn, too.
     """

@@ -34,7 +34,7 @@ class Episodes:
 
 
 CAMERAS = ("front", "side", "wrist")
-OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # of gym-aloha
+OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # gym-aloha's
 MIN_SIDE, MAX_SIDE = 16, 2048  # sides of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 
@@ -43,7 +43,7 @@ _BRIGHTNESS = (0.1, 2.0)
 class Look:
     """Lighting of a scene: part of a dataset's fingerprint, and adjustable when pictures are rendered again.
 
-    shadows: draw those of the main lamp; a picture then takes two to six times as long. brightness: factor on every
+    shadows: draw the main lamp's shadows; a picture then takes two to six times as long. brightness: factor on every
     lamp. light_turn: rotation of the lamps about the vertical through the world's origin, -180 to 180 [deg].
     Raises `UsageError` for a value out of range.
     """
@@ -81,7 +81,7 @@ class CameraConfig:
             if name not in (*CAMERAS, *OTHERS):
                 raise UnknownName("camera", name, CAMERAS)
         if not self.names or len(set(self.names)) < len(self.names):
-            raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, and none twice")
+            raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, each named once")
         if any(side % 2 or not MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             raise UsageError(
                 f"pictures have height {self.height} and width {self.width}; "

@@ -41,7 +41,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     "solved once" and "solved at the end" can both be measured. conditions: how episodes differ from the nominal world;
     they take turns by seed, and `drawn` has the current episode's values. `get_state` returns the true state, without
     the noise and delay of observations.
-    render_mode: `rgb_array`, or `human`: `reset` and `step` then update MuJoCo's viewer, in real time.
+    render_mode: `rgb_array`, or `human`, with which `reset` and `step` update MuJoCo's viewer in real time.
     Raises `UnknownName` for an unknown camera or render_mode, `UsageError` if the scene cannot be built,
     `RenderError` for `human` without a display.
     """
@@ -205,7 +205,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def observe(self) -> Observation:
         """Return what a policy observes now, with the episode's delay and noise; call it once per control step.
 
-        It has pictures only if the environment has cameras.
+        The observation has pictures only if the environment has cameras.
         """
         world = self._measured()
         seen: tuple[dict[str, Picture], dict[str, F32]] = {}, {}

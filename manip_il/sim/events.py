@@ -192,9 +192,9 @@ class Events:
         self._kind_rng = rng_for(seed, f"perturbation {name}")
 
     def before(self, step: int) -> bool:
-        """Apply the events of a step to the world; returns whether a perturbation changed it.
+        """Apply the events of a step to the world; return whether a perturbation changed it.
 
-        A perturbation for which there is no place, or that changes nothing (fingers already open), leaves the world as
+        A perturbation that finds no free place, or that changes nothing (fingers already open), leaves the world as
         it was, bit for bit.
         """
         world = self._world

@@ -58,7 +58,7 @@ def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]
 def framed_picture(
     scene: Scene, data: mujoco.MjData, camera: str | mujoco.MjvCamera, size: tuple[int, int], look: Look
 ) -> Picture:
-    """Return what a camera of the scene or a free one sees of the physics in `data`, with the axes of `ee` drawn in.
+    """Return what `camera`, the scene's or a free one, sees of the physics in `data`, with the axes of `ee` drawn in.
 
     x is red, y green, z blue. size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures`
     raises.

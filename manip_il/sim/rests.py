@@ -60,7 +60,7 @@ class Hull:
     """
 
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
-        """Take the mesh of a body, and a gripper that opens to `widest` [m], with `ee` no lower than `lowest` [m]."""
+        """Use a body's mesh, and a gripper that opens to `widest` [m] and whose `ee` gets down to `lowest` [m]."""
         points = _few(_vertices(model, geom))
         self._hull, self._centre, self._gripper = ConvexHull(points), model.body_ipos[body].copy(), (lowest, widest)
         self._rests: dict[int, Rest] = {}

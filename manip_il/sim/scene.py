@@ -156,7 +156,7 @@ def _check_objects(
     for name in task.grasped:
         if name in hulls:
             width = min(width for width, _ in hulls[name].rest(0).sizes)
-        else:  # the width to grasp from above if it lies on its worst side
+        else:  # width between the fingers if it lies on its worst side
             kind, size = int(model.geom_type[objects[name].geom]), model.geom_size[objects[name].geom]
             lengths = variation.extents(kind, size)
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])

@@ -120,16 +120,16 @@ class Shape:
 
     @property
     def word(self) -> str:
-        """Its name in an instruction."""
+        """The object's name in an instruction."""
         if self.kind in (ANY, MESH):
             return "object"
         return "cube" if self.kind == "box" and len(set(self.lengths)) == 1 else self.kind
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Range of twice the greatest number of `size` [m], when scaled, such that it can be grasped however it lies.
+        """Range of `2 * max(size)` [m] in which the object, scaled as a whole, can be grasped however it lies.
 
-        None if it is empty.
+        None if that range is empty.
         """
         if self.mesh is not None:
             return None

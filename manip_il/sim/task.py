@@ -21,9 +21,9 @@ Observed = Mapping[str, "F64 | float"]
 class Target(NamedTuple):
     """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
 
-    max_step, max_turn: at most how far towards the pose a single step aims, [m] and [rad]. exact: do not let the
-    posture cost of inverse kinematics pull the hand off its target by a millimetre, for tighter fits.
-    lean: how far the hand may lean from its rotation to reach its position, 0 to 1.
+    max_step, max_turn: at most how far towards the pose a single step aims, [m] and [rad]. exact: for tight
+    fits, keep the posture cost of inverse kinematics from pulling the hand a millimetre off its target.
+    lean: how far the hand may lean from `rotation` to reach `position`, 0 to 1.
     """
 
     position: F64
@@ -56,7 +56,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of an episode. tolerance: error that counts as success [m]; success_steps, horizon: [control steps]."""
+    """Limits of an episode. tolerance: largest error allowed [m]; success_steps, horizon: [control steps]."""
 
     tolerance: float = 0.02
     success_steps: int = 5
@@ -107,7 +107,7 @@ class Task(Protocol):
         ...
 
     def build(self, spec: mujoco.MjSpec) -> None:
-        """Add its objects (free bodies), and furniture and goal markers (mocap bodies)."""
+        """Add the task's objects (free bodies), and furniture and goal markers (mocap bodies)."""
         ...
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
@@ -132,7 +132,7 @@ class Instructing(Protocol):
     """A task whose text differs between episodes; a mocap body's pose in the state encodes the text."""
 
     def objects_in(self, world: World) -> tuple[str, ...]:
-        """Return the objects that the text of the world's episode names, which the arm must reach."""
+        """Return the objects that the arm must reach: those that the text of the world's episode names."""
         ...
 
     def instruction_in(self, world: World) -> str:
@@ -197,4 +197,4 @@ def phases(task: Task) -> tuple[str, ...]:
 
 
 CUBE_SIZES = (0.03, 0.07)  # edges of a cube that every gripper goes around [m]
-NO_PHASE = "none"  # if there is no sound label
+NO_PHASE = "none"  # the phase of a state without a sound label

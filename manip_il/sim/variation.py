@@ -1,7 +1,7 @@
 """How a world differs from the compiled model, as numbers that a state holds.
 
-Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then those of
-the world, named as in `Condition`: see `_WORLD`.
+First five numbers per object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then
+the world's numbers (`_WORLD`), with the names and units of `Condition`.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ _NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # numbers for how the epis
 
 @dataclass(frozen=True)
 class Object:
-    """A free body of a compiled model, and its first geom, which has its shape.
+    """A free body of a compiled model, and its first geom, which gives its shape.
 
-    q, v: starts of its free joint in qpos and qvel.
+    q, v: where its free joint starts in qpos and qvel.
     """
 
     name: str
@@ -125,7 +125,7 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of a variation's objects, (o, 3) [m], and the drawn MuJoCo type of their geoms, or None."""
+    """Return `geom_size` of a variation's objects, (o, 3) [m], and their geoms' MuJoCo type if drawn, else None."""
     shape = float(part(variation, "shape")[0])
     sizes = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)[:, _SIZE]
     return sizes, None if shape == _OWN else int(shape)

@@ -60,7 +60,7 @@ class ViewModel:
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
-        """Apply the look of a variation (v,) to the next pictures; nothing is uploaded to the graphics card."""
+        """Apply the look of a variation (v,) to the next pictures, without uploading anything to the graphics card."""
         if np.array_equal(variation, self._applied):
             return
         for name, plain in self._plain.items():

@@ -161,7 +161,7 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
 
     def place(self, name: str, position: F64, quaternion: F64) -> None:
-        """Put an object at rest, or a mocap body, at a pose: (3,) [m], wxyz (4,). Call `update` afterwards."""
+        """Place an object (at rest) or a mocap body at a pose: (3,) [m], wxyz (4,). Call `update` afterwards."""
         if name in self.scene.objects:
             one = self.scene.objects[name]
             self.data.qpos[one.q : one.q + 7] = [*position, *quaternion]

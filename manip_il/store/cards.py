@@ -72,7 +72,7 @@ def policy_facts(root: Path) -> dict[str, Any]:
         raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
     found = {name: root / inside / f"{name}.json" for name in ("config", "manip_il", "train_config")}
     facts = {name: checks.read_json(path, "JSON") if path.is_file() else {} for name, path in found.items()}
-    evaluations = [  # of the policy without disturbances; an evaluation that chose it is not a test
+    evaluations = [  # without disturbances; `is_test`: false if the policy was chosen by this evaluation
         {**one, "is_test": not path.parent.name.startswith("round_") and path.parent.parent.name != "validation"}
         for path in root.rglob("eval.json")
         if (one := checks.read_json(path, "JSON")).get("policy") != "expert"

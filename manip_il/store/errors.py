@@ -58,7 +58,7 @@ def explained(what: str) -> Generator[None]:
 
 
 def redact(text: str, words: Iterable[str] = ()) -> str:
-    """Hide secrets in `text`: secret environment variables, passwords of addresses in `words`, and likely tokens."""
+    """Hide in `text` values of secret environment variables, passwords of addresses in `words`, and likely tokens."""
     secrets = {value for name, value in os.environ.items() if _SECRET_VARIABLE.search(name)}
     for word in words:
         password = (word.partition("://")[2] or word).partition(":")[2].rpartition("@")[0]

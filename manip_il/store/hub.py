@@ -1,8 +1,8 @@
 """A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
 
-Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that it compared with;
-then the tag `v3.0`, by which LeRobot finds datasets, is moved there. The Hub provides sizes and hashes of all files of
-a commit.
+Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that the folder was
+compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that commit. The Hub provides the size
+and hash of each file of a commit.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Hub:
             return Manifest(self.kind, files, head, copies=frozenset(copies if are_equal else ()))
 
     def additions(self, source: Path, local: Mapping[str, Path], folder: Path) -> dict[str, Path]:
-        """Write the card and its picture into `folder`; return both, and a run's policy, by path in the repository."""
+        """Write the card and its picture into `folder`; return both, and a run's policy files, by repository path."""
         from manip_il.store.cards import write_cards  # imported here because no other remote needs matplotlib
 
         added = write_cards(source, self.kind, self._place, folder)
@@ -109,7 +109,7 @@ class Hub:
         return made
 
     def _move_tag(self) -> None:
-        """Move LeRobot's tag to the main branch. The Hub cannot move tags, so it is missing for a moment."""
+        """Delete LeRobot's tag and create it again on the main branch, because the Hub cannot move tags."""
         refs = self._api.list_repo_refs(**self._repo)
         head = next(one.target_commit for one in refs.branches if one.name == "main")
         tag = next((one.target_commit for one in refs.tags if one.name == VERSION), None)
@@ -120,7 +120,7 @@ class Hub:
 
 
 def root_copies(paths: Collection[str]) -> dict[str, str]:
-    """Return the files of a run's policy to repeat at the root, name -> path; {} for a policy without a run."""
+    """Return a run's policy files, repeated at the repository's root, name -> path; {} for a policy without a run."""
     folder = policy_folder(path for path in paths if path != CONFIG)
     inside = {path.removeprefix(f"{folder}/"): path for path in paths if folder and path.startswith(f"{folder}/")}
     return {name: path for name, path in inside.items() if "/" not in name and name != CARD}

@@ -61,7 +61,7 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Files by path. version: its id on the remote.
+    """Files by path. version: the version's id on the remote.
 
     copies: paths at the root that repeat the files of a run's policy; they are not pulled.
     """
@@ -150,9 +150,9 @@ def newest(checkpoints: Path) -> str | None:
 
 
 def policy_folder(paths: Iterable[str]) -> str | None:
-    """Return the folder of a run's policy, given its files' `paths`: "" for the root, None without a policy.
+    """Return the folder of a run's policy, given the run's file `paths`: "" for the root, None without a policy.
 
-    It is the best policy, if the run has chosen one, else that of the newest checkpoint.
+    The policy is the best one, if the run has chosen one, else that of the newest checkpoint.
     """
     folders = {path.rpartition("/")[0] for path in paths if path.rpartition("/")[2] == CONFIG}
     steps = sorted((int(found[1]), folder) for folder in folders if (found := _CHECKPOINT.fullmatch(folder)))

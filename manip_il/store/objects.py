@@ -42,7 +42,7 @@ class Sftp(SFTPFileSystem):
     """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only; fsspec's class accepts any host key."""
 
     cachable = False
-    put: Any = fsspec.AbstractFileSystem.put  # that of fsspec's SFTP class takes only a single file
+    put: Any = fsspec.AbstractFileSystem.put  # fsspec's SFTP class can put only a single file
 
     def _connect(self) -> None:
         logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # paramiko also raises the errors that it logs
@@ -140,7 +140,7 @@ class Objects:
         return {"callback": bar, **({"batch_size": at_once} if self._fs.async_impl else {})}
 
     def _switch(self, new: Manifest, before: Manifest | None) -> None:
-        """Replace the manifest if it is still `before`: on S3 atomically; elsewhere it is read again just before."""
+        """Replace the manifest if it still equals `before`: on S3 atomically, elsewhere after reading it once more."""
         found, version = self.read(), before.version if before else None
         try:
             if (found.version if found else None) != version:

@@ -51,18 +51,18 @@ def open_remote(url: str, *, revision: str | None = None, private: bool = False,
 
 
 def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> PushPlan:
-    """Push a folder, or with `dry_run` nothing; return the differences.
+    """Push a folder, or nothing if `dry_run`; return the differences.
 
-    journals: include them. Raises `NotWhole` if a check finds errors in the dataset, or in a dataset of the run,
+    journals: push them, too. Raises `NotWhole` if a check finds errors in the dataset, or in a dataset of the run,
     `UsageError` if a dataset is pushed to a policy's address or vice versa, and `RemoteError`.
     """
     kind: Kind = "dataset" if (source / INFO).is_file() else "policy"
     if kind == "policy" and not any((source / name).exists() for name in _OF_A_RUN):
         text = f"neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_OF_A_RUN)})"
-        raise UsageError(f"{source} is {text}; give the folder of one")
+        raise UsageError(f"{source} is {text}; give one of these folders")
     if remote.kind not in (None, kind):
         text = "datasets go to hf://datasets/USER/NAME, runs to hf://USER/NAME"
-        raise UsageError(f"{source} is a {kind}, {remote.name} is for a {remote.kind}; {text}")
+        raise UsageError(f"{source} is a {kind}, but {remote.name} is for a {remote.kind}; {text}")
     for dataset in datasets_in(source):
         if errors := [one for one in examine_folder(dataset) if one.is_error]:
             text = f"{dataset} is damaged and was not pushed: {' '.join(str(errors[0]).split())}"
@@ -101,7 +101,7 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
     beside, skip = journals_of(target), len(f"{JOURNALS}/")
     journals = [path for path in files if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")]
     if beside.exists() and not overwrite and not all(files[path].fits(beside / path[skip:]) for path in journals):
-        raise FolderExistsError(beside)  # equal journals are left from a killed pull
+        raise FolderExistsError(beside)  # journals equal to the remote's are allowed: a killed pull left them
     with atomic.new_folder(target, replace=overwrite) as partial:
         _fetch(partial, remote, manifest)
         for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:

@@ -1,7 +1,7 @@
 """Tasks, one file each, and their names for gymnasium: `manip_il/PandaPickPlace-v0` and its siblings.
 
-`manip_il/PickPlace-v0` takes the robot as an argument, `manip_il/Task-v0` robot and task: names or file paths. `NAMES`
-lists the tasks of `table.py`, in its order; help reads it without importing the simulator.
+`manip_il/PickPlace-v0` takes the robot as an argument, `manip_il/Task-v0` robot and task, each as a name or file path.
+`NAMES` lists the tasks of `table.py`, in its order; help reads it without importing the simulator.
 """
 
 import gymnasium

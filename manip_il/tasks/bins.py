@@ -70,6 +70,6 @@ def rise_over(world: World, box: str) -> Target:
 
 
 def drop_place(world: World, name: str, box: str, offset: Sequence[float] = (0.0, 0.0)) -> F64:
-    """Return an object's release point over a box's floor, `offset` (2,) from its middle; (3,) [m]."""
+    """Return where to release an object over a box, (3,) [m]; offset: from the middle of its floor, (2,) [m]."""
     height = 2 * THIN + lie_of(world, name).tall / 2 + DROP
     return world.pose(box).position + [offset[0], offset[1], height]

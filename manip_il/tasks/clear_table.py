@@ -95,7 +95,7 @@ class ClearTable:
         return Start({BOX: (box, UPRIGHT), **cubes})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, box, next cube, the vector to its place, and each cube's position and whether it is inside."""
+        """Return hand, box, next cube, the vector to its place, each cube's position, and whether it is in the box."""
         name = current(world)
         return {
             **observe_hand(world),

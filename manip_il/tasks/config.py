@@ -14,7 +14,7 @@ from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.tasks import NAMES, SEVERAL
 from manip_il.tasks.stock import table as stock
 
-LIMITS_HZ = 20  # control rate at which the tasks' limits count steps; at other rates they last as long [Hz]
+LIMITS_HZ = 20  # control rate that the tasks' limits assume; at other rates they last as long in seconds [Hz]
 ROBOT_HELP = (
     f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or {stock.ROBOT} or {stock.ALOHA}: gymnasium-robotics' "
     "Fetch and gym_aloha's two arms, unmodified"
@@ -38,7 +38,7 @@ class EnvConfig(Episodes):
 
     @property
     def name(self) -> str:
-        """Robot and task as one word, files by their stems, a task without its argument."""
+        """Robot and task as one word: a file gives its stem, and a task's argument is left out."""
         return f"{Path(self.robot).stem}_{Path(self.task).stem.partition(':')[0]}"
 
 

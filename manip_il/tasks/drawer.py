@@ -40,7 +40,7 @@ BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # handle: height, half its thi
 OPEN = 0.12  # how far the drawer is pulled [m]
 HAND_Z = BAR_Z - 0.005  # height of the hand at the handle [m]
 HALF = 0.02  # half the cube's edge length [m]
-OPEN_ENOUGH, SHUT = 0.09, 0.008  # opening for the object to go in; largest that counts as shut [m]
+OPEN_ENOUGH, SHUT = 0.09, 0.008  # opening that lets the object in; largest that counts as shut [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
 SLACK = FINGERS / 2 - BAR_HALF  # play of the hand along the pull before a finger meets the handle [m]
 AROUND = (0.024, 0.03, 0.018, 0.25)  # largest offset of the hand while it moves the handle: x, y, z [m], angle [rad]
@@ -265,7 +265,7 @@ class Drawer:
         }
 
     def error(self, world: World) -> float:
-        """Return how far the drawer is open, plus the object's distance from the drawer's middle, 0 inside [m]."""
+        """Return how far the drawer is open, plus the object's distance from the drawer's middle (0 if inside) [m]."""
         missing = 0.0 if is_in_drawer(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))
         return max(0.0, pulled(world)) + missing
 

@@ -48,8 +48,8 @@ class Lie(NamedTuple):
 
     grasps: for each, the yaw of a downward hand [rad], the object's width between the fingers and length across them
     [m], and the vector from its centre to the middle between them, (3,) [m]. tall: its height [m]. tilt: angle to its
-    nearest resting pose [rad]. folds: number of its yaws that look alike, 0 if all do. level: the grasps whose fingers
-    meet upright sides. above: height of its top over the middle between the fingers, by default half `tall` [m].
+    nearest resting pose [rad]. folds: number of its yaws that look alike, 0 if all do. level: the grasps with fingers
+    on upright sides. above: height of its top over the middle between the fingers, by default half `tall` [m].
     fits: whether the gripper can close around it, if that was checked.
     """
 
@@ -68,9 +68,9 @@ class Lie(NamedTuple):
 
 
 class Grasp(NamedTuple):
-    """An object relative to the hand.
+    """How to grasp an object, and how far the hand is from that grasp.
 
-    offset: the place to grasp, in the `ee` frame, from the middle between pads that hold the object [m]. width, length:
+    offset: from the middle between pads that hold the object to the place to grasp, in frame `ee` [m]. width, length:
     its size between the fingers and across them [m]; half: height of its top over that place [m]. settled: it rests on
     a face, leans on something without moving, or is between the fingers. yaw: a downward hand's yaw to grasp it; angle:
     the hand's angle to that pose [rad].
@@ -102,7 +102,7 @@ def is_cube(world: World, name: str) -> bool:
 
 
 def once_per_state[F: Callable[..., Any]](compute: F) -> F:
-    """Return `compute`, a function of a world and names in it, with each result kept until the world changes."""
+    """Return `compute`, a function of a world and names in it, with each result cached until the world changes."""
 
     @wraps(compute)
     def read(world: World, *names: str) -> Any:
@@ -286,5 +286,5 @@ def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
 
 
 def is_inside(offset: Sequence[float], box: tuple[float, float, float]) -> bool:
-    """Return whether an offset (3,) [m] is within half lengths [m]."""
+    """Return whether an offset (3,) [m] is within a box's half lengths (3,) [m]."""
     return abs(offset[0]) <= box[0] and abs(offset[1]) <= box[1] and abs(offset[2]) <= box[2]

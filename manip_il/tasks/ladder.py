@@ -91,14 +91,14 @@ def at_grasp(world: World, name: str) -> bool:
 
 
 def rise_first(at: F64, to: Sequence[float]) -> F64:
-    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far below it."""
+    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far below the other."""
     (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
     sideways = min(1.0, max(0.0, 1.0 - (to_z - z) / RISE_FIRST))
     return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
 
 
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
-    """Approach from above: over the object and down around it, fingers open; straight up if too low beside it.
+    """Approach from above: over the object and down around it, fingers open; a hand too low beside it only rises.
 
     hover: height over the grasp on the way there, if more than what clears the object's top [m]; rise: least height
     over the grasp [m].
@@ -111,7 +111,7 @@ def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> 
 
 
 def close_on(world: World, name: str) -> Target:
-    """Close the fingers at the object's position."""
+    """Close the fingers on the object, where it is."""
     g = grasp_of(world, name)
     at = np.array(g.at)
     if world.gripper.lopsided:  # the moving jaw pushes the object to the fixed one; the hand does not follow
@@ -121,7 +121,7 @@ def close_on(world: World, name: str) -> Target:
 
 
 def carry(world: World, name: str, to: F64, lift: LiftProfile = CARRY) -> Target:
-    """Carry the held object's centre to a point (3,) [m], above it first and then down."""
+    """Carry the held object's centre to a point (3,) [m]: first above that point, then down."""
     x, y, z = (to - world.pose(name).position).tolist()
     off = math.hypot(x, y)
     height = lift.over(off)

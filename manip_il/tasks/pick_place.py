@@ -1,4 +1,4 @@
-"""Pick and place: move a cube from the table to a goal on it or in the air; lift: to a goal above it."""
+"""Pick and place: move an object to a goal on the table or in the air. Lift: to a goal above its start."""
 
 from __future__ import annotations
 
@@ -67,11 +67,11 @@ class PickPlace:
         return {**observe_hand(world), "goal": world.goal, **seen, f"goal_from_{OBJECT}": to_goal}
 
     def error(self, world: World) -> float:
-        """Return the distance of the cube's centre from the goal [m]."""
+        """Return the distance of the object's centre from the goal [m]."""
         return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label (a mesh lies too wide or too low for the gripper), or ""."""
+        """Return why there is no sound label (as it lies, a mesh is too wide or too low for the gripper), or ""."""
         if lie_of(world, OBJECT).fits or held(world, OBJECT):
             return ""
         return f"{OBJECT} lies on a side on which it is too low or too wide for the gripper"
@@ -83,7 +83,7 @@ class PickPlace:
 
 @dataclass(frozen=True)
 class Lift(PickPlace):
-    """Pick and place with the goal above the cube."""
+    """Pick and place with the goal above the object."""
 
     name: str = "lift"
     instruction: str = "Lift the cube to the green goal above it."

@@ -28,7 +28,7 @@ _STIFF, _DAMPED = 150.0, 4.0  # stiffness and damping of the spring [N/m], [N s/
 
 
 def pressed(world: World) -> float:
-    """Return how far the cap is down [m]."""
+    """Return how far the cap is pressed down [m]."""
     return min(TRAVEL, max(0.0, TOP - float(world.pose(CAP).position[2])))
 
 
@@ -85,7 +85,7 @@ class Press:
         return Start({BUTTON: (np.append(at[:2], 0.0), draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
-        """Return the hand, the middle of the cap's top, and the vector to it."""
+        """Return the hand, the middle of the cap's top, and the vector from hand to cap."""
         cap = world.pose(CAP).position
         return {**observe_hand(world), CAP: cap, "cap_from_ee": cap - world.ee.position}
 

@@ -35,7 +35,7 @@ class PushStyle(NamedTuple):
     """Dimensions of a pushing hand. behind: how far behind the puck's middle it starts [m].
 
     opening: gap between the fingers, so that the puck rests against both [m]. touching: how far behind the puck's
-    middle it touches the puck [m]. lower: limit at the distance `behind`, instead of `LOW_ENOUGH` [m].
+    middle it touches the puck [m]. lower: replaces `LOW_ENOUGH` at the distance `behind` [m].
     """
 
     behind: float

@@ -211,7 +211,7 @@ class Sort:
         return Start(poses)
 
     def observe(self, world: World) -> Observed:
-        """Return hand, which cube is named, its pose, the vectors to its bin, and all positions of cubes and bins."""
+        """Return hand, which cube is named, its pose and vectors to its bin, and all positions of cubes and bins."""
         name = asked(world)
         return {
             **observe_hand(world),

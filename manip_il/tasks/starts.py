@@ -27,10 +27,10 @@ _UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.
 
 
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
-    """Draw the side an object rests on, its position and its yaw: (3,) [m] and quaternion wxyz (4,).
+    """Draw a pose of an object at rest, its side, place and yaw: position (3,) [m] and quaternion wxyz (4,).
 
     Sides that look alike count once. A capsule lies on its side; a mesh rests as modelled or, if it cannot, on the side
-    nearest to that. A cube's yaw is within +-pi/4, as its faces are alike.
+    nearest to its modelled underside. A cube's yaw is within +-pi/4, as its faces are alike.
     """
     lengths = world.extents(name)
     if (hull := world.hull(name)) is not None:

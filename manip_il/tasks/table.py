@@ -79,7 +79,7 @@ def _shaped(task: TakesShape, shape: str) -> Task:
 
 
 def is_task(name: str) -> bool:
-    """Return whether a task ships or an installed package provides it, without running anything."""
+    """Return whether a task ships or an installed package provides it; the task's code is not run."""
     base = name.partition(":")[0]
     return base in TASKS or _entry_point(base) is not None
 
@@ -90,9 +90,9 @@ def source_hash(task: Task) -> str:
 
 
 def check_unchanged(name: str) -> None:
-    """Raise `UsageError` if a task's file was edited since this process ran it, which it does only once."""
+    """Raise `UsageError` if a task's file was edited since this process ran it: a process runs a file only once."""
     path = Path(name).absolute()
-    if name.endswith(SUFFIX) and path.read_bytes() != _of_file(path)[1]:
+    if name.endswith(SUFFIX) and checks.read_bytes(path, "a task's Python file") != _of_file(path)[1]:
         raise UsageError(f"{path} was edited after this process had run it; start Python again")
 
 

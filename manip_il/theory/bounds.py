@@ -3,7 +3,7 @@
 Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross & Bagnell 2010).
 Theorem 8.2: one that errs in a share eps of its own states loses at most u H eps; u is the largest cost of one wrong
 step if the expert then drives (Ross et al. 2011, Theorem 2.2; where the bound is stated as H eps, its constant includes
-u). They are numbered as in the imitation-learning chapter. Rewards are 0 to 1 per step. Policies are fitted to
+u). The theorems' numbers are those of the course, docs/course. Rewards are 0 to 1 per step. Policies are fitted to
 trajectories; in states without data they take the worst action, as the theorems allow.
 """
 
@@ -32,7 +32,7 @@ Learner = Literal["cloning", "DAgger"]
 
 @dataclass(frozen=True, eq=False)
 class LossCurve:
-    """Losses of a learner over the horizon, for each draw of its data, (h, D).
+    """Losses of a learner at each of h horizons, for each of D draws of its training data: arrays (h, D).
 
     errors: share of states in which the policy errs; gaps: the expert's return minus the policy's; bounds: upper bounds
     on the gaps by the learner's theorem.
@@ -107,9 +107,9 @@ def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
 
 
 def clone(process: Process, seen: NDArray[np.bool_]) -> F64:
-    """Return policies (..., H, S) fitted to labels in the seen states (..., H, S): right there, wrong elsewhere.
+    """Return policies (..., H, S) fitted to labels in the seen states (..., H, S): right in these, wrong elsewhere.
 
-    In states in which no action is worse than the expert's, such as after a fall, they act as the expert.
+    In states in which no action is worse than the expert's, such as after a fall, the policies act as the expert.
     """
     return np.where(seen | (process.wrong_costs(seen.shape[-2]) <= 0), 0.0, 1.0)
 
@@ -132,7 +132,7 @@ def dagger(process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.
 
 
 def _fitted(process: Process, horizon: int, draws: int) -> dict[Learner, F64]:
-    """Cloning's and DAgger's policies for equally many trajectories, which leave a share of about ERROR / H unseen."""
+    """Policies of both learners after equally many trajectories, which leave about ERROR / H of the states unseen."""
     rngs = [rng_for(draw, f"trajectories of {horizon} steps, {process.name}") for draw in range(draws)]
     count = int(np.ceil(PLACES * np.log(horizon / ERROR)))
     first = round(count / (1 + ROUNDS / MORE))

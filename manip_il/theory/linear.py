@@ -2,9 +2,9 @@
 
 x' = a x + u + w. The expert u = -k x halves the state in every step. Its demonstrations cover few states beside its
 path, so a clone has no feedback there, and an error develops as in the open loop: it decays if the open loop is stable,
-as for an arm whose servos hold joint targets, and grows exponentially otherwise. Simchowitz et al. (2025) prove the
-latter for smooth deterministic imitators in general. Noise on the demonstrations, which makes the expert show
-corrections, is DART (Laskey et al. 2017).
+as for an arm whose servos hold joint targets, and grows exponentially otherwise. Simchowitz et al. (2025) prove
+exponential growth for smooth deterministic imitators in general. Noise on the demonstrations, which makes the expert
+show corrections, is DART (Laskey et al. 2017).
 """
 
 from __future__ import annotations

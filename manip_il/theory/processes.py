@@ -1,6 +1,6 @@
 """Processes small enough to be solved exactly, which differ in what one wrong step costs if the expert then drives.
 
-A policy is its probability (H, S) of a wrong action at each step in each state; several are (..., H, S).
+A policy is an array (H, S): the probability of a wrong action at each step in each state. Several are (..., H, S).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _BELOW_1 = 1 - 1e-9  # keeps a random number below 1 after rounding
 class Process:
     """S states and two actions; the expert always takes `RIGHT`. Rewards are 0 to 1 per step.
 
-    words: what a wrong action does. moves: transition probabilities, (2, S, S), uniform over the successors. rewards:
-    (2, S). start: distribution of the first state, (S,). slopes: exponents with which, by the theorems,
-    gap over error grows with the horizon, for cloning and DAgger.
+    words: what a wrong action does. moves: transition probabilities (action, from, to), (2, S, S), uniform over the
+    successors. rewards: (2, S). start: distribution of the first state, (S,). slopes: for cloning and DAgger, the power
+    of the horizon with which gap over error grows, according to the theorems.
     """
 
     name: str

@@ -47,12 +47,12 @@ RoundData = tuple[int, Path, tuple[Path, ...]]  # number, `pretrained_model` fol
 
 @dataclass(frozen=True)
 class RoundShift:
-    """One round's policy. on_expert, on_own: share of the expert's states, and of its own, in which it is wrong.
+    """One round's policy. on_expert, on_own: how often it is wrong, as a share of the expert's and of its own states.
 
     on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode. distance: median
-    distance of its states to the nearest training state, relative to that of the expert's states. cost, gap: mean cost,
-    and its excess over the expert's [control steps]; bound: Theorem 8.2's bound on the gap, u times `mistakes`. data,
-    hand: positions of the hand in the training data and in the policy's rollouts, (N, 3) [m].
+    distance of the policy's states to the nearest training state, divided by that of the expert's states. cost: mean
+    cost; gap: its excess over the expert's cost [control steps]; bound: Theorem 8.2's bound on the gap, u times
+    `mistakes`. data, hand: positions of the hand in the training data and in the policy's rollouts, (N, 3) [m].
     """
 
     round: int
@@ -81,7 +81,7 @@ class RoundShift:
 
 @dataclass(frozen=True)
 class Shift:
-    """A run's rounds. expert_cost: [control steps]; u: largest observed cost of one wrong action [control steps]."""
+    """A run's rounds. expert_cost: the expert's mean cost; u: largest cost seen of one wrong action [control steps]."""
 
     env: EnvConfig
     expert_cost: float
@@ -101,7 +101,7 @@ class Shift:
 
 
 def find_rounds(run: Path) -> list[RoundData]:
-    """Return the rounds of a run that have a policy. Raises `ManipError` if there is none."""
+    """Return the rounds of a run that have a policy and training data. Raises `ManipError` if there is none."""
     found, datasets = list[RoundData](), list[Path]()
     for folder in sorted(run.glob("round_[0-9][0-9][0-9]")):
         if (folder / "dataset" / "meta" / "info.json").is_file():
@@ -125,7 +125,7 @@ def measure_shift(
 ) -> Shift:
     """Run the expert and every round's policy on the same seeds, and query the expert in every state.
 
-    conditions: those of the run. u: the expert's recoverability on `env`, see `certify`.
+    conditions: the run's variations of the world. u: the expert's recoverability on `env`, see `certify`.
     """
     seeds, scale = stream_seeds("theory", episodes), env_actions(env).scale
     spec, found = env_spec(env), list[RoundShift]()
@@ -201,9 +201,9 @@ def _is_wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.b
 
 
 def relative_distance(states: F64, data: F64, fresh: F64) -> float:
-    """Return the median distance of states (N, d) to the nearest row of the data (M, d), relative to that of `fresh`.
+    """Return the median distance of `states` (N, d) to the nearest row of `data` (M, d), divided by that of `fresh`.
 
-    fresh: the expert's states in new episodes, (F, d). Columns are scaled by the data's standard deviations.
+    fresh: the expert's states in new episodes, (F, d). Columns are divided by the data's standard deviations.
     """
     scale = np.maximum(data.std(axis=0), 1e-6)
     own, usual = (np.median(cdist(rows / scale, data / scale).min(axis=1)) for rows in (states, fresh))

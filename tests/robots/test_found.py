@@ -17,6 +17,7 @@ from manip_il.robots.table import get_robot, read_robot
 from manip_il.seeding import stream_seeds
 from manip_il.tasks.config import make_config
 
+from ..scenes import started, still
 from .own import ARM, EXAMPLES, JAWS, tree_of, write
 
 SEEDS = stream_seeds("validation", 4)
@@ -111,5 +112,10 @@ def test_an_example_says_little_and_is_found_whole(example: Path):
 @pytest.mark.parametrize("name", ["ur5e", "xarm7"])
 def test_the_expert_stacks_with_fingers_on_a_linkage(name: str):
     example = next(path for path in EXAMPLES if path.stem == name)
+    env = started(str(example), "reach")
+    before, linked = env.data.qpos.copy(), sweep(env.scene.robot).linked
+    assert linked
+    env.advance(still(env, env.world.opening))
+    assert np.abs(env.data.qpos - before).max() < 0.01, "all joints of the linkage start where its opening says"
     episodes = list(RolloutJob(make_config(str(example), "stack")).run(SEEDS))
     assert all(episode.success for episode in episodes)

@@ -41,9 +41,7 @@ def with_cube(robot: str, opening: float, offset: tuple[float, float, float]) ->
 @every_robot
 def test_the_opening_that_is_commanded_is_the_opening_that_is_measured(robot: str):
     env = started(robot, "reach")
-    gripper, at_start = env.scene.gripper, env.world.opening
-    env.advance(still(env, at_start))
-    assert env.world.opening == pytest.approx(at_start, abs=1e-3), "a linkage starts closed around this opening, too"
+    gripper = env.scene.gripper
     for opening in (gripper.most, 0.03, 0.055, 0.01, gripper.least):
         for _ in range(25):
             env.advance(still(env, opening))

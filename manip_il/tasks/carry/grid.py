@@ -28,8 +28,8 @@ LIFTED = 0.02  # least height of the object over its resting height, except near
 DOWN = 0.03  # sideways distance from the goal within which the object may be lower, at full scale [m]
 AHEAD = 3  # how far the descent looks ahead [cells]
 OUTSIDE = 0.12  # largest distance to a node with a path if none is nearby, at full scale [m]
-KEPT = 26  # plans cached per process: one per environment in lockstep, and one
-_STEEP, _SHORT = 0.004, 0.3  # softmin over nodes: temperature as path length [m]; share of the price added to near ones
+KEPT = 26  # plans cached per process: one per environment in lockstep, and one more
+_STEEP, _SHORT = 0.004, 0.3  # softmin over nodes: temperature as path length [m]; share of price added to near nodes
 _QUARTERS = np.array([0.25, 0.5, 0.75])  # shares of a line at which its room and its costs are evaluated
 _LOOK = 24  # most points of a snapped path, a quarter cell apart, that one edge may replace
 _SLACK = 0.003  # lack of room that a line may have, because it may start beside a node with none to spare [m]
@@ -178,7 +178,7 @@ def _dense(positions: F64, step: float) -> F64:
 class Descent:
     """Costs-to-go of a grid, and how to descend them from any position.
 
-    costs: of the nodes, (S,); weights: of the features, per metre, (K,).
+    costs: each node's cost-to-go, (S,); weights: each feature's cost per metre, (K,).
     """
 
     grid: Grid

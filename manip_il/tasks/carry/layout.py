@@ -74,8 +74,8 @@ class Layout:
     """What stands on the table in one episode.
 
     scale: factor on all lengths, 1 for a workspace of half width `FULL`. goal: target of the object's centre [m].
-    places: (x, y) [m] of the obstacles present, by name. edge: None if none is near. half: half the object's height
-    [m]. parts: of object and hand, relative to the object's centre.
+    places: (x, y) [m] of the obstacles present, by name. edge: the table's; None if it is not near. half: half
+    the object's height [m]. parts: of object and hand, relative to the object's centre.
     """
 
     scale: float
@@ -129,7 +129,7 @@ class Layout:
         return found
 
     def is_free(self, start: F64, end: F64, spare: float) -> bool:
-        """Return whether `room` is at least `spare` [m] all along a straight line from (3,) to (3,) [m]."""
+        """Return whether `room` is at least `spare` [m] all along the straight line from `start` to `end`, (3,) [m]."""
         pieces = max(1, math.ceil(np.linalg.norm(end - start) / (2 * STEP)))
         return bool(self.room(start + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end - start)).min() >= spare)
 
@@ -153,9 +153,9 @@ def path_features(layout: Layout, positions: F64) -> F64:
 
 @dataclass(frozen=True)
 class Reward:
-    """Weights, in the order of `FEATURES`: the cost of a metre of path on which that feature is 1.
+    """Weights, in the order of `FEATURES`: each is the cost of a metre of path on which its feature is 1.
 
-    Raises `UsageError` for weights outside 0 to `MOST`, and for a `length` of 0: paths could otherwise have
+    Raises `UsageError` for a weight outside 0 to `MOST`, and for a weight of 0 for `length`: paths could then have
     any length.
     """
 
@@ -170,7 +170,7 @@ class Reward:
 
     @classmethod
     def of(cls, weights: Mapping[str, float]) -> Reward:
-        """Return a reward from weights by feature; those left out are 0. Raises `UnknownName` for any other name."""
+        """Return a reward from weights by feature; those left out are 0. Raises `UnknownName` for unknown ones."""
         for name in weights:
             if name not in FEATURES:
                 raise UnknownName("feature", name, FEATURES)

@@ -118,7 +118,7 @@ def _numbers(vector: F64) -> tuple[float, float, float]:
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout that an observation describes. name: which object; seen: `environment_state` by name."""
+    """Return the layout that an observation describes. name: the object's; seen: `environment_state` by name."""
 
     def vector(of: str) -> F64:
         return np.array([seen[f"{of}.{axis}"] for axis in "xyz"], dtype=np.float64)
@@ -131,7 +131,7 @@ def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layou
 
 
 def observe_obstacles(world: World) -> dict[str, F64 | float]:
-    """Return every obstacle's position [m] and presence, and the table's edge: a point on it, and its direction."""
+    """Return all obstacles' positions [m] and presence, and the table's edge: a point on it, its outward axis."""
     found: dict[str, F64 | float] = {}
     for name in (*OBSTACLES, EDGE):
         found |= {name: world.pose(name).position, f"{name}.here": float(is_there(world, name))}
@@ -165,7 +165,7 @@ def hand_of(scene: Scene) -> HandShape:
     """Return the shape of the hand of a scene's robot, in its home pose; cached."""
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[scene.arm_q] = scene.robot.home
-    data.qpos[scene.gripper.q] = scene.gripper.command(scene.gripper.most)
+    scene.gripper.put(data, scene.gripper.most)
     mujoco.mj_kinematics(model, data)
     ee, moved = data.site_xpos[scene.ee_site], _last_bodies(scene)
     axes = data.site_xmat[scene.ee_site].reshape(3, 3)[:, :2]
@@ -196,7 +196,7 @@ def _box(points: F64, axes: F64) -> Box:
 
 
 def fits(hand: HandShape, at: F64, yaw: float, layout: Layout) -> bool:
-    """Return whether a downward hand, `ee` at a point (3,) [m] and a yaw [rad], is clear of a layout's obstacles."""
+    """Return whether a downward hand with `ee` at (3,) [m] and a yaw [rad] is clear of a layout's obstacles."""
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])  # the hand's x and y
     for _, middle, half, height in layout.boxes:
         for box in hand.boxes:

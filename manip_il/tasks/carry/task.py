@@ -146,7 +146,7 @@ class Carry(PickPlace):
         add_obstacles(spec, self.scale)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw object, goal and one to four obstacles, mostly between the two, and set the task's reward."""
+        """Draw the object, the goal and one to four obstacles, mostly between object and goal; store the reward."""
         names = rng.permutation([*OBSTACLES, EDGE]).tolist()
         names = names[: int(rng.integers(1, len(names) + 1))]
         for tried in range(_DRAWS):

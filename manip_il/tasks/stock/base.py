@@ -43,7 +43,7 @@ class StockBase:
 
     def start(self, seed: int) -> None:
         """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
-        self._env.reset(seed=seed % 2**32)  # more is too large for gym_aloha
+        self._env.reset(seed=seed)
         self._begin()
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:

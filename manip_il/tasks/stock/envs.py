@@ -21,7 +21,7 @@ StockLabeller = StockExpert | AlohaExpert
 def make_stock(
     robot: str, task: str, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
 ) -> StockEnvironment:
-    """Make an environment. Raises `UsageError` for cameras that it does not have, or conditions that have ranges."""
+    """Make a stock environment. Raises `UsageError` for a camera that it lacks, or a condition with any range."""
     check_cameras(robot, cameras)
     if changed := [one.name for one in conditions if one.ranges]:
         raise UsageError(

@@ -18,7 +18,7 @@ PHASES = ("none", "approach", "grasp", "carry", "push", "hold")
 
 @dataclass(frozen=True)
 class StockTask:
-    """One environment. has_object: the goal is for a cube, not for the gripper; blocked: the fingers stay closed."""
+    """A stock task. has_object: the goal is for a cube, not for the gripper; blocked: the fingers stay closed."""
 
     name: str
     instruction: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import Any, override
 
 import mujoco
 import numpy as np
@@ -26,7 +26,7 @@ MOST_REWARD = 4
 GRIPPERS = np.array([6, 13])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
 _DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
-_ANEW = 0.6  # chance that an untouched object gets a new place; else a hand that reaches for it is still near it
+_ANEW = 0.6  # chance that an untouched object gets a new place; otherwise a hand reaching for it stays near it
 _DROPPED, _FALL = 0.1, 30  # chance that a hand drops what it carries; most control steps after it has opened
 _STAYS, _ELSEWHERE = 0.4, 0.08  # chance that an arm stays; largest standard deviation of its joints if not [rad]
 _COARSE = 240  # height up to which simpler meshes are drawn [pixels]: 2 % of the pixels change by over 8 of 255
@@ -61,9 +61,14 @@ class AlohaEnv(StockBase):
         self.actions = _actions(self.model)
         self.start(0)
 
+    @override
+    def start(self, seed: int) -> None:
+        """Begin the episode of a seed."""
+        super().start(seed % 2**32)  # gym_aloha takes no larger seed
+
     @property
     def progress(self) -> float:
-        """Reward of the state as a share of the environment's highest."""
+        """Reward of the state as a share of the environment's highest reward."""
         return float(self._env._env.task.get_reward(self.physics)) / MOST_REWARD
 
     def scene(self, kind: type[AlohaScene] = AlohaScene) -> AlohaScene:

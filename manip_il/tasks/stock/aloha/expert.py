@@ -21,7 +21,7 @@ ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the 
 ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
 FOREARM_ROLL, WRIST = 3, 4
 MOST_STEP, MOST_TURN = 0.10, 0.5  # largest step of a hand towards its target [m], [rad]
-FALLEN = -0.02  # an object under this height has left the table [m]
+FALLEN = -0.02  # an object lower than this has fallen off the table [m]
 REACH = (0.2, 0.68)  # range of an arm on the table, from its foot [m]
 CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
@@ -109,7 +109,7 @@ class _Arm:
         return hand.q + self._lead(step) + gravity
 
     def _lead(self, step: F64) -> F64:
-        """Lead of the targets over the joints (6,) that makes them step (6,) against friction [rad]."""
+        """Lead of joint targets over joints, (6,) [rad], that moves the joints by `step` (6,) despite friction."""
         size, most = np.abs(step), CREEPS * self._breakaway
         crept = self._creep * most
         return np.sign(step) * np.where(size <= crept, size / self._creep, most + (size - crept) / BREAKAWAY)

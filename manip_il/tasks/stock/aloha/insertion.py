@@ -74,7 +74,7 @@ class Insertion(AlohaScene):
 
 
 def _lifted_to(thing: Thing, to: F64) -> F64:
-    """Next target of an object on its way to a place (3,): up first [m]."""
+    """Next target (3,) of an object on its way to a place (3,) [m]: up first."""
     share = min(1.0, max(0.0, (thing.position[2] - LOW) / (HIGH - LOW)))
     way = share * (to - thing.position)
     return np.array([thing.position[0] + way[0], thing.position[1] + way[1], to[2]])

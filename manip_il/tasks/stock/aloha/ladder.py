@@ -160,7 +160,7 @@ def nearest(axes: F64, way: F64) -> F64:
 
 
 def ahead_across(ahead: F64, across: F64) -> F64:
-    """Return the rotation (3, 3) of a hand that points along `ahead` (3,), its fingers opening near `across` (3,)."""
+    """Return the rotation (3, 3) of a hand that points along `ahead` (3,) and opens roughly along `across` (3,)."""
     x = ahead / np.linalg.norm(ahead)
     y = across - x * (x @ across)
     y /= np.linalg.norm(y)
@@ -196,7 +196,7 @@ class HandTarget(NamedTuple):
 
 
 def close_on(scene: AlohaScene, name: str, rotation: F64, longest: float = FAST) -> HandTarget:
-    """Close the fingers at the object. rotation: the grasp's, (3, 3)."""
+    """Close the fingers on the object. rotation: the grasp's, (3, 3)."""
     return HandTarget(scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest)
 
 
@@ -220,7 +220,7 @@ def approach(
 
 
 def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[StockRung, StockRung]:
-    """Return the rungs of a hand that takes an object from the table. grasp: gives the hand's rotation, (3, 3)."""
+    """Return the rungs of a hand that takes an object from the table. grasp: scene -> the hand's rotation, (3, 3)."""
     return (
         StockRung(
             "grasp", lambda one: one.is_at_grasp(side, name, grasp(one)), lambda one: close_on(one, name, grasp(one))
