@@ -170,8 +170,7 @@ def sweep(robot: Robot) -> Sweep:
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
     ]
-    linked = _linked(robot, model, poses[shut:])
-    return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=linked)
+    return Sweep(*map(np.array, (shares, openings, middles)), *places, linked=_linked(robot, model, poses[shut:]))
 
 
 def _linked(robot: Robot, model: mujoco.MjModel, poses: Sequence[F64]) -> dict[str, F64]:

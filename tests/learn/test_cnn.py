@@ -232,7 +232,8 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
         new_policy(meta, states=str(meta.root), aux_weight=0.0)
     with pytest.raises(UsageError, match=r"policy\.states cannot be combined with ee_delta"):
         new_policy(meta, states=str(meta.root), action_space="ee_delta")
-    config, wide = policy.config, write_table({**table, "action": 3 * table["action"]}, tmp_path / "wide", spec)
+    config: Any = policy.config
+    wide = write_table({**table, "action": 3 * table["action"]}, tmp_path / "wide", spec)
     config.pretrained_path, config.states = tmp_path, str(wide[0].root)
     again: Any = build_policy(config, SimpleNamespace(features=meta.features, root=wide[0].root, stats={}))
     assert (again.model.target_high > policy.model.target_high).any(), "it acts within the range of the new data"
