@@ -151,8 +151,8 @@ def sweep(robot: Robot) -> Sweep:
     least = [min(float(gap.min()) for gap in one) for one in gaps]
     shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # links may pass each other
     pads = [_near(gap, tip, float(gap.min())) for gap, tip in zip(gaps[shut], tips, strict=True)]
-    openings, middles, shares = [], [], shares[shut:]
-    for pose in poses[shut:]:
+    openings, middles, shares, wide = [], [], shares[shut:], poses[shut:]
+    for pose in wide:
         openings.append(min(float(one.min()) for one in gaps_at(pose, pads)))
         middle = nearest(model, data, pads)[1].mean(axis=0) - data.site("ee").xpos
         middles.append(float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle))
@@ -170,7 +170,7 @@ def sweep(robot: Robot) -> Sweep:
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
     ]
-    return Sweep(*map(np.array, (shares, openings, middles)), *places, linked=_linked(robot, model, poses[shut:]))
+    return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=_linked(robot, model, wide))
 
 
 def _linked(robot: Robot, model: mujoco.MjModel, poses: Sequence[F64]) -> dict[str, F64]:
