@@ -158,7 +158,7 @@ class RunConfig(Seeded):
 
     @property
     def steps_of_branch(self) -> int:
-        """Control steps of a branch; by default just enough for the policy to learn one whole plan."""
+        """Control steps that the expert drives in a branch; by default just enough for one whole action chunk."""
         return self.branch_steps or sum(plan_of(self.fit))
 
     @property

@@ -116,7 +116,7 @@ class AnswerOptions(OfPairs, Seeded):
     """
 
     example: ClassVar[str] = "manip-il reward answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
-    teacher: str = option("perfect", "perfect, boltzmann[:1] or mistaken[:0.1]")
+    teacher: str = option("perfect", "perfect, boltzmann[:TEMPERATURE] (default 1) or mistaken[:SHARE] (default 0.1)")
     file: OutputFile = group(OutputFile(Path("preferences.json")), prefix="")
 
     def run(self) -> None:

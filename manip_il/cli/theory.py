@@ -28,7 +28,7 @@ class TheoryOptions:
     example: ClassVar[str] = "manip-il theory runs/dagger --output_dir=runs/theory"
     source: Path | None = option(None, "a run of manip-il dagger, to measure its rounds", positional=True, exists="")
     episodes: int = option(50, "episodes of the expert and of every round's policy", at_least=2)
-    cases: int = option(30, "wrong actions of each kind, to measure how many steps one costs the expert", at_least=1)
+    cases: int = option(30, "episodes per kind of perturbation, to measure the cost of a wrong action", at_least=1)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: Output = group(Output(Path("runs/theory")), prefix="")
 

@@ -70,7 +70,7 @@ class PullOptions(Replacing):
     dry_run: bool = option(False, "only list what would be downloaded")
 
     def run(self) -> None:
-        """Download, verify, rename; print what was pulled."""
+        """Download and verify the files, move the folder into place, and print what was pulled."""
         from rich import filesize
 
         from manip_il.store.transfer import open_remote, pull

@@ -1,4 +1,4 @@
-"""A `pretrained_model` folder, which may be downloaded: it is checked before anything in it is loaded.
+"""A `pretrained_model` folder, possibly downloaded: it is checked before anything in it is loaded.
 
 LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
 `trust_remote_code`, which runs Python from the named repository. Policies that are built only from their own

@@ -32,7 +32,7 @@ Mover = Callable[[], F64 | None]
 
 
 class Read(NamedTuple):
-    """The world and the follower at the moment when a client reads it.
+    """The world and the follower when a client reads the follower's position.
 
     told: the follower's target after `commands` commands. sag: how far the follower hangs below its target. Both are
     joint angles [rad], (n,).

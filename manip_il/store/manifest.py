@@ -150,7 +150,7 @@ def newest(checkpoints: Path) -> str | None:
 
 
 def policy_folder(paths: Iterable[str]) -> str | None:
-    """Return the folder of a run's policy, given the run's file `paths`: "" for the root, None without a policy.
+    """Return the folder of a run's policy, given the paths of the run's files: "" for the root, None if there is none.
 
     The policy is the best one, if the run has chosen one, else that of the newest checkpoint.
     """

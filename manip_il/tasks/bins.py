@@ -44,9 +44,9 @@ def is_in(world: World, name: str, box: str, inside: tuple[float, float]) -> boo
 def drop_rungs(
     which: Which, to: Place, is_done: Callable[[World, str], bool], names: Sequence[str], lift: LiftProfile = OVER_WALL
 ) -> tuple[Rung, ...]:
-    """Return the rungs that carry the held object over its place in a box and release it there.
+    """Return the rungs that carry the current object to its release point over a box and drop it in.
 
-    which: the object that is held or next; to: where its centre is released; is_done: whether an object is in place.
+    which: returns the current object; to: where to release its centre [m]; is_done: whether an object is in place.
     """
 
     def nearest(world: World) -> str:

@@ -38,7 +38,7 @@ class EnvConfig(Episodes):
 
     @property
     def name(self) -> str:
-        """Robot and task as one word: a file gives its stem, and a task's argument is left out."""
+        """Robot and task joined by "_": of a file, its name without the suffix; of a task, not its argument."""
         return f"{Path(self.robot).stem}_{Path(self.task).stem.partition(':')[0]}"
 
 

@@ -241,6 +241,6 @@ class Descent:
 
 @lru_cache(KEPT)
 def descent(layout: Layout, reward: Reward, robot: Robot) -> Descent:
-    """Return the descent of a layout's costs-to-go for a reward, computed once and cached."""
+    """Return a layout's costs-to-go for a reward, as a `Descent` to the goal; computed once and cached."""
     grid, weights = Grid(layout, robot), np.array(reward.weights)
     return Descent(grid, grid.costs_to_go(weights), weights)

@@ -38,7 +38,7 @@ _LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle
 
 
 def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add every obstacle with its box for contacts, the table's edge, and the bodies that hold the reward."""
+    """Add every obstacle with its contact box, the table's edge, and mocap bodies whose positions are the weights."""
     for name, obstacle in OBSTACLES.items():
         body = add_furniture(spec, name)
         body.pos = [0.5, 0, -PARKED]
@@ -141,7 +141,7 @@ def observe_obstacles(world: World) -> dict[str, F64 | float]:
 class Box(NamedTuple):
     """Upright box around a part of the hand, relative to `ee`.
 
-    bottom: height of its lowest point [m]. middle, half: middle and half lengths along the hand's x and y, (2,) [m].
+    bottom: height of its lowest point [m]. middle, half: centre and half-lengths along the hand's x and y, (2,) [m].
     """
 
     bottom: float

@@ -105,9 +105,9 @@ class AlohaEnv(StockBase):
         return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
 
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
-        """Return a state in which the arms, and untouched objects on the table, may be elsewhere.
+        """Return `state` with some arms and some untouched objects on the table moved at random.
 
-        What a hand carries moves with it, or has been dropped. Return None if bodies then overlap.
+        An object in a hand moves with the hand, or is dropped first. Return None if bodies then overlap.
         """
         self.set_state(state)
         self._env.reset(seed=int(rng.integers(2**32)))
