@@ -78,6 +78,8 @@ def small_words(words: Sequence[str]) -> list[str]:
     if {"policy", "policy.width"} & known:
         kind = _value("policy.type", own) or _policy_in_config(own) or "mlp"
         sizes |= {f"policy.{option}": size for option, size in OF_POLICY.get(kind, {}).items()}
+    if name == "compare" and own[0].endswith(".yaml"):  # the study's own file has its sizes
+        sizes = {option: size for option, size in sizes.items() if not option.startswith(("eval.", "env."))}
     if name == "serve":  # it serves for as long as a program runs
         return [name, *with_sizes(own[: own.index("--") if "--" in own else None], sizes), "--", "true"]
     return [*name.split(), *with_sizes(own, sizes)]

@@ -64,7 +64,7 @@ def test_a_knock_moves_the_cube_that_is_named():
     env = make_env("panda", "sort")
     for name, _, state in starts()[:10]:
         env.set_state(state)
-        before = env.world.pose(name).position
+        before = env.world.pose(name).position.copy()
         move_object(env.world, np.random.default_rng(0), (0.05, 0.08))
         assert 0.05 <= np.linalg.norm((env.world.pose(name).position - before)[:2]) <= 0.08
 
