@@ -46,7 +46,7 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
 _FILES = (".py", ".yaml", ".yml")  # suffixes of files with a user's own task or robot
 
 
-def own_files(env: EnvConfig) -> str:
+def env_options(env: EnvConfig) -> str:
     """Return as text those options of an environment that no dataset or policy stores: paths, and changed limits."""
     named = {"robot": env.robot, "task": env.task}
     try:

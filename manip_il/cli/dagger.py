@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, check_labels
-from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trusting, Varied, env_config, own_files
+from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trusting, Varied, env_config, env_options
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say
@@ -71,7 +72,8 @@ class DaggerOptions(Varied, Trusting):
         if (folder / "dataset").is_dir():
             say(f"labels of all rounds as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
-        say(f"next: manip-il eval --policy.path={best}{own_files(config.env)} --output_dir={folder}/test")
+        words = f"--policy.path={quote(str(best))}{env_options(config.env)} --output_dir={quote(f'{folder}/test')}"
+        say(f"next: manip-il eval {words}")
 
     def config(self) -> RunConfig:
         """Return the configuration of the run; raises if options contradict each other, or do not fit the inputs."""

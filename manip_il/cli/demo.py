@@ -6,10 +6,11 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.cli.common_options import EngineOptions, own_files
+from manip_il.cli.common_options import EngineOptions, env_options
 from manip_il.cli.dagger import DaggerOptions, run_rounds, write_page
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
@@ -71,8 +72,8 @@ class DemoOptions:
         print_table(policy_table(rows))
         say(verdict, *facts)
         say(f"report: {folder / REPORT_FILE}")
-        policy = f"{policies[-1]}{own_files(config.env)}"
-        say(f"next: manip-il eval --policy.path={policy} --eval.films=3 --output_dir={folder}_eval")
+        policy = f"{quote(str(policies[-1]))}{env_options(config.env)}"
+        say(f"next: manip-il eval --policy.path={policy} --eval.films=3 --output_dir={quote(f'{folder}_eval')}")
 
     def _measure(
         self, config: RunConfig, folder: Path, engine: Engine, stages: Stages

@@ -31,8 +31,8 @@ PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = (  # options that define an mlp's architecture
-    *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled", "grippers"),
-    "action_space",
+    *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled"),
+    *("grippers", "action_space"),
 )
 
 
