@@ -1,4 +1,5 @@
-# The command line as an image: `docker build -t manip-il .`; how it is used stands in docs/docker.md.
+# The command line as an image: `docker build -t manip-il .`; docs/docker.md shows how to use it. Before version 23,
+# Docker needs DOCKER_BUILDKIT=1.
 
 FROM debian:trixie-slim AS uv
 ARG UV_VERSION=0.13.8
@@ -21,26 +22,6 @@ RUN /opt/uv/bin/uv pip compile --quiet --no-header --no-annotate --python /usr/b
         ${TORCH_BACKEND:+--torch-backend=$TORCH_BACKEND} --no-emit-package cmake --no-emit-package triton \
         --extra so101 --constraints requirements.lock pyproject.toml --output-file runtime.txt
 
-# Those packages with the lock's hashes; one that the lock has not ends the build. Tests and headers go again.
-FROM uv AS packages
-ARG TORCH_BACKEND=
-COPY --from=names /build/runtime.txt /build/requirements.lock ./
-RUN /opt/uv/bin/uv venv --quiet --python /usr/bin/python3 /opt/manip-il \
-    && /opt/uv/bin/uv pip install --quiet --no-deps --compile-bytecode --python /opt/manip-il/bin/python \
-        $(if [ "$TORCH_BACKEND" ]; then echo "--no-verify-hashes --torch-backend=$TORCH_BACKEND"; \
-          else echo --require-hashes; fi) \
-        --constraints requirements.lock --requirements runtime.txt \
-    && cd /opt/manip-il/lib/python3*/site-packages && rm -r torch/include \
-    && find pandas pyarrow scipy sympy -type d -name tests -prune -exec rm -r {} +
-
-# This project alone: a change of its code leaves the packages as they are.
-FROM packages AS project
-COPY pyproject.toml README.md LICENSE ./
-COPY configs configs
-COPY manip_il manip_il
-RUN /opt/uv/bin/uv pip install --quiet --offline --no-deps --no-build-isolation --compile-bytecode \
-        --python /opt/manip-il/bin/python --prefix /opt/project .
-
 FROM debian:trixie-slim
 LABEL org.opencontainers.image.title="manip-il" \
       org.opencontainers.image.description="Robot-arm imitation learning without a human at the controls" \
@@ -55,8 +36,25 @@ RUN apt-get update -qq \
 # Mesa's, and passed over where there is no such driver.
 RUN echo '{"file_format_version": "1.0.0", "ICD": {"library_path": "libEGL_nvidia.so.0"}}' \
         >/usr/share/glvnd/egl_vendor.d/10_nvidia.json
-COPY --from=packages /opt/manip-il /opt/manip-il
-COPY --from=project /opt/project /opt/manip-il
+
+# Those packages with the lock's hashes; one that the lock has not ends the build. Tests and headers go again. uv and its
+# certificates are only mounted: the packages are written once, and nothing else of that stage is in the image.
+ARG TORCH_BACKEND=
+RUN --mount=from=uv,source=/opt/uv,target=/opt/uv --mount=from=uv,source=/etc/ssl,target=/etc/ssl \
+    --mount=from=names,source=/build,target=/build \
+    export UV_SYSTEM_CERTS=true UV_NO_CACHE=true \
+    && /opt/uv/bin/uv venv --quiet --python /usr/bin/python3 /opt/manip-il \
+    && /opt/uv/bin/uv pip install --quiet --no-deps --compile-bytecode --python /opt/manip-il/bin/python \
+        $(if [ "$TORCH_BACKEND" ]; then echo "--no-verify-hashes --torch-backend=$TORCH_BACKEND"; \
+          else echo --require-hashes; fi) \
+        --constraints /build/requirements.lock --requirements /build/runtime.txt \
+    && cd /opt/manip-il/lib/python3*/site-packages && rm -r torch/include \
+    && find pandas pyarrow scipy sympy -type d -name tests -prune -exec rm -r {} +
+
+# This project alone: a change of its code leaves the packages as they are.
+RUN --mount=from=uv,source=/opt/uv,target=/opt/uv --mount=target=/src,rw \
+    /opt/uv/bin/uv pip install --quiet --no-cache --offline --no-deps --no-build-isolation --compile-bytecode \
+        --python /opt/manip-il/bin/python /src
 WORKDIR /opt/manip-il/share/manip_il
 COPY configs configs
 # Everything that is written goes under /tmp, so that the root may be read-only and the user anyone, even one without a

@@ -49,7 +49,7 @@ def record(
     workers: int | None = 1,
     **options: Any,
 ) -> Dataset:
-    """Record a dataset: the expert's successful demonstrations, or all rollouts of a policy with the expert's labels.
+    """Record a dataset: the expert's successful demonstrations or, given a policy, all rollouts of the policy.
 
     beta: share of the steps that the expert drives instead of the policy. query: when the expert is queried, as for
     `manip-il dagger --query`. options: other fields of `RolloutJob`, such as `label` and `cameras`; `round` is by
@@ -85,7 +85,8 @@ def train(
     """Fit a policy to the labels of one or more datasets; return its checkpoint.
 
     options: fields of `FitConfig`, such as `policy={"type": "mlp", "width": 128}`, `steps` and `batch_size`. on_log:
-    called after every step with its metrics, or {} if there are none. Raises what `Trainer` raises.
+    called after every step with its metrics, or {} if there are none. Raises `FolderExistsError` if `output_dir` has a
+    checkpoint, `ManipError` for data that do not fit the policy.
     """
     from manip_il.learn.train import Trainer  # LeRobot's trainer takes seconds to import
 
@@ -149,9 +150,9 @@ def evaluate(
 
 
 def _check_same(path: Path, config: RunConfig) -> None:
-    """Raise `MismatchError` unless the file, if there is one, holds `config` apart from `rounds`; then write it."""
+    """Raise `MismatchError` if a run began with options other than `config` (`rounds`, `fit` aside); then write it."""
     now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
-    del now["fit"]  # some of whose options may change, such as `log_freq`
+    del now["fit"]  # some of its options may change, such as `log_freq`
     has_begun = any(path.parent.glob("round_*"))
     before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
     for key in now:

@@ -140,11 +140,11 @@ def without_link(path: str, flags: int) -> int:
 
 
 def in_child(what: str, function: Callable[..., object], *arguments: object, seconds: float = SECONDS_IN_CHILD) -> None:
-    """Call `function(*arguments)` in a child process with at most 4 GB of memory and 120 s, or `seconds`.
+    """Call `function(*arguments)` in a child process, limited to 4 GB of memory and `seconds` [s].
 
-    Only the text of its `ManipError` comes back, because the file is untrusted. Raises that error, and `ManipError` if
-    the child exceeds its limits or dies. what: name of the file or folder, for these messages; a function that opens
-    several files calls `opening` before each.
+    Only the text of a `ManipError` comes back, because the file is untrusted. Raises a `ManipError` with that text, and
+    one if the child exceeds its limits or dies. what: name of the file or folder, for these messages; a function that
+    opens several files calls `opening` before each.
     """
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
     done = subprocess.run(command, input=pickle.dumps((seconds, function, arguments)), capture_output=True, check=False)

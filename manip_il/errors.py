@@ -56,10 +56,10 @@ class NothingToLearnError(ManipError):
 
 
 class FolderExistsError(UsageError):
-    """An output folder is not empty."""
+    """An output folder already exists."""
 
     def __init__(self, folder: object):
-        ways = "--resume=true continues it, if the command can, --overwrite=true replaces it"
+        ways = "--resume=true continues it, if the command has that option; --overwrite=true replaces it"
         super().__init__(f"{folder} already exists; {ways}; or choose another folder")
 
 

@@ -25,7 +25,7 @@ LONGEST_EPISODE = 10_000  # [control steps]; eight minutes at 20 Hz
 
 
 class Actor(IntEnum):
-    """Who drives the robot in a frame."""
+    """Who drives the robot in one control step."""
 
     EXPERT = 0
     LEARNER = 1

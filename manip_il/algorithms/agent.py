@@ -1,7 +1,7 @@
 """The learner of GAIL, AIRL and PPO: an mlp with its own environments, improved by rewards that the algorithm gives it.
 
-Each iteration runs whole episodes, with its own seeds and random streams, so a killed run resumes from its last
-finished iteration to the same bytes.
+Each iteration runs whole episodes, with its own seeds and random streams, so a killed run that is resumed from its
+last finished iteration ends with the same bytes.
 """
 
 from __future__ import annotations

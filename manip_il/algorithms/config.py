@@ -74,22 +74,22 @@ class RunConfig(Seeded):
     """Options of `manip-il dagger`. Round 0 records the expert's demonstrations unless `datasets` has some.
 
     datasets: recorded demonstrations that replace those of round 0. start: the `pretrained_model` folder of a policy
-    that replaces cloning in round 0; without datasets, round 0 then has no demonstrations. Later rounds start from its
-    weights and keep its architecture.
+    that replaces cloning in round 0; without datasets, round 0 then has no demonstrations. Later rounds start from the
+    policy's weights and keep its architecture.
 
     query_rule: None for the label mode's default, see `query`. hold: also applies to validation. patience: ends
     rollouts that only repeat their states. disturbed_share: the disturbances are `manip_il.sim.events.STANDARD`.
-    cameras: the cameras to render; with redraw, not during the rollouts but for the redrawn scenes. conditions:
-    variations of the world, also in validation.
+    cameras: rendered during rollouts or, with `redraw`, only in the redrawn scenes. conditions: variations of the world
+    in rollouts and validation.
     """
 
     env: EnvConfig = field(default_factory=make_config)
     method: str = "dagger"
     demonstrations: int = option(50, "successful expert episodes of round 0", at_least=1)
     rounds: int = option(
-        5, "DAgger rounds after round 0; a resumed run may have more", at_least=0, at_most=99, grows=True
+        5, "DAgger rounds after round 0; may be raised when a run is resumed", at_least=0, at_most=99, grows=True
     )
-    episodes_per_round: int = option(50, "rollouts per round; demonstrations with --method=cloning", at_least=1)
+    episodes_per_round: int = option(50, "rollouts per round, or demonstrations with --method=cloning", at_least=1)
     label_budget: int | None = option(None, "total number of expert labels at which the run ends", at_least=1)
     beta: BetaSchedule = option(
         lambda: _LEARNER_ALONE, "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B"
@@ -100,7 +100,7 @@ class RunConfig(Seeded):
     )
     query_rule: Query | None = None
     branch_steps: int | None = option(
-        None, "control steps of a branch; by default just enough to learn one whole plan", at_least=1
+        None, "control steps of a branch; by default just enough for one whole action chunk", at_least=1
     )
     ensemble: int = option(1, "policies fitted per round, for --query=ensemble:BOUND; the first one drives", at_least=1)
     refit: Literal["scratch", "warm"] = option("scratch", "each round's initial weights: random or the last round's")
@@ -131,7 +131,7 @@ class RunConfig(Seeded):
         if self.disturbed_share and self.env.robot in STOCK:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 for stock robot {self.env.robot}")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
-            raise UsageError("redraw is for policies on pictures, with --label=per_state")
+            raise UsageError("redraw is for picture policies; give --cameras and --label=per_state")
         if self.method not in ALGORITHMS:
             raise UnknownName("method", self.method, ALGORITHMS)
         if self.method in EXPERT_DRIVES and (self.label, self.query_rule, self.beta) != _DEFAULTS:
@@ -175,7 +175,7 @@ class RunConfig(Seeded):
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
-    """Return how many actions a policy plans at once, and how many last frames of an episode its fit skips."""
+    """Return how many actions a policy plans at once, and how many frames at an episode's end its fit skips."""
     from manip_il.learn.lerobot_config import policy_config
 
     policy = policy_config(fit)

@@ -1,6 +1,6 @@
 """Inverse reinforcement learning on `carry`: paths from a dataset, the weights inferred from them, and their report.
 
-Layouts, goals and object positions are read from `observation.environment_state`; nothing else of a dataset is used.
+Layouts, goals and object positions are read from `observation.environment_state`; unsuccessful episodes are skipped.
 The results are the weights of a reward, `reward.json`, and the report of `manip-il reward irl`.
 """
 
@@ -42,7 +42,7 @@ _SIDE = 80  # points along each side of the map
 
 @dataclass(frozen=True)
 class Carried:
-    """An episode's path. positions: of the object, from its start to the goal, (T, 3) [m]."""
+    """The path of an episode's object. positions: from its start to the goal, (T, 3) [m]."""
 
     episode: int
     grid: Grid
@@ -51,9 +51,9 @@ class Carried:
 
 
 def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Carried]:
-    """Return the paths of a dataset's successful episodes, in order.
+    """Return the object's paths in a dataset's successful episodes, in order.
 
-    Raises `ManipError` for a dataset of another task, without a successful episode, or with a path through an obstacle.
+    Raises `ManipError` if the task is not `carry`, no episode succeeded, or a path leads through an obstacle.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -82,7 +82,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
 
 
 def carried_stretch(positions: F64, goal: F64) -> F64:
-    """Return the positions (T, 3) [m] from the last one at rest to the first one at the goal (3,)."""
+    """Return the positions (T, 3) [m] from the last one before the object moves to the first one at the goal (3,)."""
     moved = np.flatnonzero(np.linalg.norm(positions - positions[0], axis=1) > _MOVED)
     first = max(int(moved[0]) - 1, 0) if len(moved) else 0
     off = np.linalg.norm(positions - goal, axis=1)
@@ -161,7 +161,7 @@ def weight_table(found: Inverse) -> Table:
 
 
 def open_line(found: Inverse) -> str:
-    """Return a sentence that names the weights that are not identified; empty if all are."""
+    """Return a sentence that names the weights that are not identified; empty if there are none."""
     if not found.open_names:
         return ""
     return (
@@ -196,7 +196,7 @@ def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> R
 
 
 def _cost_figure(found: Inverse) -> Figure:
-    """Maps of the cost of a metre, with both paths, for the layouts with the most things on the table."""
+    """Maps of the cost per metre, with demonstrated and planned path, for layouts with the most things on the table."""
     count = [len(one.grid.layout.places) + (one.grid.layout.edge is not None) for one in found.carried]
     chosen = np.argsort(-np.array(count), kind="stable")[:_PANELS].tolist()
     with drawing(len(chosen), size=(3.0, 3.1)) as (drawn, axes):
@@ -215,7 +215,7 @@ def _cost_figure(found: Inverse) -> Figure:
 
 
 def _draw_cost(axis: Any, one: Carried, weights: F64) -> Any:
-    """Draw the cost of a metre and the obstacles, seen from above, at the path's median height."""
+    """Draw the cost per metre at the path's median height, and the obstacles, seen from above."""
     layout, points = one.grid.layout, one.grid.points
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     x, y = (np.linspace(low[k], high[k], _SIDE) for k in (0, 1))

@@ -37,7 +37,7 @@ class LearningConfig(Seeded):
     )
     log_std: float | None = option(
         None,
-        "log of initial action noise in standard deviations of demonstrated actions; by default -0.5, -1 with --init",
+        "log of initial action noise in standard deviations of demonstrated actions; by default -0.5, with --init -1",
         at_least=-4,
         at_most=2,
     )
@@ -59,7 +59,7 @@ class LearningConfig(Seeded):
 
     @property
     def first_log_std(self) -> float:
-        """Log of the initial action noise; smaller for a clone, so that it explores close to its actions."""
+        """Log of the initial action noise; smaller for a clone, which should explore close to its own actions."""
         if self.log_std is not None:
             return self.log_std
         return -0.5 if self.start is None else -1.0

@@ -166,7 +166,7 @@ class Run:
         return self._made[round_]
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
-        """Fit the policy, or all members of an ensemble, to `data`; it belongs to the round of the last rollouts."""
+        """Fit the policy, or all members of an ensemble, to `data`, whose last rollouts are of the policy's round."""
         config, before, round_ = self.config, self._fitted, data[-1].round
         here, members = self._folder(round_), list[Path]()
         if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
@@ -199,7 +199,7 @@ class Run:
             metrics={
                 "beta": here.beta,
                 "labels": sum(one.labels for one in so_far),
-                # More than the labels if a query yields no label to learn from (`safety`, held-out episodes of `dart`).
+                # Exceeds `labels` if a query yields no label to learn from (`safety`, held-out episodes of `dart`).
                 "queries": sum(one.queries for one in so_far) + self._held_out_steps,
                 "rollout_success": here.successes / max(1, here.episodes),
             },
@@ -215,7 +215,7 @@ class Run:
         return Agent(self.config, self._clock)
 
     def begin(self, agent: Agent) -> Iterator[Result]:
-        """Load the agent's last finished iteration and yield it; without one, yield the initial clone, if any.
+        """Load the agent's last finished iteration and yield its result; else yield that of the initial clone, if any.
 
         An iteration thus gets its line in `metrics.jsonl` even if the run was killed right after saving its checkpoint.
         """

@@ -60,7 +60,7 @@ class RobotEpisode:
 
 @dataclass(frozen=True)
 class ActionRange:
-    """Mean, scale and range of raw targets, (n,) each. Normalised y stands for mean + scale y, clipped to the range."""
+    """Mean, scale and range of raw targets, (n,) each. A normalised action y stands for mean + scale y, clipped."""
 
     mean: F32
     scale: F32
@@ -131,7 +131,7 @@ class Unending(gymnasium.Env[F32, Any]):
 class Lockstep(DummyVecEnv):
     """Parallel episodes of equal length. `seed(s)` gives them the seeds s, s + 1, ... at the next `reset`.
 
-    conversion: turns the policy's raw targets into actions, given the measured joints, which are the first inputs.
+    conversion: turns the policy's raw targets into actions, given the measured joints (the first inputs).
     executed: actions (T, B, n) since `reset`.
     """
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 OF_POLICY: Given = dict.fromkeys(("robot", "task", "control_hz", "object"))  # by default those of the policy
 SMALL: Given = {"height": 96, "width": 96}  # picture size for policies [pixels]
-_CONDITIONS = "object, dynamics, knocked, sensing, random_actions, and with cameras view, clutter, late"
+_CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras also view, clutter, late"
 
 DATASET = "a LeRobot v3.0 dataset"
 
@@ -59,7 +59,7 @@ def env_options(env: EnvConfig) -> str:
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:
-    """Return the cameras used if none are named: all, or the first one of a stock robot."""
+    """Return the cameras used if none are named: all, but for a stock robot only its first."""
     return (stock.ROBOTS[env.robot].cameras[:1] if env.robot in stock.ROBOTS else ()) or CAMERAS
 
 
@@ -89,10 +89,10 @@ class EngineOptions:
     """Options of worker processes on this machine or a Ray cluster."""
 
     workers: int | None = option(
-        None, "processes, or concurrent tasks on Ray; null (none) is one per core", at_least=1, free=True
+        None, "number of processes, or of concurrent tasks on Ray; none (null): one per core", at_least=1, free=True
     )
     engine: Literal["local", "ray"] = option(
-        "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else started here)", free=True
+        "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else on this machine)", free=True
     )
 
     def open(self) -> Engine:
@@ -108,7 +108,7 @@ class Tested:
 
     suite: str = option(
         "nominal",
-        f"nominal, disturbed, randomised or all; one condition ({_CONDITIONS}); or a YAML file of ranges",
+        f"test conditions: nominal, disturbed, randomised, all, a single one ({_CONDITIONS}) or a YAML file of ranges",
     )
 
 
@@ -119,7 +119,7 @@ class Trusting:
     trust: bool = option(
         False,
         "load the models and run the code that a checkpoint names (smolvla, pi0, groot, ...): only for sources that "
-        "you trust; only on the command line",
+        "you trust; cannot be set in a file",
         command_line_only=True,
         free=True,
     )

@@ -1,6 +1,6 @@
 """`manip-il compare`: two policies or runs on the same seeds, with the confidence in their difference, or a study.
 
-A study runs `manip-il dagger` with several arms, each with the same training seeds.
+A study runs `manip-il dagger` with several sets of options (its arms), each with the same training seeds.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class TrialGroup:
 class ComparisonOptions:
     """Which rounds of the runs are compared, and on how many episodes."""
 
-    checkpoint: Literal["best", "last"] = option("best", "which round of a run: the best on validation, or the last")
+    checkpoint: Literal["best", "last"] = option("best", "round of a run to test: the best on validation, or the last")
     at: Literal["end", "labels", "episodes", "steps", "seconds"] = option(
         "end",
-        "which rounds of a run count: end (all), or those within the labels, episodes, steps or seconds (of collecting "
-        "and fitting) that every run reached",
+        "which rounds of a run count: all (end), or those within the number of labels, episodes, steps or seconds (of "
+        "collecting and fitting) that every run reached",
     )
     eval: TrialGroup = field(default_factory=TrialGroup)
 
@@ -63,21 +63,22 @@ class StudyFile(ComparisonOptions):
 
     common: Open = field(default_factory=dict[str, Any])
     arms: Open = field(default_factory=dict[str, Any])
-    training_seeds: int = option(3, "runs of every arm", at_least=1, at_most=MAX_SEED, grows=True)
+    training_seeds: int = option(3, "runs of every arm, one per seed", at_least=1, at_most=MAX_SEED, grows=True)
     baseline: str | None = option(None, "the arm to compare others with; by default the first")
-    target: float = option(0.95, "report the cost of this validation success", at_least=0.0, at_most=1.0)
+    target: float = option(0.95, "report what it costs to reach this validation success", at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True)
 class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
     """Compare two policies, runs, or folders of several training seeds on the same test seeds; or run a whole study.
 
-    Each side is an eval.json, a policy, a run of manip-il dagger, or a folder of these named seed_0, seed_1, ...
-    Two eval.json files are compared directly; other sides are evaluated first. Writes compare.json and report.html.
+    Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with one of these per training seed
+    (seed_0, seed_1, ...). Two eval.json files are compared directly; other sides are evaluated first. Writes
+    compare.json and report.html.
 
-    One YAML file instead of two sides is a study: every arm is run with several training seeds, tested on the same
-    unseen seeds, and compared. It holds `common` and `arms` (options of manip-il dagger), training_seeds, eval,
-    checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
+    One YAML file instead of two sides is a study: every arm (a set of options) is trained with several seeds, tested
+    on the same unseen seeds, and compared. The file holds `common` and `arms` (options of manip-il dagger),
+    training_seeds, eval, checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
@@ -91,7 +92,7 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
     )
     env: Given = given(EnvConfig, **OF_POLICY)
     training_seeds: int | None = option(
-        None, "number of seeds of a study, instead of the file's; may grow with --resume=true", at_least=1, free=True
+        None, "training seeds of a study, if not its file's; may grow with --resume=true", at_least=1, free=True
     )
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")

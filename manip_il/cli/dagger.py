@@ -51,8 +51,8 @@ class DaggerOptions(Varied, Trusting):
     settings: Given = given(RunConfig, prefix="")
     query: str | None = option(
         None,
-        "when the expert is queried: every, one, probability:P, ensemble:BOUND or safety:BOUND; "
-        "by default every; with --label=takeover one, with --label=branch probability:1/STEPS",
+        "steps in which the expert is queried: every, one (per episode), probability:P, ensemble:BOUND, safety:BOUND; "
+        "by default every; for --label=takeover: one; for --label=branch: probability:1/BRANCH_STEPS",
     )
     fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
     image: Given = given(CameraConfig, **SMALL)

@@ -92,7 +92,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
 class ScoreOptions(OfDataset):
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
-    Writes scores.json and rabc.parquet: weights of frames, for manip-il train --weights= and for
+    Writes scores.json, and rabc.parquet with the frames' weights for manip-il train --weights= and
     lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, also prints how well the
     score detects them.
     """

@@ -80,7 +80,7 @@ class Edit(Replacing):
     object: str | None = option(
         None, "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh", flag="task.object"
     )
-    workers: int | None = option(None, "processes; by default one per core", at_least=1)
+    workers: int | None = option(None, "number of processes; by default one per core", at_least=1)
 
     @contextmanager
     def open(
@@ -143,16 +143,16 @@ class RelabelOptions(Edit):
 class RedrawOptions(Edit, Varied, Seeded):
     """Randomise the goals, untouched objects and appearance of visited states; label and render each scene.
 
-    TARGET is a LeRobot dataset for training policies on pictures; each frame is an episode. Scenes without a valid
+    TARGET is a LeRobot dataset for training policies on pictures; each scene is one episode. Scenes without a valid
     label are left out. --vary takes view, clutter, object (its colour), or YAML files of ranges.
     """
 
     example: ClassVar[str] = "manip-il data redraw runs/dagger datasets/redrawn --frames=20000"
-    frames: int = option(20_000, "scenes to draw", at_least=1)
-    pictures: bool = option(True, "render the scenes; false: states alone, for --policy.states")
+    frames: int = option(20_000, "number of scenes to draw", at_least=1)
+    pictures: bool = option(True, "render the scenes; false: write states only, for --policy.states")
     scenes: bool = option(True, "draw new goals and objects; false: keep the visited states")
     branch_steps: int = option(
-        1, "control steps that the expert drives from every scene, for act and diffusion", at_least=1
+        1, "control steps that the expert drives from every scene; more than 1 for act and diffusion", at_least=1
     )
     image: Given = given(CameraConfig, **SMALL)
 
@@ -166,7 +166,7 @@ class RedrawOptions(Edit, Varied, Seeded):
         with self.open("redrawn", root, -(-self.frames // CHUNK)) as (source, target):
             conditions = varied(self.vary, source.env, sees=True)
             cameras = self.camera_config(source.env)
-            check_cameras(source.env.robot, cameras)  # also for states alone
+            check_cameras(source.env.robot, cameras)  # also if only states are written
             cameras = cameras if self.pictures else None
             scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
             info = redraw_dataset(source, scenes, target)

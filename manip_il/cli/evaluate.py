@@ -32,7 +32,7 @@ class MeasuredPolicyGroup:
     """`--policy.*`: the policy to evaluate."""
 
     path: Path | None = option(None, "a checkpoint or a run")
-    type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
+    type: Literal["expert", "random"] | None = option(None, "who drives instead of a checkpoint")
     device: str = option("cpu", "where the policy runs: cpu or cuda")
 
 
@@ -50,8 +50,8 @@ class EvalGroup:
     batch_size: int = option(
         25, "episodes that run in lockstep and share policy calls; does not change results", at_least=1, free=True
     )
-    stream: Literal["test", "validation"] = option("test", "which seeds; no policy is selected on the test seeds")
-    films: int = option(2, "failures to film, and as many successes", at_least=0, free=True)
+    stream: Literal["test", "validation"] = option("test", "which stream of seeds; no policy is selected on test seeds")
+    films: int = option(2, "number of failures to film, and of successes", at_least=0, free=True)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class EvalOptions(Tested, Seeded, Trusting):
     env: Given = given(EnvConfig, **OF_POLICY)
     eval: EvalGroup = field(default_factory=EvalGroup)
     until_width: float | None = option(
-        None, "stop when the confidence interval is this narrow; 0.02 is 2 points", at_least=0.0001, at_most=1
+        None, "stop when the confidence interval is this narrow; 0.02: 2 percentage points", at_least=0.0001, at_most=1
     )
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/eval")), prefix="")

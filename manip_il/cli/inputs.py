@@ -30,7 +30,7 @@ _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 def round_policy(settings: Open) -> tuple[Open, Path | None]:
     """Return the policy options of the later rounds, and the `pretrained_model` folder to start from, if any.
 
-    For an mlp to start from, its options replace `path`, because they are needed before LeRobot is imported.
+    If that folder holds an mlp, its stored options replace `path`: they are needed before LeRobot is imported.
     """
     if "path" not in settings:
         return settings, None
@@ -39,7 +39,7 @@ def round_policy(settings: Open) -> tuple[Open, Path | None]:
     if (options := Checkpoint.open(start).mlp_options) is None:
         return settings, start
     if "type" in settings:
-        raise UsageError("give one of --policy.path=DIR and --policy.type=...: the type is in the checkpoint")
+        raise UsageError("give one of --policy.path=DIR and --policy.type=...: the checkpoint sets the type")
     return options | {name: value for name, value in settings.items() if name != "path"}, start
 
 

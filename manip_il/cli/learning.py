@@ -29,7 +29,7 @@ class Learning:
 
     method: ClassVar[str]
     first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"
-    init: Path | None = option(None, "a cloned mlp, or its run, to start from; by default a new policy")
+    init: Path | None = option(None, "a cloned mlp (a checkpoint or a run) to start from; by default a new policy")
     settings: Given = given(LearningConfig, prefix="")
     ppo: PPOConfig = field(default_factory=PPOConfig)
     engine: EngineOptions = group(EngineOptions(1), prefix="")
@@ -114,7 +114,7 @@ class PpoOptions(Learning):
 
     method: ClassVar[str] = "ppo"
     example: ClassVar[str] = "manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo"
-    init: Path = option(MISSING, "the cloned mlp, or its run, to improve", exists="")
+    init: Path = option(MISSING, "the cloned mlp (a checkpoint or a run) to improve", exists="")
     reward: Path = option(MISSING, "the reward: a folder from manip-il reward fit", exists="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/ppo")), prefix="")
 

@@ -62,7 +62,7 @@ class PairsOptions(Seeded):
     sources: list[Path] = option(MISSING, "manip-il datasets, or runs", positional=True)
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
-    reward: Path | None = option(None, "choose pairs on which this reward's networks disagree most", exists="")
+    reward: Path | None = option(None, "a fitted reward, for pairs on which its networks disagree most", exists="")
     file: OutputFile = group(OutputFile(Path("pairs.json")), prefix="")
 
     def run(self) -> None:
@@ -144,7 +144,7 @@ class FitOptions(OfPairs, Seeded):
     example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
     answers: list[Path] = option(MISSING, "preferences.json from ask or answer", positional=True, exists="")
     more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length", exists="")
-    members: int = option(8, "networks in the ensemble, and folds of the pairs", at_least=3, at_most=64)
+    members: int = option(8, "number of networks in the ensemble, and of folds of the pairs", at_least=3, at_most=64)
     output: Output = group(Output(Path("runs/reward")), prefix="")
 
     def run(self) -> None:

@@ -60,8 +60,8 @@ class RobotNewOptions(Replacing):
 class RobotCheckOptions:
     """Measure what an arm can do, before recording; writes check.html and check.json.
 
-    Shows the arm with its frame and cameras, its reach, the expert's success at every task with and without a tenth of
-    the actions random, and what to change if something does not work. The exit code is 1 if a task cannot be done.
+    Shows the arm with its hand frame and cameras, its reach, the expert's success at every task (also with a tenth of
+    its actions random), and what to change if something does not work. The exit code is 1 if a task cannot be done.
     """
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"

@@ -18,7 +18,7 @@ from manip_il.tasks.config import EnvConfig
 
 SERVO = "servo"  # a value of --vary
 
-_IDLE = ("late", "random_actions")  # suites that a served arm does not show
+_IDLE = ("late", "random_actions")  # conditions that do not affect a served arm
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class ServeOptions(Varied, Trusting):
 
     Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that program on the ports
     and presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded
-    again. --vary also takes servo. A policy as the leader (--leader=runs/lift) sets the default task and cameras.
+    again. --vary=servo also varies the servos. A policy as the leader (--leader=runs/lift) sets the default task and
+    cameras.
     """
 
     example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
@@ -50,7 +51,7 @@ class ServeOptions(Varied, Trusting):
                 raise UnknownName("leader", leader, (*LEADERS, "the folder of a policy"))
             policy = find_policy(path)
         if leader == "sliders" and not has_display():
-            raise UsageError("--leader=sliders needs a window: a DISPLAY")
+            raise UsageError("--leader=sliders opens a window, which needs a display; set DISPLAY")
         env, _, seen = open_driver(policy, "expert", self.env, trust=self.trust)
         cameras = self.camera_config(env) if self.cameras else seen
         if idle := [one for one in self.vary if one in _IDLE]:

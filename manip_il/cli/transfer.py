@@ -123,7 +123,7 @@ class McapExportOptions(OfDataset, Replacing):
     """
 
     example: ClassVar[str] = "manip-il data to-mcap datasets/demos demos_mcap"
-    out: Path = option(MISSING, "folder for the files", positional=True)
+    out: Path = option(MISSING, "folder for the MCAP files", positional=True)
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is complete."""

@@ -31,7 +31,7 @@ class WatchedPolicyGroup:
 
     path: Path | None = option(None, "a checkpoint or a run")
     type: Literal["expert", "random", "sliders"] | None = option(
-        None, "instead of a checkpoint, by default expert; sliders: you drive with the window's sliders"
+        None, "who drives instead of a checkpoint, by default the expert; sliders: you, in the window"
     )
 
 
@@ -68,7 +68,7 @@ class ViewOptions(Tested, Seeded, Trusting):
         in_window = in_window and env.robot not in STOCK
         if sliders and not in_window:
             raise UsageError(
-                "--policy.type=sliders needs a window: a DISPLAY, no --output, and a robot that is not stock"
+                "--policy.type=sliders opens a window: set DISPLAY and omit --output; not for fetch_stock and aloha"
             )
         if cameras is None and not in_window:  # for people to watch; shadows only in files, which may take longer
             cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if self.output else Look())

@@ -72,7 +72,7 @@ class ExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class NoisyExpertDriver(Driver):
-    """Executes the label plus Gaussian noise: DART (Laskey et al. 2017). covariance: noise covariance, (n, n)."""
+    """Executes the expert's label plus Gaussian noise: DART (Laskey et al. 2017). covariance: the noise's, (n, n)."""
 
     covariance: tuple[tuple[float, ...], ...]
     kind = "noisy_expert"
@@ -106,7 +106,7 @@ class PolicyDriver(Driver):
     """Executes the policy's action, or with probability beta the expert's: pi_i = beta pi* + (1 - beta) pi_hat.
 
     policies: the first one drives; a query rule may compare the others with it. trust: whether to load models
-    that the checkpoints name. device: torch device of the policies. (Ross et al. 2011)
+    and code that the checkpoints name. device: torch device of the policies. (Ross et al. 2011)
     """
 
     kind = "policy"
@@ -150,5 +150,5 @@ def policy_actions(policy: LearnedPolicy, turns: Sequence[Turn]) -> F64:
 
 
 def generators(stream: str) -> Callable[[int], np.random.Generator]:
-    """Return a function that maps an episode's seed to its random generator."""
+    """Return a function that maps an episode's seed to its random generator in `stream`."""
     return cache(lambda seed: rng_for(seed, stream))

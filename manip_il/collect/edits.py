@@ -38,7 +38,7 @@ from manip_il.tasks.stock.table import ROBOTS as STOCK
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
 SERVED = "lerobot"  # `driver` of datasets recorded by LeRobot's programs from our servos
-NOTICEABLE = 0.01  # smallest change of a label, relative to a joint's longest step or the gripper's opening
+NOTICEABLE = 0.01  # smallest change of a label that counts, relative to a joint's longest step or the gripper's opening
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,8 @@ class EditTarget:
 def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     """Write `source` with the expert's label of every state; all other columns and pictures stay the same.
 
-    States in which the expert was not queried get a label, too. Returns the number of frames whose label changed in its
-    action by more than `NOTICEABLE`, in phase, or in validity. Raises what `Dataset.read_episodes` and
+    States in which the expert was not queried get a label, too. Returns the number of frames whose label changed: its
+    action by more than `NOTICEABLE`, its phase, or its validity. Raises what `Dataset.read_episodes` and
     `rewrite_columns` raise, and `ManipError` if a worker dies.
     """
     scale, dataset = env_actions(source.env).scale, source.dataset
@@ -231,7 +231,7 @@ def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> 
 
 
 def _leads(source: EditSource, columns: Columns) -> NDArray[np.float64]:
-    """Return recorded minus expert labels, (T, n), which is the servos' sag, in logs of `serve --log=`; else 0."""
+    """Return recorded minus expert labels, (T, n): the servos' sag, if `serve --log=` wrote the dataset; else 0."""
     action = columns[schema.ACTION].astype(np.float64)
     if source.dataset.provenance.get("driver") != SERVED:
         return np.zeros_like(action)

@@ -107,7 +107,7 @@ def env_actions(config: EnvConfig) -> ActionSpace:
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
-    """Return versions, and hashes of the compiled model and the settings of environment and cameras."""
+    """Return package versions, processor, and hashes of the compiled model and of environment and camera settings."""
     if cameras is None:
         return dict(_fingerprint(config))
     drawn = DRAWN + (config.task.partition(":")[0] in _TURNED)
@@ -124,7 +124,7 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         settings["robot"], (settings["task"], _, argument) = robot.name, task.name.partition(":")
         settings |= {"reward": argument} if argument else {}  # as in older fingerprints, where only carry has it
         own = {} if settings["task"] in TASKS else {"task_sha256": source_hash(task)}
-        if robot.name not in ROBOTS:  # hashes its values, not the paths of its files
+        if robot.name not in ROBOTS:  # a user's own robot: hash its values, not its files' paths
             said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))
             own |= {"robot_sha256": hashlib.sha256(repr(said).encode()).hexdigest()}
         mesh = Shape.parse(config.object).mesh if config.object else None

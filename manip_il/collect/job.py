@@ -34,7 +34,7 @@ class RolloutJob:
     """Driver and environment of rollouts, their length, and what is recorded.
 
     hold: end an episode this many steps after success; None: at the horizon. patience: end it after this many steps
-    without progress. label: what the expert returns in the states that `query` selects. branch_steps: length of a
+    without progress. label: what the expert returns in the states that `query` selects. branch_steps: steps per
     branch. conditions: randomisations of the world, taken in turn by seed. batch: largest number of episodes that share
     a policy call; does not change outcomes. cameras: recorded in every step; None for none. A policy always gets the
     pictures that it needs.

@@ -58,7 +58,7 @@ class Query:
         return self.kind if self.bound is None else f"{self.kind}:{self.bound:g}"
 
     def start(self, setting: Setting) -> Gate:
-        """Return the rule as a function for one process. Raises `UsageError` if `setting` has too few policies."""
+        """Return the rule for the episodes of one process. Raises `UsageError` if `setting` has too few policies."""
         rule, _ = RULES[self.kind]
         return rule(self.bound or 0.0, setting)
 
@@ -101,7 +101,7 @@ def _ensemble(bound: float, setting: Setting) -> Gate:
 def _safety(bound: float, setting: Setting) -> Gate:
     """Query if expert and learner differ by more than the bound (Zhang & Cho 2017).
 
-    The expert labels every state to decide; its label is kept only if they differ.
+    The expert labels every state for this comparison; the label is kept only if they differ that much.
     """
 
     def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
@@ -151,7 +151,7 @@ def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[T
 
 
 def cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
-    """Return the learner's frames, at most `horizon`, as a finished part, followed by the expert's if it took over."""
+    """Return the learner's frames, at most `horizon`, the last one `done`, then the expert's if it took over."""
     taken = next((i for i, frame in enumerate(frames) if frame.actor != Actor.LEARNER), None)
     if taken == 0:
         return frames

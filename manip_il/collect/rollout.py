@@ -109,7 +109,7 @@ def rollout(
     """Run one episode per seed, `len(envs)` at a time; yield the transition of every step.
 
     An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on other episodes.
-    gate: when the labeller is queried; None for never. first: start state of every episode; None: drawn by seed.
+    gate: when to query the expert; None: only if `act` does. first: start state of every episode; None: drawn by seed.
     """
     waiting = iter(seeds)
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]
@@ -146,7 +146,7 @@ def _begin_step(slot: _Slot, labeller: Labeller) -> None:
 
 
 def _choose(running: Sequence[_Slot], act: Act, gate: Gate | None, takeover: bool) -> None:
-    """Choose every episode's action and, if the gate selects it, query the expert."""
+    """Choose every episode's action, and query the expert in the episodes that the gate selects."""
     led = [slot for slot in running if not slot.taken_over]
     turns = [slot.turn for slot in led]
     chosen = act(turns) if led else []

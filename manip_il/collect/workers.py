@@ -4,7 +4,7 @@ Each seed of a job always gives the same episode. So if a worker dies, its unfin
 alone, which identifies the seed that kills workers.
 
 Processes are forked from a server that has only imported what they need. So they inherit neither OpenGL nor
-threads, and torch (seconds) is imported once. They end with the process that started them, even if that is killed.
+threads, and the slow import of torch runs once. They end with the process that started them, even if that is killed.
 """
 
 from __future__ import annotations
@@ -187,8 +187,7 @@ def kill_pool(pool: ProcessPoolExecutor) -> None:
 def start_server(learned: bool) -> None:
     """Start, once per process, the background server that workers are forked from.
 
-    learned: also import policies. The server keeps the current environment variables, except for a single OpenMP
-    thread.
+    learned: also import policies. The server keeps the current environment variables, but uses one OpenMP thread.
     """
     _CONTEXT.set_forkserver_preload(["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])])
     threads = os.environ.get("OMP_NUM_THREADS")

@@ -17,7 +17,7 @@ Guarantees:
 - Equal bytes. The same episodes in the same order give the same journals and the same dataset, videos included, whether
   it is written while episodes arrive or built from their journals later. Environments with equal fingerprints
   (`fingerprint.py`) give equal episodes.
-- Untrusted files pass the gate: each file is opened once with limited memory and time. Paths never lead outside their
-  folder. Foreign code never runs. A file that cannot be read raises one `ManipError` that names it, with the reason
-  given by the library (`info.reading`).
+- Untrusted files pass through the gate: each is opened once with limited memory and time. Paths never lead outside
+  their folder. Foreign code never runs. A file that cannot be read raises one `ManipError` that names it, with the
+  reason given by the library (`info.reading`).
 """

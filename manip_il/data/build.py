@@ -136,8 +136,8 @@ def local_id(folder: str) -> str:
 def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, int]:
     """Build a LeRobot dataset from a folder of journals, in seed order, equal to the dataset that `record` writes.
 
-    Returns and raises what `Recording.make` does. Also raises `ManipError` if journals are missing or damaged,
-    and `FolderExistsError` if `root` is not empty; with `replace` the new dataset takes its place instead.
+    Returns and raises what `Recording.make` does. Also raises `ManipError` if journals are missing or damaged.
+    replace: replace an existing `root`; otherwise raises `FolderExistsError` if `root` is not empty.
     """
     recording = Recording.read(journals)
     if not (paths := list_episodes(journals)):

@@ -86,7 +86,7 @@ class Camera:
         parts = _film_parts(episodes, info, key) if films else _table_parts(root, data_files)
         ends = [part.row + part.count for part in parts]
         if [0, *ends[:-1]] != [part.row for part in parts] or ends[-1:] != [info.frames]:
-            raise ManipError(f"{root}: the files of {key} do not hold each of {info.frames} frames once")
+            raise ManipError(f"{root}: the files of {key} do not hold each of the {info.frames} frames exactly once")
         return cls(root, key, info.fps, info.frames, feature.picture_size, films, tuple(parts))
 
     def rows(self, rows: I64) -> Pictures:
@@ -189,7 +189,7 @@ def _film(path: Path, changed: int, thread: int) -> InputContainer:
 
 @lru_cache(_OPEN_TABLES)
 def _table(path: Path, changed: int, key: str) -> Any:
-    """Return the column of pictures of a data file, not decoded."""
+    """Return a data file's column of pictures, not decoded."""
     return read_file(path, [key]).column(key)
 
 

@@ -104,7 +104,7 @@ class Dataset:
         """The dataset's spec.
 
         For datasets of other programs, and after LeRobot's tools have dropped our file, it is derived from LeRobot's
-        files: the task is `unknown`, and there are no cameras if their sizes differ. Raises `ManipError` for a dataset
+        files: the task is `unknown`, and cameras are left out if their sizes differ. Raises `ManipError` for a dataset
         without actions.
         """
         if self.own is not None:

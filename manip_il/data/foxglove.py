@@ -61,7 +61,7 @@ def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Me
 
 
 def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
-    """Yield one JSON message of labelled numbers per row. rows: T rows of finite Python numbers; JSON has no others."""
+    """Yield one JSON message of labelled numbers per row. rows: T rows of Python numbers, which must be finite."""
     for row in rows:
         yield json.dumps({"scalars": [{"label": one, "value": value} for one, value in zip(labels, row, strict=True)]})
 

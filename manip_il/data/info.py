@@ -57,7 +57,7 @@ class Feature:
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """A picture's height and width [pixels]: the axes with these names, else the first two axes of `shape`."""
+        """A picture's height and width [pixels]: the axes named `height` and `width`, else the first two axes."""
         names = cast(list[Any], self.names) if isinstance(self.names, list) else []
         if "height" in names and "width" in names and len(names) == len(self.shape):
             return self.shape[names.index("height")], self.shape[names.index("width")]

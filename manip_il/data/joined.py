@@ -22,8 +22,8 @@ class JoinedDatasets:
     """Several datasets; frames are numbered in the given order.
 
     features: LeRobot's table of the columns and cameras that every dataset has, with equal shapes and without depth.
-    stats: over all frames, but for cameras ImageNet's mean and std, as in `lerobot-train`, and the first dataset's
-    other statistics. tasks: each text once.
+    stats: over all frames. Cameras have ImageNet's mean and std, as in `lerobot-train`; their other statistics are the
+    first dataset's. tasks: each text once.
     """
 
     def __init__(self, datasets: Sequence[Dataset]):

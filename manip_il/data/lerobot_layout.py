@@ -41,7 +41,7 @@ STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
 def data_schema(features: Features) -> pa.Schema:
-    """Return the Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
+    """Return the Arrow schema of the data files: shape (1,) becomes a plain value, a vector a list of fixed size.
 
     Its metadata describes the columns in the form that Hugging Face's package `datasets` reads.
     """

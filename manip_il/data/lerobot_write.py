@@ -52,9 +52,9 @@ def write_dataset(
 
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
     give the same bytes, videos included. An episode with `Films` has no pictures: the video files are copied.
-    provenance: the episodes' origin, read after the last one. replace: as in `new_folder`. If `root` is not empty,
-    raises `FolderExistsError` before taking an episode. Also raises what `ordered_columns` raises, and `ManipError` if
-    there are no episodes or the disk is full.
+    provenance: origin of the episodes, read after the last episode. replace: as in `new_folder`; otherwise, if `root`
+    is not empty, raises `FolderExistsError` before taking an episode. Also raises what `ordered_columns` raises, and
+    `ManipError` if there are no episodes or the disk is full.
     """
     about = features(spec), spec.fps, spec.robot_type or spec.robot, video
     with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about)) as writer:

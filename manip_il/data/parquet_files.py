@@ -29,7 +29,7 @@ I64, F64 = NDArray[np.int64], NDArray[np.float64]
 
 
 class ParquetFiles:
-    """Numbered parquet files, one open at a time; when it is full, the next one is started.
+    """Writes numbered parquet files, one at a time: when a file is full, the next one is started.
 
     group_rows: least number of rows in a row group; a file's last one may have fewer. A writer keeps a description of
     every row group in memory until the file is closed, so many small groups would need more memory than the rows.

@@ -61,9 +61,9 @@ class RobotTaskSpec:
     action_meaning: str = OPENINGS
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
-    phases: tuple[str, ...] = ()  # names of the values of `expert_phase`: none, then the rungs of the task's ladder
+    phases: tuple[str, ...] = ()  # name of each value of `expert_phase`: "none", then the rungs of the task's ladder
     object: str = ""  # shape and size of the object that the task moves; empty for the task's own
-    robot_type: str = ""  # LeRobot's name of the robot; empty if it is `robot`
+    robot_type: str = ""  # LeRobot's name of the robot; empty if the same as `robot`
     video: bool = True  # whether pictures are in video files; otherwise they are PNGs in the data files
     keypoints: tuple[str, ...] = ()  # points of the scene whose image coordinates are columns, for every camera
     schema: int = VERSION
@@ -103,7 +103,7 @@ class RobotTaskSpec:
 
 
 def robot_of(robot_type: str) -> dict[str, str]:
-    """Return the fields of a spec that follow from LeRobot's name of a robot."""
+    """Return the fields of `RobotTaskSpec` that LeRobot's `robot_type` determines."""
     if robot_type not in LEROBOT_TYPES:
         return {"robot": robot_type}
     return {"robot": LEROBOT_TYPES[robot_type], "robot_type": robot_type, "action_meaning": SERVOS}
@@ -142,7 +142,7 @@ def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
 def check_same_spec(left_name: str, left: Any, right_name: str, right: RobotTaskSpec, also: Sequence[str] = ()) -> None:
     """Raise `MismatchError` unless actions and observations have the same meaning on both sides.
 
-    The task may differ, so that a policy can be tried on another task. left: a spec, or an object with its fields.
+    The task may differ, so that a policy can be tried on another task. left: a spec, or an object with the same fields.
     also: other fields that must agree.
     """
     for what in (*MUST_AGREE, *also):

@@ -32,7 +32,7 @@ from manip_il.errors import UsageError
 
 @dataclass(frozen=True)
 class VideoSpan:
-    """One camera's frames of one episode: `frames` frames of a file, from `first`."""
+    """One camera's frames of one episode: `frames` frames of a video file, from frame number `first`."""
 
     chunk: int
     file: int
@@ -41,7 +41,7 @@ class VideoSpan:
 
 
 class CameraFiles:
-    """One camera's numbered video files, one open at a time; the same episodes give the same bytes."""
+    """Writes one camera's numbered video files, one at a time; the same episodes give the same bytes."""
 
     def __init__(self, folder: Path, key: str, config: VideoConfig, fps: int):
         self._folder, self._key, self._config, self._fps = folder, key, config, fps

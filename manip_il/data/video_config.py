@@ -14,10 +14,10 @@ CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvt
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`, with its defaults for `libsvtav1`.
+    """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`, with the same defaults for `libsvtav1`.
 
-    Raises `UnknownName` for an unknown codec, `UsageError` for an invalid g; the other settings are checked by
-    `try_encoder`, with the codec itself.
+    Raises `UnknownName` for an unknown codec, `UsageError` for an invalid g; the other settings are checked
+    when `try_encoder` runs the codec.
     """
 
     vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
@@ -36,7 +36,7 @@ class VideoConfig:
         object.__setattr__(self, "preset", preset if self.preset is None else self.preset)
 
     def options(self) -> dict[str, str]:
-        """Return the codec's options. It runs in one thread: two would save no time, but change the bytes of h264."""
+        """Return the codec's options, among them one thread: two would save no time, but change the bytes of h264."""
         named = {"g": self.g, "crf": self.crf, "preset": self.preset}
         options = {name: str(value) for name, value in named.items() if value is not None}
         if self.vcodec == "libsvtav1":

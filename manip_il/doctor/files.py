@@ -145,7 +145,7 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
             wanted = np.concatenate([clips.starts[row] + np.arange(table.length[row]) / dataset.fps for row in rows])
             lacking = int((np.searchsorted(times, wanted - _LATE) == np.searchsorted(times, wanted + _LATE)).sum())
             if lacking or len(times) != len(wanted):
-                text = f"{len(times):,} frames for {len(wanted):,} rows; {lacking:,} rows have none at their time"
+                text = f"{len(times):,} frames for {len(wanted):,} rows; {lacking:,} rows have no frame at their time"
                 yield Finding(name, text)
 
 

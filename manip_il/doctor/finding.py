@@ -37,7 +37,7 @@ class NotWhole(ManipError):
 
 
 def journals_of(root: Path) -> Path:
-    """Return the folder of a dataset's journals, next to it, which may be missing."""
+    """Return the folder next to a dataset that holds its journals; it may not exist."""
     return root.absolute().with_name(f"{root.absolute().name}.journals")
 
 

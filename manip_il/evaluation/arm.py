@@ -66,13 +66,13 @@ class Member:
         return replace(self, result=result)
 
     def env(self, task: str | None = None) -> EnvConfig:
-        """Return the environment in which a run was validated. task: the task's file, for a custom task."""
+        """Return the environment in which the member's run was validated. task: the task's file, for a custom task."""
         found = EvalResult.read(_round_folder(self.path, self.history[0]))
         return found.settings.env(found.robot, task or found.task)
 
     @property
     def conditions(self) -> tuple[Condition, ...]:
-        """Conditions under which a run was validated."""
+        """Conditions under which the member's run was validated."""
         return EvalResult.read(_round_folder(self.path, self.history[0])).settings.conditions
 
     def to_json(self) -> dict[str, Any]:
@@ -105,7 +105,7 @@ class Arm:
 
 
 def select_rounds(rule: Rule, arms: Sequence[Arm]) -> tuple[Rule, tuple[Arm, ...]]:
-    """Return the rule with the cost limit that all runs share, and the arms with the rounds that it chooses."""
+    """Return the rule with the cost limit that all runs share, and the arms with the rounds that the rule chooses."""
     rule = rule.limited({member.name: member.history for arm in arms for member in arm.members})
     return rule, tuple(replace(arm, members=tuple(one.select(rule) for one in arm.members)) for arm in arms)
 

@@ -2,7 +2,7 @@
 
 The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the expert's cost after
 action a in state s, and V*(s) its cost if it acts itself from s on, the gap Q*(s, a) - V*(s) is what action a costs.
-Expert and simulator are deterministic, so the undisturbed run of a seed gives V* of every state on it, and the same run
+Expert and simulator are deterministic, so the undisturbed run of a seed gives V* of every state in it, and the same run
 with one wrong action gives Q*.
 
 Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest gap, u: a learner that errs in a share e of
@@ -41,8 +41,8 @@ Group = Literal["start", "state", "action"]
 class Case(NamedTuple):
     """One episode. moment: the control step from which the expert is judged.
 
-    steps: control steps from there until solved; None if not solved within the horizon. undisturbed: steps from
-    there until solved without the perturbation, if known.
+    steps: control steps from the moment until the task is solved; None if not solved within the horizon. undisturbed:
+    the same without the perturbation, if known.
     """
 
     seed: int
@@ -114,7 +114,7 @@ class Certificate:
         return content | {"rows": [row.to_json() for row in self.rows]}
 
     def table(self) -> Table:
-        """Return one row per kind: how often the expert recovers, and what a wrong action costs."""
+        """Return one row per kind of perturbation: how often the expert recovers, and what a wrong action costs."""
         rows: list[tuple[str, ...]] = []
         for row in self.rows:
             gaps = row.gaps if row.group == "action" else []

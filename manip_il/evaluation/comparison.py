@@ -33,7 +33,7 @@ TARGET = 0.95
 class Comparison:
     """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
 
-    results: (left, right) for each training seed; episodes that only one of them ran do not count. Raises
+    results: (left, right) for each training seed; episodes that only one side ran do not count. Raises
     `MismatchError` if robot, task or settings differ, `ManipError` if left and right share no episode.
     """
 
@@ -49,7 +49,7 @@ class Comparison:
 
     @classmethod
     def of(cls, left: Arm, right: Arm) -> Comparison:
-        """Compare two arms. Raises what `Comparison` does, and `ManipError` unless all ran the same episodes."""
+        """Compare two arms. Raises what `Comparison` does; `ManipError` unless all policies ran the same episodes."""
         members = (*left.members, *right.members)
         if len({frozenset(episode.seed for episode in one.test.episodes) for one in members}) > 1:
             raise ManipError(

@@ -103,7 +103,7 @@ def compare_report(study: Study, title: str, command: str, config: Mapping[str, 
 def failures_sections(
     policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: str, heading: str, figures: tuple[Figure, ...] = ()
 ) -> list[Section]:
-    """Return the figures and the phases that failed episodes ended in, if any. policies: name and episodes of each."""
+    """Return a section with the figures and `phase_table`, if there are any. policies: name and episodes of each."""
     table = phase_table(policies, task)
     if not figures and table is None:
         return []

@@ -79,7 +79,7 @@ def drawing(
 
 
 def to_figure(drawn: Any, words: str) -> Figure:
-    """Return a drawn figure as part of a report; call it while `drawing` is open."""
+    """Return a drawn figure as part of a report; call it inside `with drawing(...)`."""
     content = io.BytesIO()
     drawn.savefig(content, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     return Figure(content.getvalue(), words, round(_DPI * drawn.get_figwidth()))
@@ -184,7 +184,7 @@ def curve_note(curves: Sequence[Curve]) -> str:
 
 
 def start_map(episodes: Sequence[EpisodeResult]) -> tuple[Figure, ...]:
-    """Draw a top view of where the object starts in solved and failed episodes; no figure if that is unknown."""
+    """Draw a top view of where the object starts in solved and failed episodes; no figure if the starts are unknown."""
     known = [(one.success, one.start) for one in episodes if one.start]
     if not known:
         return ()

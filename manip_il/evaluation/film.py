@@ -63,7 +63,7 @@ def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film],
 def film_outcomes(
     engine: Engine, job: RolloutJob, result: EvalResult, most: int, progress: Progress
 ) -> tuple[list[Film], str]:
-    """Rerun up to `most` failures and as many successes of an evaluation and film them.
+    """Rerun and film up to `most` failed and up to `most` successful episodes of an evaluation.
 
     most: 0 for no films. Returns what `collect_films` does.
     """

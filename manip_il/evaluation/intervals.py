@@ -44,7 +44,7 @@ class Proportion:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's (low, high), or that of a confidence sequence."""
+        """(low, high): Wilson's interval, or that of a confidence sequence if `sequential`."""
         return (confidence_sequence if self.sequential else wilson_interval)(self.successes, self.n)
 
     def to_json(self) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class PairCounts:
-    """Numbers of episodes that both, one or neither of two policies, left and right, solved."""
+    """Numbers of episodes solved by both, one or neither of two policies, left and right."""
 
     both: int
     only_left: int
@@ -131,7 +131,7 @@ class PairCounts:
         """(low, high) of `difference`, inside [-1, 1].
 
         Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: combines the distances of Wilson's limits
-        from both rates, allowing for the correlation of the outcomes, which has a continuity correction.
+        from both rates, allowing for the continuity-corrected correlation of the outcomes.
         """
         n, right, left = self.n, self.both + self.only_right, self.both + self.only_left
         (l1, u1), (l2, u2) = wilson_interval(right, n), wilson_interval(left, n)
@@ -152,9 +152,9 @@ class PairCounts:
 def sign_flip_exact(differences: Sequence[int]) -> float:
     """Return the two-sided p of the hypothesis that both signs of each test episode's difference are equally likely.
 
-    differences: right's successes minus left's in an episode, summed over training seeds. As it is the sum whose sign
-    is flipped, outcomes of different training seeds in one episode need not be independent. With one training seed this
-    is McNemar's exact test; in general it is Fisher's randomisation test (The Design of Experiments, 1935, section 21).
+    differences: right's successes minus left's in an episode, summed over training seeds. Since the sign of this sum is
+    flipped, outcomes of different training seeds in one episode need not be independent. With one training seed this is
+    McNemar's exact test; in general it is Fisher's randomisation test (The Design of Experiments, 1935, section 21).
     """
     ways = np.array([1], dtype=object)  # counts of the sums -total, -total + 2, ..., total of signed differences
     for size, count in Counter(abs(d) for d in differences if d).items():

@@ -1,4 +1,4 @@
-"""Find a policy: in the folder itself, in a checkpoint, or in a run."""
+"""Find the policy in a `pretrained_model` folder, a checkpoint or a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
 
 
 def find_policy(path: Path) -> Path:
-    """Return the `pretrained_model` folder of a folder, checkpoint or run: the best one, else the newest.
+    """Return `path` if it is a `pretrained_model` folder, else the best or newest one in this checkpoint or run.
 
     Raises `UsageError` if there is none.
     """
@@ -28,7 +28,7 @@ def find_policy(path: Path) -> Path:
 
 
 def hub_hint(path: Path, kind: str = "") -> str:
-    """Return a hint on pulling a path that looks like a Hub repository, else "". kind: `datasets/` for a dataset."""
+    """Return how to pull `path` if it looks like a Hub repository, else "". kind: `datasets/` for a dataset."""
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""
     return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"

@@ -44,7 +44,7 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """A page: the verdict (a first sentence with its numbers), further facts, sections, and how it was made.
+    """A page: the verdict (a first sentence with numbers), further facts, sections, and how it was made.
 
     command: the command that made it. config, fingerprint: nested mappings.
     """

@@ -125,8 +125,8 @@ class EvalSettings:
 class EvalResult:
     """One policy on one robot and task: every episode, and the statistics derived from them.
 
-    policy_sha256: hash of its files, empty if it has none. until_width: the interval width at which the evaluation was
-    to stop (intervals are then valid at any stopping time); None if the number of episodes was fixed in advance.
+    policy_sha256: hash of the policy's files, if any. until_width: the interval width at which the evaluation was to
+    stop (intervals are then valid at any stopping time); None if the number of episodes was fixed in advance.
 
     Raises `ManipError` on construction if there is no episode or a seed occurs twice.
     """
@@ -211,7 +211,7 @@ class EvalResult:
         return cls(
             policy=data["policy"],
             robot=str(data["robot"]),
-            # Paths are refused because they would run code. The reward was once a setting.
+            # A path as task is refused, because it would run code. Older files store the reward in the settings.
             task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
             fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),

@@ -100,7 +100,7 @@ class RobotCheck:
 def check_robot(
     name: str, tasks: Sequence[str], episodes: int, engine: Engine, on_result: Callable[[EpisodeResult], object]
 ) -> RobotCheck:
-    """Measure a robot, given by name or YAML, on tasks. episodes: per task, first without, then with random actions.
+    """Measure a robot, given by name or YAML, on tasks. episodes: per task without random actions, and as many with.
 
     on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
     """
@@ -119,7 +119,7 @@ def check_robot(
 
 
 def check_starts(name: str, task: str) -> TaskCheck:
-    """Draw a task's starts with a robot, as episodes do, up to `STARTS` or until one has no valid placement."""
+    """Draw up to `STARTS` starts of a task with a robot, as episodes do; stop at one without a valid placement."""
     the_task, starts = get_task(task), 0
     try:
         world = World(scene_of(name, task))
@@ -224,7 +224,7 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
 
 
 def looks(name: str) -> tuple[Film, ...]:
-    """Return pictures of a robot at home, with the axes of its frame `ee`.
+    """Return pictures of a robot in its home pose, with the axes of its frame `ee`.
 
     Raises `RenderError` without off-screen OpenGL.
     """

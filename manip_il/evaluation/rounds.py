@@ -87,7 +87,7 @@ class Rule:
     limit: float | None = None
 
     def limited(self, histories: Mapping[str, History]) -> Rule:
-        """Return the rule with the limit that all runs reached. Raises `UsageError` for a run without rounds."""
+        """Return the rule, limited to the cost that all runs reached. Raises `UsageError` for a run without rounds."""
         if self.at == "end":
             return self
         if name := next((name for name, rounds in histories.items() if not rounds), None):

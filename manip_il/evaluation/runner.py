@@ -32,7 +32,7 @@ from manip_il.tasks.stock.envs import described_stock
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 _LOG = logging.getLogger(__name__)
-HOLD = 10  # control steps for which an episode continues after success, to see whether it lasts
+HOLD = 10  # control steps for which an episode continues after success, to see whether success lasts
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
 FOLDER = "evaluations"  # folder for the evaluations of several policies
@@ -186,7 +186,7 @@ def measure(
 
 
 def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, EpisodeResult]:
-    """Return seed -> result of the episodes in `folder`. If their file is missing, write its first line.
+    """Return seed -> result of the episodes in `folder`. If the episodes' file is missing, write its first line.
 
     The first line identifies policy, environment, versions and settings. Raises `MismatchError` if they differ from
     those of `job`, `ManipError` for a line that is not an episode.
@@ -224,7 +224,7 @@ def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]
 
 @dataclass(frozen=True)
 class Trial:
-    """Environment, seeds and conditions of a test; trust: whether to load models that checkpoints name."""
+    """Environment, seeds and conditions of a test; trust: whether to load models that checkpoints refer to."""
 
     env: EnvConfig
     seeds: range
@@ -234,7 +234,7 @@ class Trial:
 
     @classmethod
     def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path] = (), trust: bool = False) -> Trial:
-        """Return a trial under a suite's conditions, except those on cameras if no policy uses cameras."""
+        """Return a trial under a suite's conditions, without camera conditions if no policy uses cameras."""
         sees = any(Checkpoint.open(policy).pictures for policy in policies)
         return cls(env, seeds, suite, suite_conditions(suite, env, sees=sees), trust)
 

@@ -26,8 +26,8 @@ _YAML = (".yaml", ".yml")
 def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
     """Return the conditions of a suite, in the order in which seeds cycle through them.
 
-    Omits conditions without effect: those on objects if the task has none, those on cameras if the policy does not use
-    them (`sees`). Limits the objects' sizes to those that the task allows. Raises `UnknownName` for an unknown suite,
+    Omits conditions without effect: those on objects if the task has none, those on cameras if the policy uses none
+    (`sees`). Limits the objects' sizes to those that the task allows. Raises `UnknownName` for an unknown suite,
     `UsageError` for an invalid file or if no condition is left.
     """
     asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
@@ -54,7 +54,7 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
 
 
 def read_condition(name: str) -> Condition:
-    """Return a condition by name, or from a YAML file of ranges by path.
+    """Return a condition, given its name or the path of a YAML file of ranges.
 
     Raises `UnknownName` for an unknown name, `UsageError` for a file that is missing or invalid.
     """

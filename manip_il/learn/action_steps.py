@@ -2,8 +2,8 @@
 
 `MeasuredJointsStep`, in the preprocessor, stores the measured joints of an observation; `JointTargetsStep`, at the end
 of the postprocessor, uses them to convert the policy's output to joint targets. A checkpoint with both works wherever
-LeRobot calls each once per step, as lerobot-eval does. They derive from LeRobot's own pair of steps, which converts a
-whole plan relative to the joints at its start; therefore LeRobot connects the two when it loads them.
+LeRobot calls each once per step, as lerobot-eval does. Both are subclasses of steps in LeRobot, which convert a
+whole plan relative to the joints at its start, so LeRobot connects the two when it loads them.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from manip_il.option import check_bounds, option
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Options of PPO, named as in its paper. Raises `UsageError` for a value out of range."""
+    """Options of PPO, named as in the PPO paper. Raises `UsageError` for a value out of range."""
 
     lr: float | None = option(
         None,
@@ -32,7 +32,7 @@ class PPOConfig:
         return self.lr if self.lr is not None else 2e-4 if clone else 5e-4
 
     def discount(self, *, clone: bool) -> float:
-        """Return gamma; by default higher for a clone, whose episodes last long enough to show delayed effects."""
+        """Return gamma; by default higher for a clone, as its episodes are long enough to show delayed effects."""
         return self.gamma if self.gamma is not None else 0.97 if clone else 0.9
 
 

@@ -119,8 +119,8 @@ class Checkpoint:
     """A policy on disk. path: its `pretrained_model` folder. config: its `config.json`.
 
     numbers: numeric input column -> size; pictures: camera -> (height, width) [pixels]; action: size of the action.
-    space: the action space that it learnt in; robot: the arm, for `ee_delta` only; grippers: see `Conversion`. origin:
-    None if another program wrote the folder. processors: file -> steps, each with `registry_name` and `config`.
+    space: the action space that the policy learnt in; robot: the arm, for `ee_delta` only; grippers: see `Conversion`.
+    origin: None if another program wrote the folder. processors: file -> steps, each with `registry_name` and `config`.
     """
 
     path: Path
@@ -245,7 +245,7 @@ def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tup
 
 @contextmanager
 def in_one_line(what: str) -> Iterator[None]:
-    """Turn errors of any type that other libraries raise on malformed files into `ManipError`: `what: ...`."""
+    """Turn every error that a library raises on a malformed file into a one-line `ManipError`, `what: ...`."""
     try:
         yield
     except ManipError:
@@ -291,7 +291,7 @@ def read_config(path: Path) -> dict[str, Any]:
 def processor_steps(path: Path) -> list[dict[str, Any]]:
     """Return the steps in a processor's file, each with `registry_name` and `config`.
 
-    Refuses steps given by import path, as LeRobot would import and call whatever a downloaded file names.
+    Refuses steps given by import path, because LeRobot would import and call whatever a downloaded file names.
     """
     values = checks.read_json(path, "a processor of LeRobot's")
     with in_one_line(f"{path} cannot be read"):

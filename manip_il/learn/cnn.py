@@ -54,19 +54,19 @@ class CNNConfig(MLPConfig):
     """A small convolutional network that finds keypoints in every camera's picture, and the mlp's perceptron on top.
 
     channels: number in each convolutional layer; the first two layers halve the picture's sides, the others keep them.
-    keypoints: number per camera. aux_weight: if the dataset has `observation.environment_state` and it is not an input,
-    a second perceptron predicts it from joints and keypoints; this is the weight of its loss, the mean absolute error
-    in standard deviations. The action is predicted from joints, keypoints and this predicted state; the true state is
-    never used to act. scales: as in the mlp, but for the offsets in the environment state (predicted, or true if it is
-    an input); scaled: their indices in that state. heatmap_weight: weight of the cross-entropy [nats] between heat
-    maps and the positions of named points of the scene (`privileged.keypoints.<camera>`), each of which has a
-    keypoint of its own in addition to `keypoints`; 0: off. states: a dataset without pictures. If given, the mlp's
-    network predicts the action from joints and predicted state alone. It is trained on the true states of this dataset
-    and of the frames with pictures, plus noise of the size of the prediction's error (the "independent" concept
-    bottleneck of Koh et al., ICML 2020). All other options are the mlp's.
+    keypoints: number per camera. aux_weight: weight of the loss of a second perceptron, which predicts
+    `observation.environment_state` from joints and keypoints if the dataset has it and it is not an input; the loss is
+    the mean absolute error in standard deviations. The action is predicted from joints, keypoints and this predicted
+    state; the true state is never used to act. scales: as in the mlp, but for the offsets in the environment state
+    (predicted, or true if it is an input); scaled: their indices in that state. heatmap_weight: weight of the
+    cross-entropy [nats] between heat maps and the positions of named points (`privileged.keypoints.<camera>`), each of
+    which has a keypoint of its own in addition to `keypoints`; 0: off. states: a dataset without pictures. If given,
+    the mlp's network predicts the action from joints and predicted state alone. It is trained on the true states of
+    this dataset and of the frames with pictures, plus noise of the size of the prediction's error (the "independent"
+    concept bottleneck of Koh et al., ICML 2020). All other options are the mlp's.
 
-    If the processor has bfloat16, `use_amp` trains the convolutions in half precision, which is twice as fast. Acting
-    is always in single precision.
+    On a CPU with bfloat16, `use_amp` trains the convolutions in half precision, which is twice as fast. Acting is
+    always in single precision.
 
     Raises what `MLPConfig` raises, and `UsageError` for sizes and weights out of range.
     """
@@ -124,7 +124,7 @@ class CNNPolicy(MLPPolicy):
     @override
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return one absolute action per row, (B, n), bit-identical whatever the other rows are."""
+        """Return one action per row, (B, n), as `MLPPolicy` does; bit-identical whatever the other rows are."""
         state = batch[STATE]
         if len(state) == 0:
             return torch.empty_like(state)
@@ -237,7 +237,7 @@ class CNNPolicy(MLPPolicy):
         return self._by_index[name][batch[INDEX].reshape(-1).cpu()].to(batch[STATE].device)
 
     def _remember(self, name: str, columns: Table, values: Tensor) -> None:
-        """Store values (N, ...) of all frames of the data."""
+        """Store, under `name`, the values (N, ...) of all frames of the data."""
         index = torch.from_numpy(columns[INDEX].reshape(-1))
         self._by_index[name] = values.new_zeros((int(index.max()) + 1, *values.shape[1:]))
         self._by_index[name][index] = values
@@ -345,7 +345,7 @@ class KeypointEncoder(nn.Module):
     A keypoint learns only where its softmax is large, so some must start on every small thing of a distinct colour.
     Hence the picture is split into brightness and colour, and the weights start with variance 2 / inputs (He et al.,
     Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own initialisation
-    every softmax began as the picture's mean, and a goal of 5 pixels was not found in 1,100 steps; now 300 suffice.
+    every softmax began nearly uniform, and a goal of 5 pixels was not found in 1,100 steps; now 300 suffice.
 
     channels: number in each layer; the first two layers halve the picture's sides. keeps_maps: whether `maps` holds the
     logarithms of the last pictures' heat maps, (B, K, height, width), while training.

@@ -76,7 +76,7 @@ class Discriminator(nn.Module):
     def fit(
         self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32] | None, rng: np.random.Generator
     ) -> dict[str, float]:
-        """Take an iteration's gradient steps; return the mean loss, and both accuracies before the first step.
+        """Take an iteration's gradient steps; return the mean loss, and the initial accuracies on expert and learner.
 
         log_probs: the log-densities, under the learner's policy, of the expert's and of the learner's actions, (N,)
         each, if the discriminator `asks_density`.

@@ -137,7 +137,7 @@ class EpisodePolicy:
 
 @contextlib.contextmanager
 def _drawing(seed: int, device: torch.device) -> Iterator[None]:
-    """Seed torch's global generator inside; restore its state afterwards."""
+    """Seed torch's global generator for a `with` block; restore its state afterwards."""
     cuda = device.type == "cuda"
     with torch.random.fork_rng(devices=[device] if cuda else []):
         # not `torch.manual_seed`, which seeds every kind of device and takes as long as a step of a small policy

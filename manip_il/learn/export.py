@@ -63,7 +63,7 @@ class PolicyFunction(nn.Module):
 
 
 def export_onnx(path: Path) -> tuple[bytes, float]:
-    """Return the policy in a `pretrained_model` folder as ONNX, and the largest change in its actions by the export.
+    """Return a `pretrained_model` folder's policy as ONNX, and the largest change that the export makes to an action.
 
     Raises `ManipError` for a policy that cannot be exported or whose file would act differently from the checkpoint,
     and what `LearnedPolicy.load` raises.
@@ -114,7 +114,7 @@ def export_onnx(path: Path) -> tuple[bytes, float]:
 
 
 def file_metadata(policy: LearnedPolicy, inputs: Sequence[str], sha256: str) -> dict[str, Any]:
-    """Return a file's metadata: the policy, its robot and task, inputs and outputs; unknown entries are left out."""
+    """Return the ONNX file's metadata: policy, robot, task, inputs and outputs; unknown entries are left out."""
     shared = ("robot", "robot"), ("task", "task"), ("control_rate_hz", "fps"), ("action_meaning", "action_meaning")
     config = policy.checkpoint.config
     entries: dict[str, Any] = {

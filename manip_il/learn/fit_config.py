@@ -30,14 +30,14 @@ DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)} 
 
 
 def _by_default(name: str) -> str:
-    """Return a phrase for help with the default of a number for each kind of policy."""
+    """Return the end of a help text: the default of `name` for each policy type."""
     own = ", ".join(f"{getattr(numbers, name):,} for {kind}" for kind, numbers in DEFAULTS.items())
     return f"by default {own}, else {getattr(LEROBOT, name):,}"
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Options of a fit; None stands for the default of the policy's kind.
+    """Options of a fit; None stands for the default of the policy's type.
 
     policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`, ...). action_space: see
     `manip_il.learn.action_spaces`; by default that of the initial checkpoint, if there is one. threads: with a second
@@ -45,7 +45,7 @@ class FitConfig:
     models that the policy or its checkpoint names may be loaded. seed: for weights and batches. init_from: a
     `pretrained_model` folder with the initial weights.
 
-    Raises `UsageError` for a number out of range.
+    Raises `UsageError` for a number out of range, and for options that do not go together.
     """
 
     policy: Mapping[str, Any] = option(
@@ -132,7 +132,7 @@ class FitConfig:
 
     @property
     def defaults(self) -> Defaults:
-        """Default numbers for this kind of policy."""
+        """Default numbers for this policy type."""
         return DEFAULTS.get(self.kind, LEROBOT)
 
     @property

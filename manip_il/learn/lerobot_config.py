@@ -79,14 +79,14 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
 
 
 def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
-    """Return a configuration registered under `base`, such as an optimiser or schedule, by `settings["type"]`."""
+    """Return the configuration (of an optimiser, a schedule, ...) that `base` registers as `settings["type"]`."""
     own = {name: value for name, value in settings.items() if name != "type"}
     cls = _registered(base, settings.get("type"), f"--{group}.type")
     return decode(cls, own, f"--{group}.type={settings.get('type')}")
 
 
 def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
-    """Return a LeRobot dataclass from options by name. source: their origin, which errors name.
+    """Return a LeRobot dataclass built from `settings`. source: where these come from, for messages.
 
     Raises `UnknownName` for an unknown option, `UsageError` for a value that LeRobot refuses.
     """

@@ -119,7 +119,7 @@ class MixtureHead(Head):
 
 
 class CategoricalHead(Head):
-    """`bins` equal bins over [-1, 1], the range of the data, for each dimension; cross-entropy.
+    """Cross-entropy over `bins` equal bins from -1 to 1, the range of the data, for each dimension.
 
     A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother et al., Stop
     regressing, ICML 2024, section 3.1), so that neighbouring bins count as near. `pad` bins of the same width at
@@ -128,9 +128,8 @@ class CategoricalHead(Head):
     centres (two-hot, as in Schrittwieser et al., MuZero, 2020, appendix F). Either way the expectation over the bin
     centres is the target.
 
-    Acts with the expectation over the likeliest bin and the bins within the smearing's half-width (at least its two
-    neighbours): exact within a bin, unlike the argmax, and never between two separate modes, unlike the expectation
-    over all bins.
+    Acts with the expectation over the likeliest bin and the max(1, `pad`) bins on either side of it: exact within a
+    bin, unlike the argmax, and never between two separate modes, unlike the expectation over all bins.
     """
 
     def __init__(self, n: int, bins: int, sigma: float = 0.0) -> None:
@@ -180,7 +179,7 @@ class CategoricalHead(Head):
 
 
 def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float = 0.0) -> Head:
-    """Return the head for a name in `LOSSES`. sigma: smearing by `categorical` [bins]."""
+    """Return the head for a name in `LOSSES`. sigma: standard deviation of the smearing in `categorical` [bins]."""
     heads: dict[str, Head] = {
         "mse": MSEHead(n),
         "l1": L1Head(n),

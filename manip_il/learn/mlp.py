@@ -125,7 +125,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """Return the mean loss over the rows of a batch, whose columns are (B, n), and an empty dict of metrics."""
+        """Return the mean loss over a batch of columns (B, d), and an empty dict of metrics."""
         losses = self._row_losses(self.network_inputs(batch), batch)
         return losses.sum() / len(losses), {}
 
@@ -200,7 +200,7 @@ class MLPPolicy(PreTrainedPolicy):
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
-    """Return the indices of the environment state's offsets between two things; `UsageError` if there are none."""
+    """Return the indices, in the environment state, of offsets between two things; `UsageError` if there are none."""
     names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
     found = tuple(i for i, name in enumerate(names) if "_from_" in name)
     if not found:
@@ -211,7 +211,7 @@ def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
 def make_mlp_pre_post_processors(
     config: MLPConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[PolicyProcessorPipeline[Any, Any], PolicyProcessorPipeline[Any, Any]]:
-    """Return LeRobot's default pair: rename, batch (B, ...), device, normalise; and the inverse.
+    """Return LeRobot's default preprocessor (rename, batch, device, normalise) and postprocessor.
 
     `config.normalization_mapping` makes the normaliser steps the identity. They stay in the
     pipelines because LeRobot's tools override them by name.

@@ -40,7 +40,7 @@ CONSTANT_TARGET = 1e-6
 class Shape:
     """Sizes and kinds that a network is built from: the options of the `mlp` policy, and so of `MLPConfig`.
 
-    loss: one of `LOSSES`. components: number in `mixture`. bins: number per dimension in `categorical`, over the range
+    loss: one of `LOSSES`. components: Gaussians in `mixture`. bins: bins per dimension in `categorical`, over the range
     of the data. sigma: standard deviation of a smeared target in `categorical` [bins]; 0: split between the two nearest
     bins. clamp: bound on the normalised inputs, in standard deviations, so that states far from the data cannot blow up
     the outputs. action_space: one of `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among
@@ -87,8 +87,8 @@ Statistics = Mapping[str, Tensor]  # named as the buffers of `MLPNetwork`
 def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str) -> Statistics:
     """Return statistics of inputs (N, d) and targets (N, n), in raw units ([rad], [m]), as float32 vectors.
 
-    x = (input - input_mean) * input_scale; target = target_mean + target_scale * y, clamped to
-    [target_low, target_high], the range of the data.
+    The network maps x = (input - input_mean) * input_scale to y, and target = target_mean + target_scale * y is
+    clamped to [target_low, target_high], the range of the data.
 
     Targets are scaled by mean and deviation, or, for `categorical`, by the middle and half-width of
     their range, which puts them in [-1, 1]. A constant target has scale 0: it equals its mean.
@@ -123,8 +123,8 @@ def perceptron(inputs: int, width: int, depth: int, outputs: int, activation: ty
 class MLPNetwork(nn.Module):
     """Perceptron, head and normalisation. Inputs (B, n + k) are raw; the first n are the measured joints.
 
-    In the space `joint_delta` its targets are relative to the measured joints, except for the grippers', which are
-    absolute: the network adds the joints itself. In all other spaces it returns the targets, which `action_spaces`
+    In the space `joint_delta` the targets of arm joints are relative to the measured joints, which the network adds
+    itself; the targets of grippers are absolute. In all other spaces it returns the targets, which `action_spaces`
     converts to actions. A row's action does not depend on the other rows, bit for bit.
     """
 
@@ -199,7 +199,7 @@ class MLPNetwork(nn.Module):
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads inside. Waiting threads spin, so on one free core two are far slower than one."""
+    """Let torch use `count` threads in a `with` block. Waiting ones spin: on one core, two are far slower than one."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

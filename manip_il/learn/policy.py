@@ -54,19 +54,19 @@ class LearnedPolicy:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Cameras among its inputs."""
+        """Cameras among the policy's inputs."""
         return tuple(self.checkpoint.pictures)
 
     @property
     def module(self) -> torch.nn.Module:
-        """The network: an `MLPNetwork` for the mlp, LeRobot's policy for any other type."""
+        """The network: an `MLPNetwork` for the mlp, a `PreTrainedPolicy` for any other type."""
         return self._policy.module
 
     @torch.inference_mode()
     def act(
         self, states: F32, environment_states: F32, images: Images | None = None, episodes: Sequence[int] | None = None
     ) -> F64:
-        """Return absolute actions, (B, n): joint targets [rad], gripper command [m].
+        """Return absolute actions, (B, n), as in the training data: usually joint targets [rad], gripper command [m].
 
         states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row, by
         default its index; the policy's memory of an episode and its random draws depend on that number. An episode that
@@ -88,8 +88,7 @@ class LearnedPolicy:
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Reset the memory of episodes that begin.
 
-        instructions: episode number -> text for a policy that reads language; an empty text stands for the `task` of
-        `load`.
+        instructions: episode number -> text for a policy that reads language; "" means the `task` given to `load`.
         """
         self._policy.begin(instructions)
 
@@ -138,7 +137,7 @@ class _Perceptron:
             self.module = MLPNetwork(width, checkpoint.action, Shape.of(checkpoint.config))
             self.module.load_state_dict(read_weights(checkpoint.path))
         self.module.to(device).eval()
-        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network does joint_delta
+        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network converts joint_delta
         self._conversion = Conversion(space, checkpoint.robot)
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:

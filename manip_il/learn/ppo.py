@@ -207,7 +207,7 @@ class Learner:
         return (log_prob + entropy).numpy()
 
     def explored(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
-        """Return the N rows with noise of the actor's initial spread added to their actions, clipped to their range."""
+        """Return the N rows; the actions have noise of the actor's initial spread and are clipped to their range."""
         noise = rng.standard_normal(rows.actions.shape, dtype=np.float32) * self._first_spread
         actions = np.clip(rows.actions + noise, *self._bounds) * (1.0 - rows.states[:, -1:])
         return Transitions(rows.states, actions.astype(np.float32), rows.next_states)
@@ -219,7 +219,7 @@ class Learner:
         return space.low, space.high
 
     def save(self, folder: Path, modules: Mapping[str, Any]) -> None:
-        """Write weights and optimiser states of actor, critic and `modules`, by name, to `folder`."""
+        """Write weights and optimiser states to `folder`: of actor and critic, and of `modules` (name -> module)."""
         for name, module in self._modules(modules).items():
             (folder / name).mkdir()
             save_file(module.state_dict(), folder / name / "weights.safetensors")
@@ -267,7 +267,7 @@ def start_policy(
 ) -> MLPPolicy:
     """Return an mlp with a Gaussian loss. rows: raw inputs (N, d) and targets (N, n), for a new mlp's statistics.
 
-    A clone keeps its own statistics and acts as before. Weights are drawn from torch's global generator.
+    A clone keeps its own statistics and acts as before. New weights are drawn from torch's global generator.
     """
     options = (None if start is None else Checkpoint.open(start).mlp_options) or {}
     options |= {"loss": _GAUSSIAN, "action_space": conversion.space, "grippers": conversion.grippers}

@@ -64,7 +64,7 @@ class RewardShape:
 def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
     """Return the input columns of every offset in the environment state, such as `goal_from_object`.
 
-    Each offset appears twice, in 3D and in the plane of the table, as hands approach from above.
+    Each offset appears twice, in 3D and in the plane of the table, because the hand approaches from above.
     """
     place = {name: len(spec.joint_names) + at for at, name in enumerate(spec.environment_state_names)}
     names = [name.removesuffix(".x") for name in place if "_from_" in name and name.endswith(".x")]
@@ -174,7 +174,7 @@ class LearnedReward:
         return cls(network, origin)
 
     def check_fits(self, name: str, spec: RobotTaskSpec) -> None:
-        """Raise `MismatchError` unless task and columns in `spec` are this reward's. name: of `spec` in the message."""
+        """Raise `MismatchError` unless `spec` has this reward's task and columns. name: what messages call `spec`."""
         if self.origin.task != spec.task:
             raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
         self.origin.check_fits(spec)
@@ -208,7 +208,7 @@ def write_reward(
 ) -> None:
     """Write a `pretrained_model` folder: config.json, model.safetensors, and its origin, manip_il.json.
 
-    options: those of the fit. Raises `OSError` if it cannot be written.
+    options: the options of the fit. Raises `OSError` if it cannot be written.
     """
     origin = Origin.of(spec, fingerprint, options)
     features = {key: {"type": _KINDS[key], "shape": [width]} for key, width in _widths(origin).items()}
@@ -227,9 +227,10 @@ def _widths(origin: Origin) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Answers on pairs of clips. left, right: rows of their steps, (A, L); better: preference for left, (A,), 0 to 1.
+    """Answers on pairs of clips. left, right: input rows of each clip, (A, L).
 
-    pair: index of the pair that was asked about, (A,); answers about one pair are held out together.
+    better: preference for left, (A,), 0 to 1. pair: index of the pair that was asked about, (A,); answers about one
+    pair are held out together.
     """
 
     left: I64
@@ -254,7 +255,7 @@ class Fit:
 def fit_reward(
     inputs: F32, compared: Compared, shape: RewardShape, seed: int, on_epoch: Callable[[], None] = lambda: None
 ) -> Fit:
-    """Fit the networks to answers; inputs: those of every frame, (N, d).
+    """Fit the networks to answers. inputs: the networks' inputs for every frame, (N, d).
 
     The pairs are split into as many folds as there are networks: network m holds out fold m and trains on the others.
     All stop at the epoch with the lowest loss on the held-out folds. The same arguments give the same bits. Raises
@@ -283,7 +284,7 @@ def deal(pair: I64, folds: int, seed: int) -> I64:
     """Return the fold of every answer, (A,); all answers about a pair are in the same fold."""
     names, place = np.unique(pair, return_inverse=True)
     if len(names) < folds:
-        raise ManipError(f"only {len(names)} pairs are answered by left, right or equal; expected at least {folds}")
+        raise ManipError(f"only {len(names)} pairs have an answer (left, right or equal); expected at least {folds}")
     order = np.random.default_rng([seed, 2]).permutation(len(names))
     return (order % folds)[place]
 

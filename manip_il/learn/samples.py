@@ -39,7 +39,7 @@ _MAX_HELD_OUT = 1_024  # number of validation samples
 class Windows:
     """The frames that each sample consists of. episodes: the episode of every frame, (N,), ascending.
 
-    deltas: column -> frame offsets from the sample's own, (K,); other columns have only the sample's own frame.
+    deltas: column -> offsets from the sample's own frame, (K,); other columns have only the sample's own frame.
     """
 
     episodes: I64
@@ -183,13 +183,13 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
 
 
 def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
-    """Return the weight of every frame, (N,), at most 1, from the progress in a file.
+    """Return the weight of every frame, (N,), at most 1, from a file with the progress of every frame.
 
     The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9). LeRobot
     multiplies losses by them; here samples are drawn in proportion to them, which gives the same mean gradient.
 
-    episodes: the dataset's `episode_index`, (N,). ahead: number of frames that an action spans. Raises `ManipError` if
-    the file cannot be read or every frame weighs 0, `MismatchError` if it is for another dataset.
+    episodes: the dataset's `episode_index`, (N,). ahead: number of frames over which the gain in progress is measured.
+    Raises `ManipError` if the file cannot be read or every frame weighs 0, `MismatchError` for another dataset's file.
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 

@@ -1,4 +1,4 @@
-"""Behaviour cloning with any policy of LeRobot's or ours: its optimiser and schedule, its processors, its checkpoints.
+"""Behaviour cloning of any policy, LeRobot's or ours, with its optimiser, schedule, processors and checkpoints.
 
 The data are in memory, so that a batch is one gather per column; a batch depends only on seed and step.
 """
@@ -260,7 +260,7 @@ def _portable(path: Path) -> Path:
 
 
 def _on_this_cpu() -> str:
-    """Return the precision to train in: bf16 if the processor supports it, else no (single precision)."""
+    """Return the precision to train in: "bf16" if the CPU supports it, else "no" (single precision)."""
     return "bf16" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "no"  # pyright: ignore[reportPrivateUsage]
 
 
@@ -271,7 +271,7 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
         precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
     if not torch.distributed.is_initialized():  # accelerate keeps the precision of the first fit in a process
         AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
-    ours = policy.type in OWN_SPACE  # with equal buffers in every process, except the cnn's mean error
+    ours = policy.type in OWN_SPACE  # every process has equal buffers, except for the cnn's mean error
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,

@@ -56,7 +56,7 @@ def read_step(checkpoint: Path) -> dict[str, Any]:
 
 @contextmanager
 def new_checkpoint(final: Path) -> Generator[Path]:
-    """Yield an empty folder to write a checkpoint into; on exit it gets its name and becomes `last`.
+    """Yield an empty folder to write a checkpoint into; on exit it is renamed to `final` and becomes `last`.
 
     It is removed after an exception. Raises `ManipError` if the disk is full or read-only.
     """
@@ -105,7 +105,7 @@ def json_lines(path: Path, step: int) -> Writer:
 
 @contextmanager
 def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
-    """Yield a function that adds a record's numbers to their curves."""
+    """Yield a function that adds a record's numbers to TensorBoard's curves."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:

@@ -76,9 +76,9 @@ class Demonstrations:
         return np.concatenate(self.inputs), np.concatenate(self.targets)
 
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
-        """Return all episodes as `steps` transitions each. encode: normalises raw targets (T, n).
+        """Return all episodes, each padded to `steps` transitions, or not padded if `hold` is None.
 
-        If `hold` is None, nothing is padded. Raises `UsageError` if an episode is longer than `steps`.
+        encode: normalises raw targets (T, n). Raises `UsageError` if an episode is longer than `steps`.
         """
         if self.longest > steps:
             raise UsageError(

@@ -44,7 +44,7 @@ class ManipILEnv(EnvConfig):
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras:
     comma-separated names. observation_height, observation_width: size of their pictures [pixels]. fps, episode_length,
     tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
-    render_mode: with `none` lerobot-eval's films are black; rendering them takes no OpenGL and hardly any time.
+    render_mode: with `none` lerobot-eval's films are black, which needs no OpenGL and hardly any time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
     """
@@ -94,7 +94,7 @@ class ManipILEnv(EnvConfig):
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
         """Return the environments in LeRobot's form, in processes forked from a server that has done the slow imports.
 
-        Python 3.12 should preload the running command by itself, but fails because its fork server drops the path.
+        Python 3.12 should preload the running command by itself, but its fork server loses the path of that command.
         """
         commands = [name for name in _COMMANDS if name in sys.modules]
         multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
@@ -137,7 +137,7 @@ class ManipILEnv(EnvConfig):
 
 
 class FilmedEnv(ManipEnv):
-    """`ManipEnv` for lerobot-eval, which always films: without `film`, the film's pictures are small and black."""
+    """`ManipEnv` for lerobot-eval, which always films: if `film` is false, its pictures are small and black."""
 
     def __init__(self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any):
         task = get_task(config.task, config.object)

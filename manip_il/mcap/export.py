@@ -53,7 +53,7 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
     for key in numbers:
         require_finite(f"{dataset.root}, column {key!r}", table[key])
     if missing := set(table[layout.TASK_INDEX].tolist()) - set(texts):
-        raise ManipError(f"{dataset.root}: rows have task {min(missing)}, which {layout.TASKS} lacks")
+        raise ManipError(f"{dataset.root}: rows have task_index {min(missing)}, which {layout.TASKS} lacks")
     cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
     episodes, rate = dataset.episodes, Fraction(str(dataset.fps))
     for place, episode in enumerate(episodes.index.tolist()):

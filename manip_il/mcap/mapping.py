@@ -21,7 +21,7 @@ TASK = "task"  # key of a frame's task text
 
 @dataclass(frozen=True)
 class TopicSource:
-    """The topic of a column, and which message a frame takes. tolerance: largest time between frame and message [s].
+    """A column's topic, and which message is used in a frame. tolerance: largest time from frame to message [s].
 
     resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one not after the frame.
     field: paths to a message's numbers or text, joined in order. shape: that of the joined values, by default a vector.
@@ -85,7 +85,7 @@ class Mapping:
             if key in (*INDEX_FEATURES, TASK):
                 raise UsageError(f"LeRobot fills in {key} itself; leave it out")
             if source.video and self.fps % 1:
-                raise UsageError(f"LeRobot needs a whole fps for videos, not {self.fps}; {key} needs video: false")
+                raise UsageError(f"LeRobot's videos need a whole fps, not {self.fps}; set video: false for {key}")
 
     @property
     def sources(self) -> dict[str, TopicSource]:

@@ -131,7 +131,7 @@ class Teacher:
     def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
         """Return the teacher's answer about every pair. Raises `ManipError` if the sources have no true progress."""
         if clips.progress is None:
-            raise ManipError("the sources have no progress column, by which teachers compare; use manip-il reward ask")
+            raise ManipError("the sources have no progress column, which teachers need; use manip-il reward ask")
         returns = clips.progress[clips.rows].sum(-1)
         difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
         mistaken = rng.random(len(returns)) < self.epsilon
@@ -147,6 +147,6 @@ TEACHERS = {"perfect": 0.0, "boltzmann": 1.0, "mistaken": 0.1}  # default of the
 
 
 def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:
-    """Return a teacher's preferences about the pairs; they depend only on the state of `rng`."""
+    """Return a teacher's preferences about the pairs, reproducible from the state of `rng`."""
     answers = [Answer(number, one) for number, one in enumerate(teacher.answers(clips, rng))]
     return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", tuple(answers))

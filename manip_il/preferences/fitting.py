@@ -20,7 +20,7 @@ TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 
 @dataclass(frozen=True, eq=False)
 class FittedReward:
-    """A fit, and its agreement on held-out pairs; each network of the ensemble holds out some.
+    """A fit, and its agreement on held-out pairs; each network of the ensemble holds out some pairs.
 
     answered: agreement with the answers that are not `equal`; true: agreement with true progress, without pairs that
     differ by less than `TIE`; None if the datasets have no progress.

@@ -23,7 +23,7 @@ _ROUNDS = "round_*/dataset"  # a run's datasets
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The frames of a dataset, or of several joined: states (N, n), environment states (N, k), actions (N, n).
+    """The frames of one or more datasets: states (N, n), environment states (N, k), actions (N, n).
 
     actions: as executed. episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
     if the dataset has no such column.

@@ -124,7 +124,7 @@ class Clips:
 
     @cached_property
     def rows(self) -> I64:
-        """Rows in `inputs` of the frames of left and right clips, (P, 2, L)."""
+        """Rows of `inputs` that hold the frames of the left and right clips, (P, 2, L)."""
         begin = [
             [self.offsets[clip.source] + self.frames[clip.source].firsts[clip.episode] + clip.first for clip in pair]
             for pair in self.pairs.pairs
@@ -154,7 +154,7 @@ def read_clips(pairs: Pairs) -> Clips:
     for source in pairs.sources:
         root = Path(source.root)
         if not root.is_dir():
-            raise ManipError(f"{root} with the pairs' clips is missing; run in the folder where the pairs were chosen")
+            raise ManipError(f"the pairs' dataset {root} is missing; run in the folder where the pairs were chosen")
         if (found := dataset_sha256(root)) != source.sha256:
             raise MismatchError(f"sha256 of {root}", "the file of pairs", source.sha256[:12], "the dataset", found[:12])
     return Clips(pairs, tuple(read_all([Path(source.root) for source in pairs.sources])))

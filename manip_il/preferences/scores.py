@@ -30,7 +30,7 @@ from manip_il.preferences.frames import Frames
 F64 = NDArray[np.float64]
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
 LAST = 1.0  # an episode's score is the mean over its last second [s]
-BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it a kept episode may be
+BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it the score of a kept episode may be
 WORST = 10  # number of episodes listed
 _METADATA = b"reward_model_path"  # the key that LeRobot's own scripts write
 

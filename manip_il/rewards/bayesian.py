@@ -20,7 +20,7 @@ from manip_il.rewards.paths import Demonstration, add_rivals, rivals
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
-TASTES = 60  # weights drawn from the prior, the same for all demonstrations
+TASTES = 60  # weight vectors drawn from the prior, the same for all demonstrations
 CHAINS = 4
 _ROUNDS, _MORE = 3, 30  # rounds of drawing tastes from the posterior, and tastes per round
 _DRAWS, _WARM_UP = 10_000, 2_000  # steps of a chain and of each warm-up
@@ -41,7 +41,7 @@ class Choices:
 
     @classmethod
     def of(cls, sums: Sequence[F64]) -> Choices:
-        """Return the choices from each demonstration's feature sums (m, K), the chosen path in the first row."""
+        """Return the choices, given feature sums (m, K) for each demonstration, with its own path in the first row."""
         starts = np.cumsum([0, *map(len, sums[:-1])]).astype(np.int64)
         return cls(np.concatenate([one - one[0] for one in sums]), starts)
 
@@ -67,7 +67,7 @@ class Posterior:
 
     @property
     def mean(self) -> F64:
-        """Posterior mean of the weights, (K,) [1/m]. The path that is cheapest for it has the least expected cost."""
+        """Posterior mean of the weights, (K,) [1/m]. The cheapest path for the mean has the least expected cost."""
         return self.pooled.mean(axis=0)
 
     @property
@@ -91,7 +91,7 @@ class Posterior:
 
 
 def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: float = PRIOR) -> F64:
-    """Return weights drawn from the prior, (count, features) [1/m]."""
+    """Return weight vectors drawn from the prior, (count, features) [1/m]."""
     return rng.exponential(prior, (count, features))
 
 

@@ -51,7 +51,7 @@ class SoftPlan:
         return self.problem.matrix(self.chances).T.tocsr()
 
     def visits(self, start: int) -> F64:
-        """Return the expected visits of every edge on the way from a start, (E,) (Ziebart et al. 2008, alg. 1).
+        """Return the expected number of visits to each edge from node `start` on, (E,) (Ziebart et al. 2008, alg. 1).
 
         Raises `ManipError` if no path leads to the goal.
         """
@@ -68,7 +68,7 @@ class SoftPlan:
         raise ManipError(f"paths of more than {_MOST_EDGES} edges are likely; expected higher costs")
 
     def features(self, start: int) -> F64:
-        """Return the expected feature sums on the way from a start, (K,)."""
+        """Return the expected feature sums of a path from node `start`, (K,)."""
         return self.visits(start) @ self.problem.features
 
 
@@ -133,7 +133,7 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 
 
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
-    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: see `PRIOR` [1/m].
+    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: their standard deviation [1/m].
 
     The search starts from weights above `least_weights`. It fits some of the demonstrations first, then all of them.
     """

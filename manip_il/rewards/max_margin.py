@@ -25,7 +25,7 @@ def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) 
     """Return the margin violation of a demonstration for weights (K,), and a subgradient (K,).
 
     The margin of a path is `margin` times the length of its edges that end off the demonstration (Ratliff et al. 2006,
-    with the maximum over paths as in their eq. 7). Costs minus margins are positive if length has weight 1 or more.
+    with the maximum over paths as in their eq. 7). Costs minus margins are positive if length's weight is 1 or more.
     """
     problem = demonstration.problem
     off = np.ones(problem.nodes, bool)

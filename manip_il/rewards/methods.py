@@ -14,16 +14,16 @@ from manip_il.rewards.paths import LENGTH, Demonstration, open_features, rivals
 F64 = NDArray[np.float64]
 METHODS = ("max_margin", "bayesian", "max_entropy")
 LEVEL = 0.9  # level of the credible intervals
-_TASTES = 20  # random weights whose paths show whether a feature matters
+_TASTES = 20  # random weight vectors whose paths show whether a feature matters
 
 
 @dataclass(frozen=True)
 class Learnt:
     """The weights that a method found.
 
-    weights: (K,), divided by the weight of length. open: features in which all demonstrations agree, so that the
-    features' weights are not identified. intervals: the weights' credible intervals, (K, 2), or None. chains: quality
-    of the sampling, in words.
+    weights: (K,), divided by the weight of length. open: indices of the weights that are not identified, see
+    `open_features`. intervals: the weights' credible intervals, (K, 2), or None. chains: quality of the sampling, in
+    words.
     """
 
     method: str

@@ -30,8 +30,8 @@ _SAME = 1e-6  # largest difference between equal feature sums [m]
 class PathProblem:
     """S nodes, E edges with K features each, one goal.
 
-    edges: (E, 2), from and to, each pair once, without self-loops. features: (E, K), 0 or more; the first one is the
-    edge's length [m], above 0; another may be the part of this length that lies above an object on the table [m].
+    edges: nodes (from, to), (E, 2), each pair once, without self-loops. features: (E, K), 0 or more; the first one is
+    the edge's length [m], above 0; another may be the part of this length that lies above an object on the table [m].
     """
 
     edges: I64
@@ -41,7 +41,7 @@ class PathProblem:
 
     @cached_property
     def numbers(self) -> Any:
-        """Edge numbers, counted from 1, as a sparse matrix (S, S), rows: from, columns: to."""
+        """Edge numbers, counted from 1, as a sparse matrix (from, to), (S, S)."""
         return csr_array((np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes))
 
     def costs(self, weights: F64) -> F64:
@@ -49,7 +49,7 @@ class PathProblem:
         return self.features @ weights
 
     def matrix(self, values: F64) -> Any:
-        """Return the edges' values (E,) as a sparse matrix (S, S), rows: from, columns: to. Zeros are stored, too."""
+        """Return the edges' values (E,) as a sparse matrix (from, to), (S, S). Zeros are stored, too."""
         numbers = self.numbers
         return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
@@ -90,7 +90,7 @@ def plan_edges(problem: PathProblem, costs: F64) -> Plan:
 
 
 def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64, F64]:
-    """Return the nodes (n,) and feature sums (K,) of a plan's path from a start.
+    """Return the nodes (n,) and feature sums (K,) of a plan's path from node `start`.
 
     Raises `ManipError` if no path leads to the goal.
     """
@@ -122,7 +122,7 @@ class Demonstration:
 
 
 def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstration]]:
-    """Return the sets of demonstrations to fit in turn: first every fifth one, unless these are too few, then all."""
+    """Return the sets of demonstrations to fit in turn: every fifth one (skipped if these are too few), then all."""
     few = demonstrations[::_EVERY]
     return [few, demonstrations] if len(few) >= _FEW else [demonstrations]
 
@@ -130,14 +130,14 @@ def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstrati
 def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
     """Return the feature sums (m, K) of each demonstration's alternatives.
 
-    Alternatives are the distinct paths that are cheapest for one of the weights in `tastes` (n, K). The demonstration's
-    own sums come first, so m is at most n + 1.
+    Alternatives are the distinct paths that are cheapest for one of the weight vectors `tastes` (n, K). The
+    demonstration's own sums come first, so m is at most n + 1.
     """
     return add_rivals(demonstrations, [one.sums[None] for one in demonstrations], tastes)
 
 
 def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64) -> list[F64]:
-    """Return `sums` with the alternatives for further `tastes` (n, K) added: (m, K) per demonstration, as `rivals`."""
+    """Return the `sums` of `rivals`, (m, K) each, with the alternatives for further weight vectors `tastes` (n, K)."""
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
         more = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]

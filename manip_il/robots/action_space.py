@@ -37,9 +37,9 @@ class ActionSpace:
     """Names and bounds of an action (n,): joint targets [rad] and, last in `names`, the gripper's opening [m].
 
     low, high: what commands are clipped to, infinite for a joint that turns freely. scale: for a joint the largest step
-    of its target from its measured position [rad], for the gripper its whole opening [m]. relative: whether a learner's
-    target is relative to the measured position: true except for the gripper. units: set for a robot with servos;
-    low, high, scale, actions and measured states are then in degrees, the gripper's from 0 to 100.
+    of its target from its measured position [rad], for the gripper the range of its opening [m]. relative: whether a
+    learner's target is relative to the measured position: true except for the gripper. units: set for a robot with
+    servos; low, high, scale, actions and measured states are then in degrees, the gripper's from 0 to 100.
     """
 
     names: tuple[str, ...]

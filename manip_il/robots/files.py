@@ -32,7 +32,7 @@ class ModelFiles:
 
     @classmethod
     def read(cls, what: str, tree: Mapping[str, Any], folder: Path) -> Self:
-        """Return the files that a YAML in `folder` names. what: prefix of keys in messages. Raises `ManipError`."""
+        """Return the files that a YAML in `folder` names. what: prefix of its keys in messages. Raises `ManipError`."""
         places = {key: place(what + key, tree[key], folder) for key in KEYS if key in tree and key != "mend"}
         return cls(**places, mend=read(f"{what}mend", dict[str, str], tree.get("mend", {})))
 

@@ -40,7 +40,7 @@ _DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: Mapping[str, Any]) -> Robot:
-    """Complete a YAML's fields from the robot's model; return the robot. Raises `UsageError` if one is not found."""
+    """Complete a YAML's fields from the robot's model; return the robot. Raises `UsageError` for a field not found."""
     files, names = said["files"], said["joints"]
     spec = bare_spec(said["name"], files, said["hand"], said["gripper"])
     require(said["name"], "joint", names, spec.joints)
@@ -136,7 +136,7 @@ def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]
 
 
 def _tip(robot: Robot, z: F64) -> float:
-    """Measure how far the closed fingers extend from the hand along its axis (3,) [m]."""
+    """Measure how far the closed fingers extend from the hand [m] along `z` (3,), a direction in its frame."""
     model, data = _settled(robot, 0.0)
     hand = model.body(robot.hand).id
     along = data.xmat[hand].reshape(3, 3) @ z

@@ -12,7 +12,7 @@ from manip_il.mdp import F64
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 
-_AT_TIP = 0.025  # distance from a fingertip beyond which a geom is no pad [m]
+_AT_TIP = 0.025  # a geom that ends farther than this from its finger's tip is not at the tip [m]
 _FAR = 1.0  # longest distance that is measured [m]
 _NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # shifts of a geom, tried in order until the distance is not 0 [m]
 CLEARANCE = 0.02  # parts nearer than this count as colliding [m]

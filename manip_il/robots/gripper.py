@@ -1,4 +1,4 @@
-"""A gripper, described by the opening [m] between its pads, whatever drives the fingers and however they move.
+"""A gripper, described by the opening [m] between its pads: the parts of the fingertips that face each other.
 
 A sweep relates command and opening: when a robot is first used, its gripper is moved from closed to open in steps, and
 the gap between the fingers is measured once they rest. Parallel, hinged and linked fingers are thus treated alike.
@@ -34,11 +34,11 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 class Sweep:
     """Measured relation between command and opening.
 
-    shares: how far the fingers are open, 0 to 1, for commands and measured positions alike; rising, (c,).
+    shares: how far the driven joints are, or are commanded to be, from closed (0) to open (1); rising, (c,).
     openings: gaps between the pads at these [m], rising, (c,). middles: offsets along the hand's y of the midpoint
-    between the pads [m], (c,); all 0 if both sides move alike. pads: for each finger the indices of its pads among its
-    geoms, nearest to the other finger first; holding: the same for the geoms that may hold an object. linked: positions
-    of the joints of a linkage that are not driven, by name, (c,).
+    between the pads [m], (c,); all 0 if both sides move alike. pads: for each finger, the indices of its pads among its
+    geoms, nearest to the other finger first. holding: for each finger, the indices of the geoms that may hold an
+    object. linked: positions of a linkage's undriven joints, by name, (c,).
     """
 
     shares: F64
@@ -88,7 +88,7 @@ class Gripper:
         return self._closed + float(np.interp(opening, openings, shares)) * self._travel
 
     def put(self, data: mujoco.MjData, opening: float) -> None:
-        """Place the fingers, a linkage's other joints included, and set their commands to an opening [m]."""
+        """Place the fingers, with their linkage if there is one, at an opening [m], and command that opening."""
         data.qpos[self.q] = data.ctrl[self.ctrl] = self.command(opening)
         for at, positions in self._linked:
             data.qpos[at] = np.interp(opening, self._sweep.openings, positions)
@@ -106,14 +106,14 @@ class Gripper:
         return float(np.interp(opening, self._sweep.openings, self._sweep.middles)) if self.lopsided else 0.0
 
     def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] for `commands` (g,), judged by the actuator that moves farthest from `before` (g,)."""
+        """Return the opening [m] that `commands` (g,) ask for, by the one farthest from its value in `before` (g,)."""
         shares = (commands - self._closed) / self._travel
         moved = np.abs(shares - (before - self._closed) / self._travel)
         return float(np.interp(shares[moved.argmax()], self._sweep.shares, self._sweep.openings))
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> bool:
         """Return whether every finger touches a geom. Needs kinematics to be up to date in `data`."""
-        # For two separate boxes `mj_geomDistance` sometimes returns 0, but only if they are nearer than its limit.
+        # For two separate boxes `mj_geomDistance` sometimes returns 0, but only if they are nearer than `TOUCH`.
         return all(
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads)
             for pads in self._holding
@@ -149,7 +149,7 @@ def sweep(robot: Robot) -> Sweep:
     tips = [at_tip(model, data, jaw, data.site("ee").xmat.reshape(3, 3)[:, 2]) for jaw in jaws]
     gaps = [gaps_at(pose, tips) for pose in poses]
     least = [min(float(gap.min()) for gap in one) for one in gaps]
-    shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # links may pass each other
+    shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # last pose with touching tips
     pads = [_near(gap, tip, float(gap.min())) for gap, tip in zip(gaps[shut], tips, strict=True)]
     openings, middles, shares, wide = [], [], shares[shut:], poses[shut:]
     for pose in wide:
@@ -158,8 +158,8 @@ def sweep(robot: Robot) -> Sweep:
         middles.append(float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle))
     if openings[-1] - openings[0] < _LEAST_TRAVEL or (np.diff(openings) <= 0).any() or (np.diff(shares) <= 0).any():
         raise UsageError(
-            f"robot {robot.name}: the fingers stand {openings[0]:.3f} m apart closed and {openings[-1]:.3f} m open; "
-            "expected the gap to grow all the way: check gripper.joints, closed, open and fingers"
+            f"robot {robot.name}: the fingers stand {openings[0]:.3f} m apart when closed, {openings[-1]:.3f} m "
+            "when open; expected the gap to grow all the way: check gripper.joints, closed, open and fingers"
         )
     holding = jaws  # a turning jaw holds wide objects farther from its tip
     if np.ptp(middles) < _LOPSIDED:

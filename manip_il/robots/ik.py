@@ -107,7 +107,7 @@ class ArmIK:
         return self._ee.copy(), self._ee_rotation.copy()
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
-        """Return only the displacement of `step`, (arm,) [rad]. weight: rotation cost, by default an upright hand's."""
+        """Return only the displacement of `step`, (arm,) [rad]. weight: rotation cost, else `Costs.orientation`."""
         self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(position, rotation)
         if x is None:

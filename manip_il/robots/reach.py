@@ -38,10 +38,10 @@ _ABOVE = 0.05  # how far the map extends above the workspace [m]
 _VERSION = 2  # version of the map's computation
 _STEPS = 80  # most steps of inverse kinematics
 _NEAR, _ANGLE = 1e-3, 0.05  # pose error that counts as converged [m]; what a radian adds to it [m/rad]
-ARRIVES = 0.004  # pose error up to which the hand arrives [m]
-STRETCH = 0.02  # pose error up to which the hand gets near [m]
+ARRIVES = 0.004  # pose error below which the hand counts as arrived [m]
+STRETCH = 0.02  # pose error below which the hand counts as near [m]
 _LEAN = 0.13  # how much farther sideways a leaning hand reaches [m]
-_MOST_LEAN = 1.0  # largest lean of a hand that the arm cannot hold upright [rad]
+_MOST_LEAN = 1.0  # largest lean of a hand that the arm cannot point straight down [rad]
 _BLOCKED = 0.1  # error added for a posture in which the robot collides with itself [m]
 
 
@@ -49,7 +49,8 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 class Reach:
     """A grid of points and an error for each: how far from the point the downward hand ends up.
 
-    origin: the grid's first point, (3,) [m]. errors: (x, y, z) [m].
+    Eight neighbouring points are the corners of a cell. origin: the grid's first point, (3,) [m]. errors: [m], an array
+    with the axes x, y and z.
     """
 
     origin: F64
@@ -103,7 +104,7 @@ class Reach:
         return self.has(position) or self.error(position) < STRETCH
 
     def lean(self, position: Sequence[float] | F64) -> float:
-        """Return how much the hand must lean to reach `position` [m], (3,), from 0 (upright) to 1."""
+        """Return how much the hand must lean to reach `position` [m], (3,), from 0 (pointing down) to 1."""
         if self.has(position):
             return 0.0
         return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
@@ -111,7 +112,7 @@ class Reach:
     def leaning(self, position: Sequence[float] | F64) -> bool:
         """Return whether a leaning hand gets near `position` (3,) [m].
 
-        It does if an upright one gets near it, or near the point 13 cm farther in towards the map's middle.
+        It does if the downward hand gets near `position`, or near the point 13 cm closer to the map's middle.
         """
         if self.nearly(position):
             return True
@@ -188,7 +189,7 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
 
 
 def _angle_off(robot: Robot, hand: F64, yaw: float, down: F64) -> float:
-    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; if the arm leans, it may by `_MOST_LEAN`."""
+    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; a leaning arm may lean by `_MOST_LEAN`."""
     if robot.leans:
         return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
     return angle_between(down, hand)

@@ -1,4 +1,4 @@
-"""A robot, an arm with a gripper, as dataclasses: one per section of its YAML, which refers to its MJCF by name."""
+"""A robot, an arm with a gripper, as dataclasses: one per section of its YAML, which names parts of its MJCF."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, 
 class EndEffector:
     """Frame `ee`: between the fingertips, z out of the hand, y along the fingers' motion.
 
-    With the hand straight down at zero yaw its axes are world x, -y, -z. position [m] and quaternion (wxyz) in `body`.
+    With the hand straight down at zero yaw, its axes are the world's x, -y, -z. position [m], quaternion (wxyz): its
+    pose in `body`.
     lowest: least height of the frame over the table, at which the fingertips just clear it [m].
     """
 
@@ -63,7 +64,7 @@ class GripperConfig:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Volume in which tasks take place: +- half_width about the centre on the table, up to a height over it [m]."""
+    """Volume in which tasks take place: within half_width of the centre along x and y, `height` above the table [m]."""
 
     centre: tuple[float, float]
     half_width: float = 0.15
@@ -134,7 +135,7 @@ class LeRobotConfig:
     def __post_init__(self) -> None:
         checks.name("robot_type", self.robot_type)
         if len(set(self.gripper)) != 2:
-            raise ManipError(f"gripper is {list(self.gripper)}; expected two joint positions [rad], for 0 and for 100")
+            raise ManipError(f"gripper is {list(self.gripper)}; expected different joint positions [rad] for 0 and 100")
 
     def percent(self, joint: F64) -> F64:
         """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint [rad]."""
@@ -143,7 +144,7 @@ class LeRobotConfig:
 
 
 UPRIGHT = Costs()
-SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # for an arm that cannot hold its hand upright
+SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # for an arm whose hand leans everywhere
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ class Robot:
     gripper's [rad or m]. max_joint_step: largest step of a joint target from the measured position [rad]. costs:
     of inverse kinematics. yaw: where zero yaw points: along the world's x (world) or away from the shoulder (shoulder).
     wrist_camera: name of the model's camera on its hand, or position of an added one in the frame `ee` [m]. cameras:
-    poses of the scene's cameras, front and side, that replace the default ones. table: the scene's.
+    poses of the scene's cameras, front and side, that replace the default ones. table: the scene's table.
     colours: red, green and blue of meshes without contacts, by patterns of their names; later patterns win. lerobot:
     how LeRobot's recorder writes the robot; its servos' units then replace [rad] and [m].
     """
@@ -208,5 +209,5 @@ class Robot:
 
     @property
     def leans(self) -> bool:
-        """Whether the hand leans everywhere, as the arm has too few joints to hold it upright."""
+        """Whether the hand leans everywhere, as the arm has too few joints to point it straight down."""
         return self.costs.orientation == self.costs.leaning

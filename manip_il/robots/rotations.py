@@ -71,13 +71,13 @@ def angle_between(a: F64, b: F64) -> float:
 
 
 def turned_towards(rotation: F64, target: F64, largest: float) -> F64:
-    """Return `rotation` (3, 3) turned towards `target` on the shortest way, by at most `largest` [rad]."""
+    """Return `rotation` (3, 3) turned towards `target` along the shortest path, by at most `largest` [rad]."""
     if angle_between(rotation, target) <= largest:
         return target
     (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation.T.dot(target).tolist()
     axis = zy - yz, xz - zx, yx - xy
     length = math.hypot(*axis)
-    if length < 1e-6:  # half a turn, for which this difference is 0: turn about the hand's z
+    if length < 1e-6:  # half a turn, for which this axis is 0: turn about the hand's z
         axis, length = (0.0, 0.0, 1.0), 1.0
     x, y, z = axis
     turn = largest / length

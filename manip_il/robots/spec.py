@@ -81,7 +81,7 @@ def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, 
 def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig) -> tuple[str, ...]:
     """Return the names of the hinges between the base and the hand, except the gripper's.
 
-    robot: its name. Raises `UsageError` if there are none, and what `bare_spec` raises.
+    robot: its name. Raises `UsageError` if there are none, or as `bare_spec` does.
     """
     spec = bare_spec(robot, files, hand, gripper)
     joints, body = list[str](), spec.body(hand)
@@ -168,7 +168,7 @@ def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -
 
 
 def linkage(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
-    """Return the names of the gripper's undriven joints: those of a linkage, below the hand."""
+    """Return the names of the joints beyond the hand that nothing drives or fixes: those of the gripper's linkage."""
     apart = {*robot.joints, *robot.gripper.joints, *robot.fixed}
     below = spec.body(robot.hand).find_all("joint")
     return [joint.name for joint in below if joint.parent.name != robot.hand and joint.name not in apart]
@@ -241,7 +241,7 @@ def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
 
 
 def _foreign(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
-    """Yield what to delete, each kind looked up only in its turn, as MuJoCo also deletes what depends on it."""
+    """Yield what to delete; each kind is looked up only at its turn, as MuJoCo deletes dependents, too."""
     yield from list(spec.keys)
     mocaps = {body.name for body in spec.bodies if body.mocap}
     yield from [equality for equality in spec.equalities if {equality.name1, equality.name2} & mocaps]

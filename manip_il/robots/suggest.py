@@ -1,4 +1,4 @@
-"""A first draft of the YAML for an MJCF: the hand's body, the joints that drive the fingers, and a workspace."""
+"""A first draft of the YAML for a robot's MJCF: the hand's body, the joints that drive the fingers, and a workspace."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _NOTES = {
 
 
 def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
-    """Inspect a robot's MJCF, and its gripper's if there is one; return a YAML's content without the paths.
+    """Inspect a robot's MJCF, and its gripper's if there is one; return the content of a YAML, without paths.
 
     Raises `UsageError` if MuJoCo cannot read or compile them, or if no hand or no fingers are found.
     """
@@ -116,7 +116,7 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
     driven = slides or motored or in_step or next_to_hand
     if not driven or not all(joint.name and joint.range[0] < joint.range[1] for joint in driven):
         raise UsageError(
-            f"{path}: no joint that has a name and a range moves a finger; write the YAML by hand (docs/robots.md)"
+            f"{path}: no joint with a name and a range moves the fingers; write the YAML by hand (docs/robots.md)"
         )
     return driven
 

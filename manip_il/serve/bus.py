@@ -60,7 +60,7 @@ Calibration = dict[str, dict[str, int]]
 
 
 class Bus:
-    """Servos on a pseudo-terminal, answered by a thread of their own.
+    """Servos on a pseudo-terminal; a thread of their own answers packets.
 
     calibration: the registers that the servos keep without power, by joint name. bus[NAME]: values of one
     register of all servos, (n,), by LeRobot's NAME. path: device file, for any program that uses serial ports. lock:

@@ -1,6 +1,6 @@
-"""Settings of servos and of sessions, without the simulator.
+"""Settings of servos and of sessions. Importing this module does not load the simulator.
 
-Published and measured values of the servos: Feetech's data sheet of the STS3215-C018 (12 V: 30 kg cm at stall, 45 turns
+Sources of the servos' values: Feetech's data sheet of the STS3215-C018 (12 V: 30 kg cm at stall, 45 turns
 per minute without load); gear play of about 1 degree and an error of 1.8 to 2.6 degrees under 1.5 kg at 10 cm
 (github.com/TheRobotStudio/SO-ARM100, issue 134; robonine.com); friction as in MuJoCo Menagerie's SO-101. The delay is
 an assumption.
@@ -44,7 +44,7 @@ class ServoConfig:
     offset: float = option(0.0, "error of each joint's calibration [deg]", at_least=-10, at_most=10)
 
     def varied(self, rng: np.random.Generator) -> ServoConfig:
-        """Draw servos that differ from these by amounts within `VARIED`."""
+        """Draw servos whose parameters differ from these within the ranges of `VARIED`."""
         drawn: dict[str, float] = {}
         for name, ends in VARIED.items():
             own, change = getattr(self, name), rng.uniform(*ends)
@@ -56,9 +56,9 @@ class ServoConfig:
 class SessionConfig(Seeded):
     """Options of a session: how the follower's servos move, when a new world is drawn, and what is saved."""
 
-    output_dir: Path = option(Path("runs/serve"), "folder of the ports follower and leader, and their calibrations")
+    output_dir: Path = option(Path("runs/serve"), "folder of the ports follower and leader, and of their calibrations")
     leader: str = option(
-        "expert", "who moves the leader: expert, sliders (in a window), none, or a policy (a checkpoint or a run)"
+        "expert", "who moves the leader arm: expert, sliders (in a window), none, or a policy (a checkpoint or a run)"
     )
     speed: float = option(
         1.0, "how fast time passes in the world; 2: twice as fast as real time", at_least=0.1, at_most=10
@@ -66,7 +66,7 @@ class SessionConfig(Seeded):
     servo: Literal["sts3215", "ideal"] = option("sts3215", "servo model; ideal: without play, delay and friction")
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
-        "solved", "without a COMMAND, when to draw a new world: on Enter, or also one second after the task is solved"
+        "solved", "when to draw a new world if no COMMAND runs: on Enter, or also one second after the task is solved"
     )
     intervene: float = option(
         0.15,

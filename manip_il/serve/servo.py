@@ -32,7 +32,7 @@ class Follower:
         self._at, self._on, self._coming = np.zeros(len(self.q)), np.zeros(len(self.q), bool), deque[F64]()
 
     def reset(self, config: ServoConfig) -> None:
-        """Use servos with these parameters, whose goals are the current joint positions."""
+        """Use servos with these parameters; the current joint positions become their goals."""
         self.config = config
         for model in (self._world.scene.model, self._world.model):
             model.body_gravcomp[model.jnt_bodyid[:]] = 0.0

@@ -106,7 +106,7 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
 
 
 def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | None) -> Mover:
-    """Return a function that moves the leader as a policy commands. The policy sees the cameras' last pictures."""
+    """Return a function that moves the leader as a policy commands. The policy sees the cameras' latest pictures."""
     seed = None
 
     def move() -> F64:

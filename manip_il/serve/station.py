@@ -25,7 +25,7 @@ from manip_il.sim.world import World
 
 FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
 HELD = 1.0  # how long the task must stay solved before it counts [s]
-_FULL_TURN = "wrist_roll"  # the joint to which LeRobot's calibration gives a full turn
+_FULL_TURN = "wrist_roll"  # the joint whose range is a full turn in LeRobot's calibration
 
 
 Mover = Callable[[], F64 | None]
@@ -49,7 +49,7 @@ class Station:
 
     `NAME.json` beside each port is its calibration in LeRobot's format: the registers that the servos keep without
     power. on_read: called, from another thread, whenever a client reads the follower's position. mover: called every
-    control step; returns the joints to which the weightless leader moves [rad], (n,), or None to leave it. hand: joint
+    control step; returns the joints to which the weightless leader moves [rad], (n,), or None if it stays. hand: joint
     angles at which a hand holds both arms still [rad], (n,), or None. clock: paces the control steps. Raises
     `UsageError` for a robot without Feetech servos.
     """
@@ -116,7 +116,7 @@ class Station:
         return self.to_joints(label.action) + self.follower.sag() + self.follower.offset if label.valid else None
 
     def reset(self, seed: int) -> None:
-        """Draw the world of a seed, with the arm and the leader at its start posture."""
+        """Draw the world of a seed; follower and leader are at its start posture."""
         self.env.start(seed)
         self.seed, self._solved = seed, 0
         self.follower.reset(self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos)

@@ -86,7 +86,7 @@ class Condition:
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
-        """Return the condition without the ranges that have no effect; None if none is left.
+        """Return the condition without the ranges that have no effect; None if it had some and none is left.
 
         has_object: whether the task has an object. sees: whether the policy has cameras. sizes: object sizes that the
         task can take [m]; None: only its own.

@@ -34,7 +34,7 @@ class Episodes:
 
 
 CAMERAS = ("front", "side", "wrist")
-OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # gym-aloha's
+OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # of gym-aloha
 MIN_SIDE, MAX_SIDE = 16, 2048  # sides of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 

@@ -43,7 +43,7 @@ def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> 
     """Return `action` (n,) with Gaussian noise, as in Meta-World's tests of its experts.
 
     share: the noise's standard deviation as a share of each entry's range, which is twice the longest step for a joint,
-    and the whole opening for the gripper.
+    and the whole range of openings for the gripper.
     """
     actions = world.scene.actions
     spread = np.where(actions.relative, 2, 1) * actions.scale
@@ -156,7 +156,7 @@ class Perturbation(Condition):
         vars(self).update(moments=moments)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return kind -> the control step at which it happens in the episode of a seed."""
+        """Return the kind's name -> the control step at which it happens in the episode of a seed."""
         return {self.name: self.moments[seed]}
 
 
@@ -177,7 +177,7 @@ STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), kn
 
 
 class Events:
-    """Events of one episode: `drawn` says which, how strong and when; the rest is drawn from the seed."""
+    """Events of one episode: `drawn` says which, how strong and when; directions and noise are drawn from the seed."""
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
         self._world = world

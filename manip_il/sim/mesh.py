@@ -23,8 +23,8 @@ _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P
 class Mesh:
     """A closed mesh with its centre of mass at the origin: vertices (n, 3) [m], faces (m, 3), volume [m^3].
 
-    sha256: hash of the file. text: the option's value, with the file's path; stored: the value with the file's name
-    and hash instead, as in datasets.
+    sha256: hash of the file. text: the value of --task.object, with the file's path; stored: as in datasets, with the
+    file's name and hash in place of its path.
     """
 
     text: str

@@ -33,7 +33,7 @@ _DRAWS = 50  # draws of a clutter object's place before it is left out
 
 
 class Prop(NamedTuple):
-    """An object to draw: MuJoCo's geom type and size (3,), its place (3,) [m], axes (3, 3), red, green, blue, alpha."""
+    """An object to draw: MuJoCo's geom type and size (3,), position (3,) [m], rotation (3, 3) and colour (RGBA)."""
 
     kind: int
     size: F64
@@ -42,7 +42,7 @@ class Prop(NamedTuple):
     colour: tuple[float, float, float, float]
 
     def add_to(self, scene: Any) -> None:
-        """Add it to `scene`, MuJoCo's list of geoms to draw next."""
+        """Add the object to `scene`, MuJoCo's list of geoms to draw next."""
         geom, colour = scene.geoms[scene.ngeom], np.array(self.colour, np.float32)
         mujoco.mjv_initGeom(geom, self.kind, self.size, self.position, self.rotation.ravel(), colour)
         geom.category = mujoco.mjtCatBit.mjCAT_STATIC
@@ -58,7 +58,7 @@ def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0
 
 
 def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
-    """The stand of a goal, wider than an object there: on the table a foot, in the air a pole with a cross."""
+    """The stand of a goal, wider than an object there: a foot on the table, or a pole with a cross in the air."""
     body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
     if body < 0:
         return []

@@ -28,7 +28,7 @@ REMEDY = f"unset MUJOCO_GL if it is set; on Debian: apt-get install -y {PACKAGES
 _FINER = 2  # supersampling each way: cheaper than OpenGL's antialiasing, which redraws the meshes
 _MAX_GEOMS = 1_000
 _EE = 4  # group of the site `ee`, the robot's only one
-_AXES = 0.06, 0.006  # length and thickness of its axes [m]
+_AXES = 0.06, 0.006  # length and thickness of the axes drawn at `ee` [m]
 
 
 def pictures(
@@ -48,8 +48,8 @@ def pictures(
 def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
     """Return where points (K, 3) of the world [m] are in this process's last `pictures`: name -> (K, 3).
 
-    Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside the picture; one
-    inside may be occluded. Raises what `pictures` raises.
+    Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside the picture. A
+    point inside may be hidden behind others. Raises `RenderError` as `pictures` does.
     """
     renderer = _renderer(scene, cameras.look)
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
@@ -60,8 +60,8 @@ def framed_picture(
 ) -> Picture:
     """Return what `camera`, the scene's or a free one, sees of the physics in `data`, with the axes of `ee` drawn in.
 
-    x is red, y green, z blue. size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures`
-    raises.
+    The x axis is red, y green, z blue. size: height and width [pixels]. The picture is RGB, uint8 (height, width, 3).
+    Raises `RenderError` as `pictures` does.
     """
     renderer = _renderer(scene, look)
     renderer.pose(data, scene.nominal)
@@ -90,7 +90,7 @@ def _renderer(scene: Scene, look: Look) -> _Renderer:
 @cache
 def _context() -> Any:
     """This process's OpenGL context."""
-    backend = os.environ.get("MUJOCO_GL", "").lower().strip()  # also if mujoco was imported before it was set
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()  # mujoco may have been imported before it was set
     made_by = import_module(f"mujoco.{backend if backend in ('egl', 'osmesa') else 'glfw'}").GLContext
     setattr(made_by, "_context", None)  # noqa: B010 - its destructor needs it even if its constructor failed
     gl = made_by(1, 1)  # any size will do, as pictures have a buffer of their own

@@ -35,10 +35,11 @@ _ROUND = 0.03  # largest variation of a round object's width, as a share of it
 class Rest(NamedTuple):
     """A side on which an object rests.
 
-    down: unit vector (3,), in the object's frame, that then points down. Heights [m]: `height` of the body's origin
-    over the table, `tall` of the object, `above` of its top over the grasp. For each of w grasps: across (w, 3), unit
-    vector along the fingers' motion; centre (w, 3), middle between the fingers [m]; sizes: width between them and
-    length across them [m]. fits: whether the fingers go around it, and it is high enough. round: any yaw will do.
+    down: unit vector (3,), in the object's frame, that points down when the object rests on the side. Heights [m]:
+    `height` of the body's origin over the table, `tall` of the object, `above` of its top over the grasp. For each of w
+    grasps: across (w, 3), unit vector along the fingers' motion; centre (w, 3), middle between the fingers [m]; sizes,
+    the object's width between the fingers and its length at right angles to that [m]. fits: whether the object is
+    narrow enough for the open fingers, and tall enough to grip. round: whether any yaw will do.
     """
 
     down: F64
@@ -56,7 +57,7 @@ class Hull:
     """An object's convex hull, and the sides on which it rests, for one gripper.
 
     extents: lengths of the box around it, centred on the body's origin [m]. downs: for each side the unit vector that
-    points down when it rests there, (n, 3); the first is the nearest to down in its modelled orientation.
+    points down when the object rests on it, (n, 3); the first is the nearest to down as the object was modelled.
     """
 
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
@@ -143,7 +144,7 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
 
 
 def _all_ways(hull: ConvexHull, heights: F64, flat: F64, tips: float, turns: F64) -> list[_Way]:
-    """The grasp at each turn, with the fingertips at a height over the table [m]."""
+    """The grasp at each turn, with the fingertips at the height `tips` over the table [m]."""
     levels = np.arange(tips + _TIP, heights.max() - _TIP / 2, _LEVEL).tolist()
     cuts = [_cut(hull, heights, flat, level) for level in levels]
     return [_way(cuts, turn) for turn in turns]

@@ -41,9 +41,10 @@ _SHADOW_SIZE = 1024  # side of the shadow map [pixels]: the main cost on a softw
 
 @lru_cache(SCENES_KEPT)
 def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
-    """Return the scene of a robot and a task, compiled once and cached. Raises `UsageError`.
+    """Return the scene of a robot and a task, compiled once and cached.
 
-    step: physics time step [s].
+    step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object of the task,
+    or has one to grasp that is too wide for the gripper.
     """
     try:
         spec = scene_spec(robot, task)
@@ -152,11 +153,14 @@ def _check_objects(
     gripper: Gripper,
     hulls: Mapping[str, Hull],
 ) -> None:
-    """Raise `UsageError` for an object that is too wide for the gripper."""
+    """Raise `UsageError` for an object that the scene does not have, or that is too wide for the gripper."""
+    for name in (*task.objects, *task.grasped):
+        if name not in objects:
+            raise UnknownName(f"object of task {task.name}", name, objects)
     for name in task.grasped:
         if name in hulls:
             width = min(width for width, _ in hulls[name].rest(0).sizes)
-        else:  # width between the fingers if it lies on its worst side
+        else:  # width between the fingers if the object lies on its worst side
             kind, size = int(model.geom_type[objects[name].geom]), model.geom_size[objects[name].geom]
             lengths = variation.extents(kind, size)
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])

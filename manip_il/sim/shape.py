@@ -35,11 +35,12 @@ SHAPE_HELP = (
 
 @dataclass(frozen=True)
 class Shape:
-    """A wooden solid. kind: one of `KINDS`, mesh or any; lengths: along its own axes x, y and z [m].
+    """A wooden solid. kind: one of `KINDS`, `mesh` or `any`; lengths: along its own axes x, y and z [m].
 
-    any: each episode draws one of `KINDS`, of the same width; a cube if nothing is drawn.
+    `any`: each episode draws one of `KINDS`, of the same width; a cube if nothing is drawn.
     Cylinders and capsules have their axis along z, and a capsule's length is that between the tips of its round ends.
-    Raises `UsageError` for a length outside `SHORTEST` to `LONGEST`, or a capsule no longer than wide.
+    Raises `UsageError` for a length outside `SHORTEST` to `LONGEST` (for a mesh, only the longest counts, and it may be
+    `LONGEST_MESH`), or a capsule no longer than wide.
     """
 
     kind: str
@@ -95,7 +96,7 @@ class Shape:
 
     @property
     def size(self) -> tuple[float, ...]:
-        """Its `geom_size` in MuJoCo [m]."""
+        """MuJoCo's `geom_size` of the shape [m]."""
         width, _, length = self.lengths
         if self.kind in ("box", ANY):
             return tuple(one / 2 for one in self.lengths)
@@ -154,7 +155,7 @@ def draws_shape(text: str) -> bool:
 
 
 def stored(text: str) -> str:
-    """Return an object's text as datasets store it: for a mesh with its file's name and hash, but no folder."""
+    """Return an object's text as datasets store it: for a mesh, with the file's name and hash in place of its path."""
     mesh = Shape.parse(text).mesh if text else None
     return text if mesh is None else mesh.stored
 
@@ -170,5 +171,5 @@ def contact(kind: str) -> tuple[int, float]:
     return (4, 0.0001) if kind in ("box", ANY) else (6, ROLLING)
 
 
-_THINNEST, _WIDEST = 0.02, 0.07  # bounds on a scaled object: least length, and greatest between the fingers [m]
+_THINNEST, _WIDEST = 0.02, 0.07  # bounds on a scaled object: least length, greatest width between fingers [m]
 CUBE = Shape("box", (DEFAULT_WIDTH, DEFAULT_WIDTH, DEFAULT_WIDTH))

@@ -21,8 +21,8 @@ Observed = Mapping[str, "F64 | float"]
 class Target(NamedTuple):
     """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
 
-    max_step, max_turn: at most how far towards the pose a single step aims, [m] and [rad]. exact: for tight
-    fits, keep the posture cost of inverse kinematics from pulling the hand a millimetre off its target.
+    max_step, max_turn: how far a single step may aim towards the pose, in position [m] and rotation [rad]. exact: for
+    tight fits, keep the posture cost of inverse kinematics from pulling the hand a millimetre off its target.
     lean: how far the hand may lean from `rotation` to reach `position`, 0 to 1.
     """
 
@@ -37,7 +37,7 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class Rung:
-    """One rung of a task's ladder. name: the phase; holds: whether the world is in it; target: where to move then."""
+    """A rung: one phase of a task. holds: whether the world is in this phase; target: where the hand moves then."""
 
     name: str
     holds: Callable[[World], bool]
@@ -46,9 +46,9 @@ class Rung:
 
 @dataclass(frozen=True)
 class Start:
-    """Drawn start of an episode: (position (3,) [m], quaternion wxyz (4,)) of objects and mocap bodies.
+    """Drawn start of an episode. poses: body name -> (position (3,) [m], quaternion wxyz (4,)).
 
-    Bodies that are not named start where `build` put them.
+    The bodies are objects and mocap bodies; those without a pose start where `build` put them.
     """
 
     poses: Mapping[str, tuple[F64, F64]]
@@ -56,7 +56,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of an episode. tolerance: largest error allowed [m]; success_steps, horizon: [control steps]."""
+    """Limits of an episode. tolerance [m], success_steps, horizon [control steps]: as in `Episodes`."""
 
     tolerance: float = 0.02
     success_steps: int = 5
@@ -67,13 +67,13 @@ class Task(Protocol):
     """A task, independent of the arm.
 
     objects: what the arm moves and must reach; events move the first. grasped: those that the gripper must go around.
-    rungs: latest phase first; the last rung listed always holds. Each is a function of the world alone, so that the
-    expert can label any state.
+    rungs: the phases, latest first; the expert takes the first that holds, and the last always holds. Each depends only
+    on the world, so that the expert can label any state.
     """
 
     @property
     def name(self) -> str:
-        """Name in options."""
+        """The task's name in options."""
         ...
 
     @property
@@ -103,7 +103,7 @@ class Task(Protocol):
 
     @property
     def rungs(self) -> tuple[Rung, ...]:
-        """Rungs of the ladder, latest phase first."""
+        """The task's phases as rungs, latest first."""
         ...
 
     def build(self, spec: mujoco.MjSpec) -> None:
@@ -155,7 +155,7 @@ class TakesShape(Protocol):
     """A task whose object may be of any shape."""
 
     def with_shape(self, shape: Shape) -> Task:
-        """Return the task with an object of a shape."""
+        """Return this task with an object of the given shape."""
         ...
 
 
@@ -178,7 +178,7 @@ class Fitting(Protocol):
     """A task whose fixed parts are scaled to the arm."""
 
     def fitted(self, robot: Robot) -> Task:
-        """Return the task for a robot's workspace."""
+        """Return this task with its fixed parts scaled to the robot."""
         ...
 
 

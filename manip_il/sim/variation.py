@@ -1,7 +1,7 @@
 """How a world differs from the compiled model, as numbers that a state holds.
 
-First five numbers per object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then
-the world's numbers (`_WORLD`), with the names and units of `Condition`.
+First five numbers per object: MuJoCo's `geom_size` (3,) [m], the mass [kg] and the sliding friction. Then the numbers
+of the world as a whole, such as `table` and `clutter`, with the names and units of `Condition`.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def part(variation: F64, name: str) -> F64:
 def completed(variation: F64, like: F64) -> F64:
     """Return a variation (v,) in the current format. like: the scene's own, (v,).
 
-    Older states lack numbers at the end. These get their nominal values; if others were drawn, only the
-    dataset's provenance records them. Raises `MismatchError` for a variation of any other length.
+    States of older versions lack numbers at the end, which get their nominal values here; if other values were drawn
+    then, only the dataset's provenance has them. Raises `MismatchError` for a variation of any other length.
     """
     if (lacks := len(like) - len(variation)) in OLDER:
         return np.concatenate([variation, NOTHING_DRAWN[-lacks:]])
@@ -102,8 +102,8 @@ def same_physics(variation: F64, other: F64) -> bool:
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     """Return `base` (v,) with the values in `drawn`, whose names and units are those of `Condition`.
 
-    Other names change nothing. size is the edge or width [m]; an object of a drawn shape is wooden. camera_shift and
-    camera_turn have a vector (3,) per camera.
+    Names of other quantities change nothing. size is the edge or width [m]. An object of a drawn shape has the mass of
+    a wooden one, unless a mass is drawn. camera_shift and camera_turn have a vector (3,) per camera.
     """
     varied = base.copy()
     rows = varied[: len(base) - WORLD_SIZE].reshape(-1, PER_OBJECT)
@@ -125,7 +125,7 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of a variation's objects, (o, 3) [m], and their geoms' MuJoCo type if drawn, else None."""
+    """Return `geom_size` of a variation's objects, (o, 3) [m], and their MuJoCo geom type if drawn, else None."""
     shape = float(part(variation, "shape")[0])
     sizes = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)[:, _SIZE]
     return sizes, None if shape == _OWN else int(shape)
@@ -151,7 +151,7 @@ def apply(
 
 
 def _apply_dynamics(changed: Any, plain: mujoco.MjModel, motors: NDArray[np.int64], variation: F64) -> None:
-    """Scale the arm's damping and gains, kv by the root of kp's factor, which keeps the damping ratio."""
+    """Scale the arm's damping and gains, kv by the square root of kp's factor, which keeps the damping ratio."""
     damping, gain = (float(part(variation, name)[0]) for name in ("joint_damping", "actuator_gain"))
     dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
     changed.dof_damping[dofs] = plain.dof_damping[dofs] * damping
@@ -183,7 +183,7 @@ def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, sh
 
 
 def extents(kind: int, size: F64) -> F64:
-    """Return a geom's lengths along its own axes [m], (3,), from MuJoCo's `geom_size`; for a mesh, those of its box."""
+    """Return a geom's lengths along its axes [m], (3,), from `geom_size`; a mesh counts as a box about its origin."""
     geom = mujoco.mjtGeom
     if kind in (int(geom.mjGEOM_BOX), _MESH):
         return 2 * size

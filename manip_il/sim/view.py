@@ -23,9 +23,9 @@ from manip_il.sim.world import Scene, once_per_scene
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
 _CELLS = 22  # grid cells along a mesh's diagonal: enough to look right at 480 x 640 pixels
-_LEAST_CELL = 0.008  # width of a pixel at 128 x 128; less if the cameras are nearer [m]
+_LEAST_CELL = 0.008  # least width of a cell: a pixel at 128 x 128; less if the cameras are nearer [m]
 _PLAIN_FACES = 1_600  # meshes with up to this many faces are not simplified
-_PULL = 0.01  # weight of a cell's mean in its vertex, against that of its faces' planes
+_PULL = 0.01  # weight of a cell's mean, relative to its faces' planes, in placing its vertex
 _LEAST_PULL = 1e-12  # [m^2] if a cell has no faces
 _LAMPS = ("light_ambient", "light_diffuse", "light_specular")
 _CHANGED = (
@@ -116,7 +116,7 @@ def _with_few_faces(scene: Scene) -> mujoco.MjModel:
 
 
 def simplify_meshes(model: mujoco.MjModel, finest: float) -> None:
-    """Reduce the faces of large meshes in a model that is only drawn. finest: as in `cluster` [m]."""
+    """Reduce the faces of large meshes in a model that is only drawn. finest: least size of a grid cell [m]."""
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:
             _simplify(model, mesh, finest)
@@ -139,7 +139,7 @@ def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
 
 
 def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple[F64, Indices, Indices]:
-    """Merge vertices (v, 3) in each grid cell; return positions (c, 3), indices of originals (c,) and faces (f, 3).
+    """Merge vertices (v, 3) that share a grid cell; return positions (c, 3), indices of originals (c,), faces (f, 3).
 
     finest: least size of a cell [m]. The original of a cell is the vertex nearest to the mean of its vertices; the
     original's normal shades the coarse mesh like the fine one.

@@ -1,4 +1,4 @@
-"""A compiled scene and its physics in one state, read by name by tasks, ladders and the expert.
+"""A compiled scene and its present physics, which tasks and the expert read by name.
 
 Lengths in [m], angles in [rad], all in the world's frame: z = 0 is the table's top, x points away from the robot.
 """
@@ -30,13 +30,13 @@ from manip_il.sim.variation import Object
 F64 = NDArray[np.float64]
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08  # heights and distance at which a hand may hit a neighbour of an object [m]
-_MOST_TURNS = 4  # symmetric turns considered, to either side
+_MOST_TURNS = 4  # symmetric turns tried in each direction
 _AT_REST = 0.03, 0.5  # speeds below which an object is at rest [m/s], [rad/s]
 GOAL = "goal"  # the mocap body that marks the goal
 
 
 class Pose(NamedTuple):
-    """Position (3,) [m] and rotation matrix (3, 3) of a body or frame."""
+    """Position (3,) [m] and rotation matrix (3, 3) of a body or coordinate frame in the world."""
 
     position: F64
     rotation: F64
@@ -47,7 +47,7 @@ class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of its named parts.
 
     task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies by name.
-    hulls: convex hulls of the objects that are meshes.
+    hulls: convex hulls, by name, of the objects that are meshes.
     ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest yaw of the hand,
     relative to `World.ahead` [rad]. nominal: the variation of the model as compiled, (v,).
     """
@@ -161,7 +161,7 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
 
     def place(self, name: str, position: F64, quaternion: F64) -> None:
-        """Place an object (at rest) or a mocap body at a pose: (3,) [m], wxyz (4,). Call `update` afterwards."""
+        """Place an object (at rest) or mocap body: position (3,) [m], quaternion wxyz (4,). Call `update` next."""
         if name in self.scene.objects:
             one = self.scene.objects[name]
             self.data.qpos[one.q : one.q + 7] = [*position, *quaternion]
@@ -211,7 +211,8 @@ class World:
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
         """Return the yaws relative to `ahead` [rad] that bring a hand at a position (3,) [m] to `yaw` or an equivalent.
 
-        alike: turn after which the grasp looks the same [rad]. If none is within the arm's range, return the smallest.
+        alike: turn after which the grasp looks the same [rad]. If none is in the arm's range, return the one nearest to
+        `ahead`.
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)

@@ -120,7 +120,7 @@ class Hub:
 
 
 def root_copies(paths: Collection[str]) -> dict[str, str]:
-    """Return a run's policy files, repeated at the repository's root, name -> path; {} for a policy without a run."""
+    """Return which files of a run's policy are copied to the root, name -> path; {} for a policy without a run."""
     folder = policy_folder(path for path in paths if path != CONFIG)
     inside = {path.removeprefix(f"{folder}/"): path for path in paths if folder and path.startswith(f"{folder}/")}
     return {name: path for name, path in inside.items() if "/" not in name and name != CARD}

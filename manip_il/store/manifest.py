@@ -17,9 +17,9 @@ from manip_il.doctor.finding import journals_of
 from manip_il.store.errors import RemoteError
 
 MANIFEST_FILE = "manip_il_manifest.json"
-JOURNALS = "journals"  # folder of journals, of a pushed dataset or anywhere in a run
+JOURNALS = "journals"  # name of a folder of journals, in a pushed dataset or anywhere in a run
 CHECKPOINTS, LAST = "checkpoints", "last"  # the link `last` to the newest checkpoint is not pushed; a pull creates it
-CARD, CONFIG = "README.md", "config.json"  # one per repository, one per policy
+CARD, CONFIG = "README.md", "config.json"  # the first once per repository, the second once per policy
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
 _PICKLE_OR_CODE = re.compile(
@@ -144,7 +144,7 @@ def datasets_in(folder: Path) -> list[Path]:
 
 
 def newest(checkpoints: Path) -> str | None:
-    """Return the name of the newest checkpoint in a run's `checkpoints`; None for any other folder."""
+    """Return the name of the newest checkpoint in a run's `checkpoints`; None for other or empty folders."""
     steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal() and path.is_dir()]
     return max(steps, key=int, default=None) if checkpoints.name == CHECKPOINTS else None
 

@@ -53,7 +53,7 @@ def open_remote(url: str, *, revision: str | None = None, private: bool = False,
 def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> PushPlan:
     """Push a folder, or nothing if `dry_run`; return the differences.
 
-    journals: push them, too. Raises `NotWhole` if a check finds errors in the dataset, or in a dataset of the run,
+    journals: push journals, too. Raises `NotWhole` if a check finds errors in the dataset, or in a dataset of the run,
     `UsageError` if a dataset is pushed to a policy's address or vice versa, and `RemoteError`.
     """
     kind: Kind = "dataset" if (source / INFO).is_file() else "policy"

@@ -46,7 +46,7 @@ def drop_rungs(
 ) -> tuple[Rung, ...]:
     """Return the rungs that carry the current object to its release point over a box and drop it in.
 
-    which: returns the current object; to: where to release its centre [m]; is_done: whether an object is in place.
+    which: returns the current object; to: where to release its centre [m]; is_done: whether an object is in its box.
     """
 
     def nearest(world: World) -> str:

@@ -14,7 +14,7 @@ from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.tasks import NAMES, SEVERAL
 from manip_il.tasks.stock import table as stock
 
-LIMITS_HZ = 20  # control rate that the tasks' limits assume; at other rates they last as long in seconds [Hz]
+LIMITS_HZ = 20  # control rate for which tasks give their limits [Hz]; at other rates they last as many seconds
 ROBOT_HELP = (
     f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or {stock.ROBOT} or {stock.ALOHA}: gymnasium-robotics' "
     "Fetch and gym_aloha's two arms, unmodified"
@@ -29,7 +29,7 @@ TASK_HELP = (
 class EnvConfig(Episodes):
     """Settings of one environment; every field is part of the fingerprint. `make_config` checks and completes them.
 
-    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own.
+    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's default.
     """
 
     robot: str = option("panda", ROBOT_HELP, flag="robot.type")
@@ -38,7 +38,7 @@ class EnvConfig(Episodes):
 
     @property
     def name(self) -> str:
-        """Robot and task joined by "_": of a file, its name without the suffix; of a task, not its argument."""
+        """Robot and task joined by "_": a file by its name without the suffix, a task without its argument."""
         return f"{Path(self.robot).stem}_{Path(self.task).stem.partition(':')[0]}"
 
 
@@ -47,7 +47,7 @@ def make_config(
 ) -> EnvConfig:
     """Return the settings of an environment; what is not given comes from its robot and task.
 
-    settings: the other fields of `EnvConfig`. Raises `UnknownName` for a robot or task, `UsageError` for a wrong value.
+    settings: other `EnvConfig` fields. Raises `UnknownName` (robot or task) or `UsageError` (a wrong value).
     """
     return complete(EnvConfig(robot=robot, task=task, control_hz=control_hz, **settings))
 

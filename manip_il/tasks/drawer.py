@@ -43,14 +43,14 @@ HALF = 0.02  # half the cube's edge length [m]
 OPEN_ENOUGH, SHUT = 0.09, 0.008  # opening that lets the object in; largest that counts as shut [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
 SLACK = FINGERS / 2 - BAR_HALF  # play of the hand along the pull before a finger meets the handle [m]
-AROUND = (0.024, 0.03, 0.018, 0.25)  # largest offset of the hand while it moves the handle: x, y, z [m], angle [rad]
+AROUND = (0.024, 0.03, 0.018, 0.25)  # largest offset of the moving hand from the handle: x, y, z [m], angle [rad]
 HOVER, SLOPE = 0.08, 2.0  # height of the hand over the handle on its way there [m]; height per distance from it
-BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # bounds on the object's offset from the closed handle at the start [m]
+BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # object's offset from the handle at the start: most in x, least in y [m]
 DROP = 0.018  # height of the object over the drawer's floor at release [m]
 OVER = 0.13  # height of the hand over the object on approach [m]
 OVER_FRONT = LiftProfile(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # into the drawer
 OVER_TABLE = LiftProfile(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # to a place beside it
-MUCH_NEARER = 2.3  # how much nearer the second yaw at the handle must be to be chosen [rad]
+MUCH_NEARER = 2.3  # how much nearer the yaw -pi/2 at the handle must be to be chosen [rad]
 LEFT = (0.03, 0.06, 0.03)  # offset from the handle beyond which the hand need not rise first: x, y, z [m]
 # In the cabinet's frame [m]: where an object is in the handle's way, x and y; x below which it lies in front of the
 # closed handle; and where it is put aside.
@@ -132,7 +132,7 @@ def _at_bar(world: World) -> bool:
 
 
 def _to_bar(world: World) -> Target:
-    """Move over the handle and down around it; straight up if too low beside it."""
+    """Move over the handle and down around it; a hand too low beside it only rises."""
     ee, bar, yaw = world.ee, hand_at_handle(world), _yaw(world)
     off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(0.0, angle_from_down(ee.rotation, yaw) - 0.1)
     height = min(HOVER, SLOPE * max(0.0, off - 0.006))
@@ -193,7 +193,7 @@ def _must_shut(world: World) -> bool:
 
 
 def _must_open(world: World) -> bool:
-    """Whether to open the drawer: it is not open, and no object in front of it must be moved first."""
+    """Whether to open the drawer: it is not open, and the object does not lie in front of the closed handle."""
     return not _is_open(world) and not _is_in_way(world, BEFORE)
 
 

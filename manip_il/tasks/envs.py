@@ -30,7 +30,7 @@ def config_scene(config: EnvConfig) -> Scene:
 
 
 def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> ManipEnv:
-    """Return the environment that configurations describe."""
+    """Return the environment that these settings describe."""
     return ManipEnv(*_parts(config), config, cameras=cameras, conditions=conditions)
 
 

@@ -70,7 +70,7 @@ class Lie(NamedTuple):
 class Grasp(NamedTuple):
     """How to grasp an object, and how far the hand is from that grasp.
 
-    offset: from the middle between pads that hold the object to the place to grasp, in frame `ee` [m]. width, length:
+    offset: of the place to grasp from the middle between the holding pads, in frame `ee` [m]. width, length:
     its size between the fingers and across them [m]; half: height of its top over that place [m]. settled: it rests on
     a face, leans on something without moving, or is between the fingers. yaw: a downward hand's yaw to grasp it; angle:
     the hand's angle to that pose [rad].

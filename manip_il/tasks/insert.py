@@ -49,13 +49,13 @@ _QUARTER = math.pi / 2
 
 
 def is_inserted(world: World) -> bool:
-    """Return whether the peg is at the hole's floor."""
+    """Return whether the peg has reached the hole's floor."""
     return math.dist(lower_end(world), world.pose(HOLE).position) < IN
 
 
 @once_per_state
 def to_hole(world: World) -> Way:
-    """Return the remaining motion of a peg that hangs from the hand, to the easiest of the four rotations that fit."""
+    """Return the remaining motion of a hanging peg into the hole, in the easiest of the four rotations that fit."""
     peg, hole, hand = world.pose(PEG), world.pose(HOLE), world.ee.rotation
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
@@ -192,7 +192,7 @@ class Insert:
 
 
 def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
-    """Add a chamfered wall at a yaw [rad] from the hole's middle; inner: distance of its inner face [m]."""
+    """Add a chamfered wall at a yaw [rad] from the hole's middle; inner: distance from there to its inner face [m]."""
     height, steep = DEPTH - CHAMFER, math.pi / 4
     c, s = math.cos(yaw), math.sin(yaw)
     out, thick = inner + WALL / 2, CHAMFER / 2

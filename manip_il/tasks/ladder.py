@@ -19,8 +19,8 @@ from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside, lie_of
 
-Which = Callable[[World], str]  # the current object
-Place = Callable[[World], F64]  # target of its centre, (3,) [m]
+Which = Callable[[World], str]  # returns the current object's name
+Place = Callable[[World], F64]  # returns the target of that object's centre, (3,) [m]
 
 CLEAR = 0.03  # clearance of the hand over the object's top at which the fingertips are above it [m]
 RISE_FIRST = 0.03  # a hand this far below its path only rises [m]

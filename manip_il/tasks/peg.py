@@ -17,7 +17,7 @@ from manip_il.tasks.grasp import OPEN_SLACK, lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 
 PEG, HOLE = "peg", "hole"
-_OPEN_SHARE = 0.85  # share of the gripper's opening beyond the peg, if that is less than `OPEN_SLACK`
+_OPEN_SHARE = 0.85  # least opening beyond the peg, as a share of the most possible, if less than `OPEN_SLACK`
 FROM_END = 0.04  # distance of the grip from the peg's upper end [m]
 LOWEST = 0.024  # least height of the hand over the table at a lying peg [m]
 BACK = 0.05  # a held peg's upper end is the one nearer to a point that is this far behind the hand [m]
@@ -25,7 +25,7 @@ STANDS = 0.4  # tilt below which the peg stands and is grasped from above [rad]
 LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
 LEAN_BY_ROOM = 3.0  # largest lean per distance to the end of the arm's reach: leaning moves the wrist outwards [rad/m]
 AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # errors up to which to close, to keep closing [m]
-AT_ANGLE = 0.25  # [rad]
+AT_ANGLE = 0.25  # angle to the grip up to which to close [rad]
 OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # height over the grip on approach [m], and per error; tolerated error [m]
 BARE = 0.012  # how far outside the peg's faces and ends a hand that holds it may be [m]
 ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
@@ -48,7 +48,7 @@ IN_AIR, BESIDE = 0.006, 0.045  # least height of a falling peg; largest distance
 class Grip(NamedTuple):
     """Grip that the hand aims for: pose of `ee`, position (3,) [m] and rotation (3, 3).
 
-    off: misalignment of the hand, distance and angle as one length [m]; angle: between the hand's rotation and this one
+    off: misalignment of the hand, distance and angle as one length [m]; angle: between the rotations of hand and grip
     [rad]; height: distance to keep above the grip, which grows with the misalignment [m]. open_enough: whether the
     fingers pass on both sides of the peg.
     """
@@ -106,7 +106,7 @@ def stands(world: World) -> bool:
 
 @once_per_state
 def holds_peg(world: World) -> bool:
-    """Return whether both fingers touch the peg, and the hand is between its faces and ends or just outside them."""
+    """Return whether both fingers touch the peg, and the hand is within the peg's faces and ends or just outside."""
     if not world.touched(PEG):
         return False
     peg = world.pose(PEG)
@@ -155,8 +155,8 @@ def _farthest(scene: Scene) -> float:
 class Way(NamedTuple):
     """Remaining motion of a held peg.
 
-    rotation: the hand's once the peg is upright and, if it goes into the hole, aligned with the hole, (3, 3); turn: the
-    rotation vector left until then, (3,) [rad]. off: horizontal offset left, (2,) [m]. error: off and turn, as one
+    rotation: the hand's once the peg is upright and, if it goes into the hole, aligned with the hole, (3, 3); turn:
+    remaining rotation vector, (3,) [rad]. off: remaining horizontal offset, (2,) [m]. error: off and turn, as one
     length [m]. low: height of the peg's lower end over the table once the peg is upright [m].
     """
 
@@ -168,7 +168,7 @@ class Way(NamedTuple):
 
     @property
     def angle(self) -> float:
-        """Angle left for the hand to turn [rad]."""
+        """Angle through which the hand must still turn [rad]."""
         return math.hypot(*self.turn)
 
 
@@ -176,8 +176,8 @@ class Way(NamedTuple):
 def to_stand(world: World) -> Way:
     """Return the remaining motion of a held peg that must stand on the table first.
 
-    The peg turns upright by the smallest rotation, and the hand to one side; the place to stand is near the workspace's
-    middle along x, and away from the hole.
+    The peg turns upright by the smallest rotation, and the hand turns to one side. The peg's place is near the
+    workspace's middle along x, and away from the hole.
     """
     hand, axis = world.ee.rotation, upper_axis(world)
     upright = _upright(axis) @ hand
@@ -203,7 +203,7 @@ def _upright(axis: F64) -> F64:
 
 
 def _free_place(world: World, end: F64) -> F64:
-    """Place on the table to set up a peg, nearest to where its lower end (3,) would be, (3,) [m]."""
+    """Place (3,) [m] on the table to set the peg up, nearest to where its lower end (3,) would be."""
     x, y, _ = end.tolist()
     middle = world.scene.robot.workspace.centre[0]
     at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])
@@ -215,7 +215,7 @@ def _free_place(world: World, end: F64) -> F64:
 def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
     """Return the remaining motion if the hand turns with the peg to a rotation (3, 3).
 
-    to: gives the target of the peg's lower end from where the turn alone would bring it, (3,) [m].
+    to: returns the target of the peg's lower end, given where the turn alone would bring it, (3,) [m].
     """
     ee, peg = world.ee, world.pose(PEG)
     turn = rotation_vector(rotation @ ee.rotation.T)
@@ -302,7 +302,7 @@ def _at_grip(world: World) -> bool:
 
 
 def _approach(world: World) -> Target:
-    """Move over the grip and down to it, fingers open; straight up if too low beside it."""
+    """Move over the grip and down to it, fingers open; a hand too low beside it only rises."""
     grip = grip_of(world)
     x, y, z = grip.position
     height = grip.height if grip.open_enough else max(grip.height, OVER)

@@ -71,7 +71,7 @@ class PickPlace:
         return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label (as it lies, a mesh is too wide or too low for the gripper), or ""."""
+        """Return why there is no sound label (the mesh, as it lies, is too wide or too low for the gripper), or ""."""
         if lie_of(world, OBJECT).fits or held(world, OBJECT):
             return ""
         return f"{OBJECT} lies on a side on which it is too low or too wide for the gripper"
@@ -112,7 +112,7 @@ def observe_object(world: World, name: str) -> Observed:
             f"{name}.tilt": lie.tilt,
             f"{name}.width": world.extents(name)[0],
         }
-    else:  # by its narrowest grasp, so that the numbers change continuously as it turns
+    else:  # numbers of the narrowest grasp change continuously as the object turns
         yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
         seen = {
             f"{name}.folds": float(lie.folds),

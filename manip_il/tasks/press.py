@@ -39,7 +39,7 @@ def _off(world: World) -> float:
 
 
 def _aim(world: World) -> Target:
-    """Go over the button, lower as the hand gets nearer, and press beyond its stop once over it."""
+    """Go over the button, descending on the way; once above it, press beyond its stop."""
     off = _off(world)
     x, y, _ = world.pose(BUTTON).position
     height = min(HOVER, SLOPE * max(0.0, off - OVER)) if off > OVER else -TRAVEL - DEEPER

@@ -103,7 +103,7 @@ def _pushes(world: World) -> bool:
 
 
 def _low_enough(world: World, behind: float) -> float:
-    """Height below which a hand pushes, by its distance behind the puck's middle [m]."""
+    """Height of `ee` below which a hand pushes [m]. behind: the hand's distance behind the puck's middle [m]."""
     style = _style(world)
     apart = min(1.0, max(0.0, (behind - style.touching) / (style.behind - style.touching)))
     return world.robot.ee.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
@@ -123,7 +123,7 @@ def _push(world: World) -> Target:
 
 
 def _around(world: World) -> Target:
-    """Move behind the puck: over it, and lower as the hand gets nearer; straight up if too low beside it."""
+    """Move over the puck to behind it, descending on the way; a hand too low beside it only rises."""
     hand, to = _hand(world), _place_behind(world)
     off = math.hypot(*(to - hand[:2]))
     height = world.robot.ee.lowest + LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))

@@ -30,7 +30,7 @@ SENTENCES = (
     "The {colour} cube goes into the {colour} bin.",
 )
 INSIDE = (0.046, 0.068)  # half a bin's inner length and width [m]
-_IN_ROW = 1e-6  # bins farther from their place in the row were moved [m]
+_IN_ROW = 1e-6  # distance from its place in the row beyond which a bin was moved [m]
 PITCH = 0.105  # spacing of the bins, which stand in a row away from the robot [m]
 SIDE = 0.19  # offset of the row from the workspace's middle, left or right [m]
 SHIFT = 0.08  # largest shift of cubes and bins along x, to where the arm reaches farthest to both sides [m]
@@ -43,7 +43,7 @@ STEP = 0.1  # how far the target runs ahead of the carrying hand: a fast hand dr
 SLOPE = 5.0  # slope of the path around other bins: distance from the row per distance along it
 NEAR_WALL, BY_WALL = 0.045, 0.065  # distances from a wall, in a bin and beside it, below which fingers lack room [m]
 NARROW = 0.024  # opening beyond the width of a cube near a bin's wall [m]
-TURNED = 0.3  # angle to the grasp near a wall above which the hand stays over the cube [rad]
+TURNED = 0.3  # near a wall: angle to the grasp beyond which the hand stays over the cube [rad]
 _HIGH = 0.04  # clearance of a cube that is carried across a bin's walls [m]
 _WRONG = 0.1  # error for each other cube in a bin [m]
 
@@ -79,7 +79,7 @@ def _to(world: World) -> F64:
 
 
 def _carry_progress(world: World) -> float:
-    """Progress by the distance left around the other bins and the missing height, 0 to 1."""
+    """Progress, 0 to 1, by the distance left around the other bins and the height still to gain."""
     along, across, up = (_place(world) - world.pose(asked(world)).position).tolist()
     lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))
     return nearness(abs(along) + abs(across) + max(0.0, up + lift))
@@ -130,7 +130,7 @@ def _approach(world: World, name: str, hover: float) -> Target:
 
 
 def _middle(world: World) -> tuple[float, float]:
-    """Middle of cubes and bins [m], such that a dropped cube falls where it can be picked up."""
+    """Middle (x, y) [m] of cubes and bins, chosen so that the arm can also pick up a dropped cube."""
     x, y = world.scene.robot.workspace.centre
     line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
     shifts = [
@@ -143,7 +143,7 @@ def _middle(world: World) -> tuple[float, float]:
 
 
 def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) -> F64:
-    """Draw a resting place of a cube, (3,) [m], away from the bins on a side (-1 or 1)."""
+    """Draw a cube's resting place, (3,) [m], away from the bins. side: where the bins are, -1 (right) or 1 (left)."""
     (x, y), wide = _middle(world), world.scene.robot.workspace.half_width
     along, across = rng.uniform(-1, 1) * wide, side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
     return np.array([x + along, y + across, resting_height(world, name)])
@@ -179,7 +179,7 @@ class Sort:
         return (asked(world),)
 
     def unsound(self, world: World) -> str:
-        """Return "the bins do not stand in a row" if they were drawn one by one, else ""."""
+        """Return "the bins do not stand in a row" if some bins were moved without the others, else ""."""
         bins = np.array(sorted(world.pose(one).position.tolist() for one in BINS.values()))
         row = bins[0] + np.outer(np.arange(len(bins)), [PITCH, 0.0, 0.0])
         return "" if np.abs(bins - row).max() < _IN_ROW else "the bins do not stand in a row"

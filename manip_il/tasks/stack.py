@@ -22,7 +22,7 @@ ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # tolerances on the base: sideways, in h
 LEANS_Z, LEANS = 0.008, 0.3  # the same for a cube in a leaning hand: in height [m]; tilt [rad]
 OVER_BASE = LiftProfile(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # carried cube over its place
 PRESS = 0.01  # how far below the base's top the cube is aimed, so that it makes contact [m]
-AWAY, AWAY_ENOUGH = 0.06, 0.035  # heights of the hand over the stack: target after release, and least that is away [m]
+AWAY, AWAY_ENOUGH = 0.06, 0.035  # heights of the hand over the stack: target after release; least to count as away [m]
 APART = 0.09  # least distance between cubes at the start [m]
 ROOM = 0.05  # reachable margin around each cube at the start [m]
 _HAND = 0.05  # error added while the hand is at the cube [m]
@@ -100,7 +100,7 @@ class Stack:
         }
 
     def error(self, world: World) -> float:
-        """Return how far the cube is from its place on the other [m], plus 0.05 m until it stands without the hand."""
+        """Return the cube's distance from its place on the base [m], plus 0.05 m until it stands without the hand."""
         off = math.dist(world.pose(TOP).position, place_on_base(world))
         return off + (0.0 if stands(world) and _hand_is_away(world) else _HAND)
 

@@ -53,7 +53,7 @@ def _upright(down: F64) -> F64:
 
 
 def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
-    """Axes (0 to 2) that may point up when the object rests; of axes with the same length, one."""
+    """Axes (0 to 2) that may point up when the object rests; axes of the same length count once."""
     if kind in (_SPHERE, _CAPSULE):
         return [0]
     return [axis for axis in range(3) if lengths[axis] not in lengths[:axis] or (kind != _BOX and axis == 2)]
@@ -67,7 +67,7 @@ def draw_resting(rng: np.random.Generator, world: World, name: str, room: float 
 def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
     """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's start.
 
-    room: margin around the place that must be within reach, too [m], so that a knocked object stays within reach.
+    room: margin around the place [m] that must also be within reach, so that a knocked object stays within reach.
     """
     space = world.scene.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
@@ -119,7 +119,7 @@ def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World
 def draw_together(
     draw: Callable[[str], F64], names: Iterable[str], fits: Callable[[F64, Sequence[F64]], bool], world: World
 ) -> list[F64]:
-    """Draw one place (3,) [m] per name, each to fit with the earlier ones; if none is found, draw all of them again.
+    """For each name draw a place (3,) [m] that fits the earlier places; if none is found, draw all places again.
 
     Raises `UsageError` after a thousand attempts.
     """

@@ -30,7 +30,7 @@ from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
 
 SUFFIX = ".py"
-GROUP = "manip_il.tasks"  # entry points: a name, and a class that is a task
+GROUP = "manip_il.tasks"  # entry-point group: maps a task's name to its class
 _MEMBERS = (
     *("name", "instruction", "limits", "objects", "grasped", "sizes", "rungs"),
     *("build", "draw", "observe", "error", "progress"),
@@ -54,8 +54,8 @@ TASKS: dict[str, Task] = {
 def get_task(name: str, shape: str = "") -> Task:
     """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or by the path of its Python file.
 
-    shape: of its object, as `Shape.parse` reads it; empty for the task's own. Raises `UnknownName`; `UsageError` for a
-    file without a task, or for an argument or a shape that is invalid or that the task does not take.
+    shape: the object's, as `Shape.parse` reads it; empty for the task's default. Raises `UnknownName`; `UsageError` for
+    a file without a task, or for an argument or a shape that is invalid or that the task does not take.
     """
     if name.endswith(SUFFIX):
         task = _of_file(Path(name).absolute())[0]
@@ -121,7 +121,7 @@ def _of_file(path: Path) -> tuple[Task, bytes]:
         raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
     name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None  # its suffix is Python's
+    assert spec is not None  # because the path ends in `.py`
     assert spec.loader is not None
     text, module = path.read_bytes(), importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
@@ -134,7 +134,7 @@ def _of_file(path: Path) -> tuple[Task, bytes]:
     tasks = [one for one in own if hasattr(one, "rungs") and not one.__name__.startswith("_")]
     if len(tasks) != 1:
         found = ", ".join(one.__name__ for one in tasks) or "none"
-        raise UsageError(f"{path} has the tasks {found}; expected exactly one class with `rungs` (docs/new-task.md)")
+        raise UsageError(f"tasks in {path}: {found}; expected exactly one class with `rungs` (docs/new-task.md)")
     task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
     if task.name in TASKS:
         raise UsageError(f"{path}: its task has a built-in task's name, {task.name!r}; choose another")

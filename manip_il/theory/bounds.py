@@ -1,9 +1,9 @@
 """Losses of cloning and DAgger over the horizon, compared with the bounds of two theorems.
 
 Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross & Bagnell 2010).
-Theorem 8.2: one that errs in a share eps of its own states loses at most u H eps; u is the largest cost of one wrong
-step if the expert then drives (Ross et al. 2011, Theorem 2.2; where the bound is stated as H eps, its constant includes
-u). The theorems' numbers are those of the course, docs/course. Rewards are 0 to 1 per step. Policies are fitted to
+Theorem 8.2: a policy that errs in a share eps of its own states loses at most u H eps; u is the largest cost of one
+wrong step if the expert then drives (Ross et al. 2011, Theorem 2.2; a bound stated as H eps hides u in its constant).
+The theorems are numbered as in the course, docs/course. Rewards are 0 to 1 per step. Policies are fitted to
 trajectories; in states without data they take the worst action, as the theorems allow.
 """
 
@@ -132,7 +132,7 @@ def dagger(process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.
 
 
 def _fitted(process: Process, horizon: int, draws: int) -> dict[Learner, F64]:
-    """Policies of both learners after equally many trajectories, which leave about ERROR / H of the states unseen."""
+    """Cloning's and DAgger's policies from equally many trajectories, which leave about ERROR / H of states unseen."""
     rngs = [rng_for(draw, f"trajectories of {horizon} steps, {process.name}") for draw in range(draws)]
     count = int(np.ceil(PLACES * np.log(horizon / ERROR)))
     first = round(count / (1 + ROUNDS / MORE))

@@ -1,6 +1,6 @@
 """Cloning with continuous actions, on linear systems that differ in how an uncorrected error develops.
 
-x' = a x + u + w. The expert u = -k x halves the state in every step. Its demonstrations cover few states beside its
+x' = a x + u + w. The expert u = -k x halves the state in every step. Its demonstrations cover few states off its
 path, so a clone has no feedback there, and an error develops as in the open loop: it decays if the open loop is stable,
 as for an arm whose servos hold joint targets, and grows exponentially otherwise. Simchowitz et al. (2025) prove
 exponential growth for smooth deterministic imitators in general. Noise on the demonstrations, which makes the expert
@@ -28,7 +28,7 @@ _LATE = 10  # the growth is measured over this many final steps
 
 @dataclass(frozen=True)
 class Drift:
-    """Distance between a clone's and the expert's states. pole: the system's a.
+    """Distance between a clone's and the expert's states. pole: a in the module's x' = a x + u + w.
 
     noise: standard deviation of the noise on demonstrated actions. error: root mean square error of the clone's
     actions in the expert's states; apart: root mean square distance from the expert's states after each step, (STEPS,).

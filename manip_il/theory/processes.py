@@ -1,6 +1,7 @@
 """Processes small enough to be solved exactly, which differ in what one wrong step costs if the expert then drives.
 
-A policy is an array (H, S): the probability of a wrong action at each step in each state. Several are (..., H, S).
+A policy is an array (H, S): the probability of a wrong action at each step in each state. Several policies
+are (..., H, S).
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ class Process:
     """S states and two actions; the expert always takes `RIGHT`. Rewards are 0 to 1 per step.
 
     words: what a wrong action does. moves: transition probabilities (action, from, to), (2, S, S), uniform over the
-    successors. rewards: (2, S). start: distribution of the first state, (S,). slopes: for cloning and DAgger, the power
-    of the horizon with which gap over error grows, according to the theorems.
+    successors. rewards: (2, S). start: distribution of the first state, (S,). slopes: powers of the horizon with which
+    gap over error grows according to the theorems, for cloning and for DAgger.
     """
 
     name: str
@@ -88,7 +89,7 @@ class Process:
 
 
 def _walk(back: bool) -> tuple[F64, F64, F64]:
-    """A random walk over `PLACES`, and one state beside them that a wrong action leads to.
+    """A random walk over `PLACES` states, and one state beside them that a wrong action leads to.
 
     back: whether the right action leads back from there.
     """
@@ -102,7 +103,7 @@ def _walk(back: bool) -> tuple[F64, F64, F64]:
 
 
 def _ring() -> tuple[F64, F64, F64]:
-    """`PLACES` in a ring: the right action moves one or two forward, the wrong one back; the expert visits them all."""
+    """A ring of `PLACES` states, all visited by the expert: right actions move 1 or 2 forward, wrong ones back."""
     on = (np.roll(np.eye(PLACES), 1, axis=1) + np.roll(np.eye(PLACES), 2, axis=1)) / 2
     rewards = np.stack([np.ones(PLACES), np.zeros(PLACES)])
     return np.stack([on, on.T]), rewards, np.full(PLACES, 1 / PLACES)

@@ -53,7 +53,7 @@ class Theory:
 
 
 def slope_table(theory: Theory) -> Table:
-    """Return a table of the log-log slopes of gap over error, one row per process."""
+    """Return a table of the log-log slopes of gap over error against the horizon, one row per process."""
     rows = []
     for process in PROCESSES:
         cloned, improved = (theory.by_name[process.name, learner] for learner in ("cloning", "DAgger"))

@@ -17,7 +17,7 @@ function keep() {
 
 function recall() {
   try {
-    localStorage.setItem(key + " probe", "");  // another key: right after a reload, saved answers may not be here yet
+    localStorage.setItem(key + " probe", "");  // not `key`: after a reload, its saved answers may not have loaded yet
     localStorage.removeItem(key + " probe");
   } catch {
     keeps = false;

@@ -61,7 +61,7 @@ def _links(shape: tuple[int, int, int]) -> _Links:
 class Grid:
     """Nodes of a layout's free space, each joined to the 26 around it.
 
-    shape: nodes along x, y and z; origin (3,) [m] and cell [m]; goal: number of the node at the goal.
+    shape: node counts along x, y and z; origin: first node's place (3,) [m]; cell: spacing [m]; goal: its node number.
     """
 
     def __init__(self, layout: Layout, robot: Robot):
@@ -138,8 +138,8 @@ class Grid:
     def snap(self, positions: F64) -> I64:
         """Return a path of free nodes, (n,), each joined to the next, that follows positions (T, 3) [m].
 
-        If the positions lie on a straight line, it is no longer than the shortest path in the grid. Gaps without free
-        nodes are bridged by the shortest path. If the positions end near the goal, it is extended to the goal.
+        If the positions lie on a straight line, the path is no longer than the shortest path in the grid. Gaps without
+        free nodes are bridged by the shortest path. If the positions end near the goal, the path is extended to it.
         """
         dense = _dense(positions, self.cell / 4)
         index = np.round((dense - self.origin) / self.cell).astype(np.int64).clip(0, np.array(self.shape) - 1)
@@ -186,11 +186,11 @@ class Descent:
     weights: F64
 
     def leads(self, position: F64) -> bool:
-        """Return whether a path leads to the goal from nodes near a position (3,) [m]."""
+        """Return whether a path leads to the goal from any node near a position (3,) [m]."""
         return len(self._around(position)) > 0
 
     def _around(self, position: F64) -> I64:
-        """Nodes with a path within `AHEAD` cells of a position (3,) [m]; if there are none, the nearest, (n,)."""
+        """Numbers (n,) of nodes with a path: those within `AHEAD` cells of a position (3,) [m], else the nearest."""
         nodes = self.grid.near(position)
         nodes = nodes[np.isfinite(self.costs[nodes])]
         if len(nodes):

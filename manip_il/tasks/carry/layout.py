@@ -1,4 +1,4 @@
-"""Layouts of `carry`, as pure geometry: what stands on the table; and rewards: what a metre of path costs there.
+"""Layouts of `carry`: what stands on the table, as pure geometry. Rewards: what a metre of path costs there.
 
 Paths are those of the carried object's centre. Features are densities per metre of path, functions of a point alone;
 for a path of points, or an edge of the grid, they are integrated along it. A reward has a weight for each feature.
@@ -170,7 +170,7 @@ class Reward:
 
     @classmethod
     def of(cls, weights: Mapping[str, float]) -> Reward:
-        """Return a reward from weights by feature; those left out are 0. Raises `UnknownName` for unknown ones."""
+        """Return a reward from weights by feature, 0 by default. Raises `UnknownName` for an unknown feature."""
         for name in weights:
             if name not in FEATURES:
                 raise UnknownName("feature", name, FEATURES)
@@ -178,7 +178,7 @@ class Reward:
 
     @classmethod
     def parse(cls, text: str) -> Reward:
-        """Return the reward that a text describes: a shipped one's name, a `reward.json`, or `NAME=NUMBER,...`.
+        """Return the reward that a text describes: the name of a shipped one, a `reward.json`, or `NAME=NUMBER,...`.
 
         Only the lists `names` and `weights` of a file are read. Raises `UsageError` for anything else.
         """

@@ -38,7 +38,7 @@ _LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle
 
 
 def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add every obstacle with its contact box, the table's edge, and mocap bodies whose positions are the weights."""
+    """Add every obstacle with its contact box, the table's edge, and mocap bodies whose positions hold the weights."""
     for name, obstacle in OBSTACLES.items():
         body = add_furniture(spec, name)
         body.pos = [0.5, 0, -PARKED]
@@ -96,7 +96,7 @@ def layout_of(world: World, name: str) -> Layout:
 def make_layout(
     scene: Scene, lengths: Sequence[float], goal: F64, places: Mapping[str, F64], edge: tuple[F64, F64] | None
 ) -> Layout:
-    """Return the layout of an object of lengths (3,) [m], a goal (3,) [m], places of obstacles (3,) [m], and an edge.
+    """Return the layout for an object of lengths (3,) [m], a goal (3,) [m], places of obstacles (3,) [m], and an edge.
 
     edge: a point on it (3,) [m] and the direction away from the table, (3,).
     """
@@ -196,7 +196,7 @@ def _box(points: F64, axes: F64) -> Box:
 
 
 def fits(hand: HandShape, at: F64, yaw: float, layout: Layout) -> bool:
-    """Return whether a downward hand with `ee` at (3,) [m] and a yaw [rad] is clear of a layout's obstacles."""
+    """Return whether a downward hand, `ee` at a place (3,) [m] and a yaw [rad], is clear of a layout's obstacles."""
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])  # the hand's x and y
     for _, middle, half, height in layout.boxes:
         for box in hand.boxes:

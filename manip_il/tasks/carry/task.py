@@ -57,7 +57,7 @@ _SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # sides that the edge may be on:
 
 
 def descent_of(world: World) -> Descent:
-    """Return the costs-to-go of a world's episode, and their descent."""
+    """Return the costs-to-go of a world's episode, as a `Descent` to the goal."""
     return descent(layout_of(world, OBJECT), reward_in(world), world.scene.robot)
 
 
@@ -96,7 +96,7 @@ def _rise(world: World) -> float:
 
 
 def _approach(world: World, name: str, hover: float) -> Target:
-    """Approach as for any object, but above all obstacles until the hand is over it."""
+    """Approach as for any object, but above all obstacles until the hand is over the object."""
     return approach(world, name, hover, _rise(world))
 
 
@@ -201,7 +201,7 @@ def _draw_goal(rng: np.random.Generator, world: World, at: F64) -> F64:
 
 
 def _has_way(world: World, at: F64, goal: F64) -> bool:
-    """Whether a goal is far enough from the object, and the hand can carry it there over any obstacles."""
+    """Whether a goal is far enough from the object, and the hand can carry the object there over any obstacles."""
     scale = scale_of(world.scene)
     if math.dist(at[:2], goal[:2]) < APART * scale or not world.reach.has(goal):
         return False
@@ -214,9 +214,9 @@ def _has_way(world: World, at: F64, goal: F64) -> bool:
 def _draw_obstacles(
     rng: np.random.Generator, world: World, here: Sequence[str], at: F64, goal: F64
 ) -> dict[str, tuple[F64, F64]]:
-    """Draw the places of the obstacles present, beside an object at (3,) with a goal (3,) [m].
+    """Draw the places of the obstacles in `here`, clear of the object's place `at` (3,) and its goal (3,) [m].
 
-    Return the poses of all obstacles, empty if they do not fit.
+    Return the poses of all obstacles and the edge, or an empty dict if they do not fit.
     """
     scene, lengths = world.scene, world.extents(OBJECT)
     x, y = scene.robot.workspace.centre

@@ -32,7 +32,7 @@ def always(read: object) -> bool:
 class StockBase:
     """An environment of another package, under this program's interface; reset and step are that package's."""
 
-    world: ClassVar[None] = None  # its expert restores states itself
+    world: ClassVar[None] = None  # a stock expert restores states itself
     actions: ActionSpace
     model: mujoco.MjModel
     data: mujoco.MjData

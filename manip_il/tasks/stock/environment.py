@@ -20,7 +20,7 @@ from manip_il.tasks.stock.table import STATE_NAMES, STOCK, TOLERANCE, StockTask
 
 
 class StockActions(ActionSpace):
-    """Actions [dx, dy, dz, fingers] in [-1, 1]; they do not depend on the state."""
+    """Actions [dx, dy, dz, fingers], each in [-1, 1] in every state."""
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
         """Draw any action, (4,), whatever the state (4,) is."""
@@ -32,7 +32,7 @@ ACTIONS = StockActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]
 
 
 class StockEnv(StockBase):
-    """An environment of gymnasium-robotics. task: its name."""
+    """An environment of gymnasium-robotics. task: the environment's name there."""
 
     actions = ACTIONS
 

@@ -21,7 +21,7 @@ StockLabeller = StockExpert | AlohaExpert
 def make_stock(
     robot: str, task: str, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
 ) -> StockEnvironment:
-    """Make a stock environment. Raises `UsageError` for a camera that it lacks, or a condition with any range."""
+    """Make a stock environment. Raises `UsageError` for a camera that it lacks, or a condition that has ranges."""
     check_cameras(robot, cameras)
     if changed := [one.name for one in conditions if one.ranges]:
         raise UsageError(

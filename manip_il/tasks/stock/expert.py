@@ -29,7 +29,7 @@ OPENING = 0.25  # extra opening needed per distance of the cube in x, a ratio
 LEAD = 0.04  # largest lead of the gripper in y towards the goal while the fingers close [m]
 CLOSED_ON = 0.03  # distance to the grasp at which that lead begins [m]
 GRASPED = np.array([0.03, 0.026, 0.04])  # largest offset from the cube in x, y, z if the fingers hold it [m]
-HELD = 0.054  # opening below which the fingers hold it [m]
+HELD = 0.054  # opening below which the fingers hold the cube [m]
 
 # Push
 BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half sides of the area blocked to the gripper's middle by the cube [m]
@@ -37,7 +37,7 @@ CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]  #
 LOW, HIGH = 0.012, 0.05  # heights of the gripper over the cube's middle, to push it and to pass over it [m]
 AHEAD = 0.004  # gap between gripper and cube on arrival behind it [m]
 ALONG, ACROSS, BELOW = 0.028, 0.021, 0.03  # offsets from the place behind the cube within which the gripper pushes [m]
-LOOK = 0.003  # time by which the pushed cube's motion is predicted [s]
+LOOK = 0.003  # how far ahead the pushed cube's motion is predicted [s]
 DECELERATION = 9.0  # deceleration of a cube that slides on the table [m/s^2]
 AT_GOAL = 0.05  # [m]
 CENTRING = 0.35  # share of the distance to the line through cube and goal that the gripper corrects in a step
@@ -67,7 +67,7 @@ def _between(env: StockEnv) -> bool:
 
 
 def _grasp(env: StockEnv) -> tuple[F64, float]:
-    """Go to the cube, leading towards the goal as it gets nearer, so that a finger takes it along."""
+    """Go to the cube; close to it, lead towards the goal, so that a finger takes the cube along."""
     way = _to_grasp(env)
     share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
     way[1] += share * np.clip(env.goal[1] - env.object[1], -LEAD, LEAD)

@@ -61,7 +61,7 @@ ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  #
 class Held:
     """Half gaps between the fingers for one object [m]. open: smallest that clears it; thin: smallest that holds it.
 
-    long: whether the object's own x axis is its long one.
+    long: whether the object is longest along its own x axis.
     """
 
     open: float
@@ -73,7 +73,7 @@ class Held:
 class AlohaTask:
     """One task of `gym_aloha`. own: its name there. grasped: the hand that takes each object.
 
-    inserted: an object and the one that it goes into.
+    inserted: an object, and the object that it goes into; empty if nothing is inserted.
     """
 
     name: str
@@ -155,7 +155,7 @@ ROBOTS = {
         ALOHA_NAMES,
         TWO_ARMS,
         400,  # as in LeRobot's environment; the one registered with gymnasium has 300
-        {"control_hz": 50, "tolerance": TOLERANCE, "success_steps": 1},  # its own reward shows when it is solved
+        {"control_hz": 50, "tolerance": TOLERANCE, "success_steps": 1},  # the reward shows when it is solved
         OTHERS,
         ends_solved=True,
     ),

@@ -29,8 +29,8 @@ _DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
 _ANEW = 0.6  # chance that an untouched object gets a new place; otherwise a hand reaching for it stays near it
 _DROPPED, _FALL = 0.1, 30  # chance that a hand drops what it carries; most control steps after it has opened
 _STAYS, _ELSEWHERE = 0.4, 0.08  # chance that an arm stays; largest standard deviation of its joints if not [rad]
-_COARSE = 240  # height up to which simpler meshes are drawn [pixels]: 2 % of the pixels change by over 8 of 255
-_CELL, _SHADOWS = 0.004, 1024  # least size of such a mesh's cell [m]; size of the shadow map [pixels]
+_COARSE = 240  # picture height up to which meshes are simplified [pixels]; 2 % of pixels change by over 8 of 255
+_CELL, _SHADOWS = 0.004, 1024  # least cell size of simplified meshes [m]; size of the shadow map [pixels]
 _BLANK = np.zeros((1, 1, 3), np.uint8)
 
 
@@ -45,7 +45,7 @@ class AlohaActions(ActionSpace):
 
 
 class AlohaEnv(StockBase):
-    """An environment of `gym_aloha`. task: its name. cameras: those drawn in every step.
+    """An environment of `gym_aloha`. task: a key of `ALOHA_TASKS`. cameras: rendered in every step.
 
     Raises `ManipError` if the package is not installed.
     """

@@ -17,7 +17,7 @@ from manip_il.robots.rotations import angle_between, turned_towards
 from manip_il.tasks.stock.base import StockRung, always
 from manip_il.tasks.stock.table import SIDES, AlohaTask, Held
 
-FINGER_AT_TOUCH = 0.0224  # finger joint position at which the two would touch [m]
+FINGER_AT_TOUCH = 0.0224  # position of a finger joint at which the fingers would touch [m]
 GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
 AROUND = (0.010, 0.012, 0.010)  # largest offset from that place to begin closing, in the hand's axes [m]
 HELD_AROUND = (0.020, 0.022, 0.020)  # the same while closing or holding [m]
@@ -42,7 +42,7 @@ MOST_TURN = 0.3  # largest turn of an object in a step [rad]
 class Hand:
     """One hand: its position (3,) [m], axes (ahead, across, up) (3, 3), and half the gap between its fingers [m].
 
-    q: joints of its arm, (6,) [rad]. outward: its axis across, (3,), when it reaches straight for the table's middle.
+    q: joints of its arm, (6,) [rad]. outward: its across axis, (3,), if the arm reaches straight to the table's middle.
     """
 
     position: F64

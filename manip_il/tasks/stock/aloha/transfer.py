@@ -79,7 +79,7 @@ class Transfer(AlohaScene):
 
     @cached_property
     def to_go(self) -> float:
-        """Distance of the cube from the handover [m]."""
+        """Distance of the cube from the place of the handover [m]."""
         return float(np.linalg.norm(self.cube - MEETING))
 
 
