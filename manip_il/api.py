@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,6 +32,7 @@ from manip_il.evaluation.runner import evaluate as run_episodes
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.seeding import stream_base, stream_seeds
+from manip_il.sim.conditions import NOMINAL
 from manip_il.tasks.config import EnvConfig, make_config
 
 Policy = Checkpoint | Path
@@ -59,8 +60,8 @@ def record(
     driver = RolloutJob.driver if policy is None else PolicyDriver((_folder(policy),), beta)
     chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)} | options
     job, journals = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals")
-    if root.exists() or journals.exists():
-        raise FolderExistsError(root)
+    if found := next((one for one in (root, journals) if one.exists()), None):
+        raise FolderExistsError(found)
     recording = Recording("local/recorded", provenance=provenance(job), only_labelled=not job.labels_all)
     with Engine(workers) as engine:
         if policy is None:
@@ -145,19 +146,23 @@ def evaluate(
     driver = RolloutJob.driver if path is None else PolicyDriver((path,))
     chosen: dict[str, Any] = {"hold": episode_hold(env), "label": "last"} | options
     job = RolloutJob(env, driver, **chosen)
+    suite = "_".join(one.name for one in job.conditions) or NOMINAL.name
     with Engine(workers) as engine:
-        return run_episodes(engine, job, stream_seeds(stream, episodes, seed), str(path or "expert"))
+        return run_episodes(engine, job, stream_seeds(stream, episodes, seed), str(path or "expert"), suite=suite)
 
 
 def _check_same(path: Path, config: RunConfig) -> None:
-    """Raise `MismatchError` if a run began with options other than `config` (`rounds`, `fit` aside); then write it."""
+    """Raise `MismatchError` if a run began with options other than `config`; then write it.
+
+    `rounds` may differ, and those options of the fit that change no result.
+    """
     now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
-    del now["fit"]  # some of its options may change, such as `log_freq`
+    now["fit"] = {one.name: now["fit"][one.name] for one in fields(FitConfig) if not one.metadata.get("free")}
     has_begun = any(path.parent.glob("round_*"))
     before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
     for key in now:
-        if before.get(key) != now[key]:
-            raise MismatchError(key, str(path.parent), before.get(key), "this call", now[key])
+        if key in before and before[key] != now[key]:  # earlier versions did not store the fit
+            raise MismatchError(key, str(path.parent), before[key], "this call", now[key])
     write_json(path, now)
 
 

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,17 @@ def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError) ->
         return path.read_bytes()
     except OSError as error:
         raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
+
+
+def check_unchanged(path: Path) -> None:
+    """Raise `UsageError` if a file was edited since the first call: a process reads a task, robot or mesh only once."""
+    if path.is_file() and path.read_bytes() != _first_bytes(path.absolute()):
+        raise UsageError(f"{path} was edited after this process had read it; start Python again")
+
+
+@cache
+def _first_bytes(path: Path) -> bytes:
+    return path.read_bytes()
 
 
 def without_link(path: str, flags: int) -> int:

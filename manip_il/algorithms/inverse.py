@@ -165,8 +165,8 @@ def open_line(found: Inverse) -> str:
     if not found.open_names:
         return ""
     return (
-        f"All demonstrations agree in {', '.join(found.open_names)}, so these weights are not identified. The reward "
-        "omits them, and plans with 0 instead."
+        f"No demonstration differs from its alternatives in {', '.join(found.open_names)}, so these weights are not "
+        "identified. The reward omits them, and plans with 0 instead."
     )
 
 

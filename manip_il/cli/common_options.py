@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, Open, given
@@ -46,16 +45,17 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
 _FILES = (".py", ".yaml", ".yml")  # suffixes of files with a user's own task or robot
 
 
-def env_options(env: EnvConfig) -> str:
-    """Return as text those options of an environment that no dataset or policy stores: paths, and changed limits."""
+def env_options(env: EnvConfig) -> list[str]:
+    """Return those options of an environment that no dataset or policy stores: paths, and changed limits."""
     named = {"robot": env.robot, "task": env.task}
     try:
         usual = make_config(env.robot, env.task, env.control_hz, object=env.object)
     except ManipError:  # the user's file was edited or deleted meanwhile
         usual = env
     limits = [name for name in ("tolerance", "horizon", "success_steps") if getattr(env, name) != getattr(usual, name)]
-    paths = "".join(f" --{what}.type={quote(name)}" for what, name in named.items() if name.endswith(_FILES))
-    return paths + "".join(f" --env.{name}={getattr(env, name):g}" for name in limits)
+    paths = [f"--{what}.type={name}" for what, name in named.items() if name.endswith(_FILES)]
+    paths += [f"--task.object={env.object}"] if env.object.startswith("mesh:") else []
+    return paths + [f"--env.{name}={getattr(env, name):g}" for name in limits]
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:

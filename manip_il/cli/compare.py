@@ -101,15 +101,19 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
         """Run the missing runs and evaluations, compare, print and write the result."""
         match self.sides:
             case [file] if file.suffix in _YAML:
-                plain = CompareOptions(sides=self.sides)
-                for name in ("eval", "checkpoint", "at", "env"):
-                    if getattr(self, name) != getattr(plain, name):
-                        raise UsageError(f"options of {name} cannot be combined with a study; set them in {file}")
+                self._refuse(f"cannot be combined with a study; set them in {file}", "eval", "checkpoint", "at", "env")
                 self._run_study(file)
             case [left, right]:
                 self._compare(left, right)
             case _:
                 raise UsageError(f"{len(self.sides)} sides are given; expected two, or the YAML file of one study")
+
+    def _refuse(self, why: str, *names: str) -> None:
+        """Raise `UsageError` for options that have no effect, if they are given."""
+        plain = CompareOptions(sides=self.sides)
+        for name in names:
+            if getattr(self, name) != getattr(plain, name):
+                raise UsageError(f"options of {name} {why}")
 
     def _run_study(self, path: Path) -> None:
         from manip_il.evaluation.arm import read_arm, select_rounds
@@ -142,6 +146,7 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
         first, *others = [member for arm in both for member in arm.members]
         trial = None if first.result else self._trial(self._env(both), both, self.eval.n_episodes)
         if trial is None:
+            self._refuse("change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
             _ = Study(both, both[0].name, rule).comparisons  # raises unless they can be compared
             for other in others:
                 warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
@@ -157,7 +162,8 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
         given = {name: value for name, value in self.env.items() if value is not None}
         members = [member for arm in arms for member in arm.members]
         if runs := [member for member in members if member.history]:
-            return require_same_env({run.name: replace(run.env(given.get("task")), **given) for run in runs})
+            own = given.pop("task", None), given.pop("object", None)
+            return require_same_env({run.name: replace(run.env(*own), **given) for run in runs})
         origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
         return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.config import ALGORITHMS, Method, RunConfig, check_labels
 from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trusting, Varied, env_config, env_options
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.progress import Stages, say, say_next
 from manip_il.data.atomic import write_json
 from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.suites import varied
@@ -54,7 +53,7 @@ class DaggerOptions(Varied, Trusting):
         "steps in which the expert is queried: every, one (per episode), probability:P, ensemble:BOUND, safety:BOUND; "
         "by default every; for --label=takeover: one; for --label=branch: probability:1/BRANCH_STEPS",
     )
-    fit: Given = given(FitConfig, prefix="", only=_OF_FIT)
+    fit: Given = given(FitConfig, prefix="", only=_OF_FIT, fixed=("steps",))
     image: Given = given(CameraConfig, **SMALL)
     engine: EngineOptions = group(EngineOptions(), prefix="")
     output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")
@@ -72,8 +71,7 @@ class DaggerOptions(Varied, Trusting):
         if (folder / "dataset").is_dir():
             say(f"labels of all rounds as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
-        words = f"--policy.path={quote(str(best))}{env_options(config.env)} --output_dir={quote(f'{folder}/test')}"
-        say(f"next: manip-il eval {words}")
+        say_next("eval", f"--policy.path={best}", *env_options(config.env), f"--output_dir={folder}/test")
 
     def config(self) -> RunConfig:
         """Return the configuration of the run; raises if options contradict each other, or do not fit the inputs."""

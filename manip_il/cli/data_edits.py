@@ -38,7 +38,7 @@ class BuildOptions(Replacing):
         """Build the dataset."""
         from manip_il.data.build import build
 
-        require_replaceable(self.dataset, self.overwrite)
+        require_replaceable(self.dataset, self.overwrite, [self.journals])
         with exclusive(self.dataset):
             info, failed = build(self.journals, self.dataset, replace=self.overwrite)
         say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.algorithms.config import RunConfig
@@ -14,7 +13,7 @@ from manip_il.cli.common_options import EngineOptions, env_options
 from manip_il.cli.dagger import DaggerOptions, run_rounds, write_page
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.progress import Stages, say, say_next
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.tasks.config import EnvConfig
@@ -42,7 +41,7 @@ class DemoOptions:
     first: ClassVar[str] = "robot.type task.type rounds test_episodes output_dir resume"
     env: Given = given(EnvConfig)
     settings: Given = given(RunConfig, prefix="", only=(*RUN, "episodes_per_round", "disturbed_share", "seed"), **RUN)
-    fit: Given = given(FitConfig, prefix="", only=("policy", *FIT), **FIT)
+    fit: Given = given(FitConfig, prefix="", only=("policy", *FIT), fixed=("steps",), **FIT)
     test_episodes: int = option(200, "unseen test episodes, which never select a policy", at_least=1)
     disturbed_episodes: int = option(100, "test episodes that are also run with disturbances", at_least=1)
     engine: EngineOptions = group(EngineOptions(), prefix="")
@@ -72,8 +71,8 @@ class DemoOptions:
         print_table(policy_table(rows))
         say(verdict, *facts)
         say(f"report: {folder / REPORT_FILE}")
-        policy = f"{quote(str(policies[-1]))}{env_options(config.env)}"
-        say(f"next: manip-il eval --policy.path={policy} --eval.films=3 --output_dir={quote(f'{folder}_eval')}")
+        words = f"--policy.path={policies[-1]}", *env_options(config.env), "--eval.films=3"
+        say_next("eval", *words, f"--output_dir={folder}_eval")
 
     def _measure(
         self, config: RunConfig, folder: Path, engine: Engine, stages: Stages

@@ -6,13 +6,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import ResumableOutput, publish
-from manip_il.cli.progress import Stages, say, warn
+from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.option import Seeded, option
@@ -114,8 +113,8 @@ class EvalOptions(Tested, Seeded, Trusting):
                 films = film_outcomes(engine, job, result, self.eval.films, stages)
             self._report(result, folder, *films)
         seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
-        own = f" --task.type={quote(job.env.task)}" if job.env.task.endswith(".py") else ""
-        say(f"next: manip-il eval {quote(str(folder))}{own} --replay={seed} --video=replay.mp4")
+        own = [f"--task.type={job.env.task}"] if job.env.task.endswith(".py") else []
+        say_next("eval", folder, *own, f"--replay={seed}", "--video=replay.mp4")
 
     def _job(self) -> RolloutJob:
         from manip_il.cli.inputs import open_driver

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.cli.common_options import DatasetRoots, EngineOptions, env_options
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.progress import Stages, say, say_next
 from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
@@ -56,8 +55,7 @@ class Learning:
             learning_report(title, found, records, command, to_plain(self)).write(folder / REPORT_FILE)
         best = folder / "best" / "pretrained_model"
         say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
-        words = f"--policy.path={quote(str(best))}{env_options(config.env)} --output_dir={quote(f'{folder}/test')}"
-        say(f"next: manip-il eval {words}")
+        say_next("eval", f"--policy.path={best}", *env_options(config.env), f"--output_dir={folder}/test")
 
     def learning_config(self) -> LearningConfig:
         """Return the configuration of the run; raises if datasets, policy and environment do not fit."""

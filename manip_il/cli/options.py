@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import re
 import shlex
 import sys
 import types
@@ -33,12 +34,15 @@ def group(default: Any, prefix: str | None = None) -> Any:
     return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
 
 
-def given(cls: type, prefix: str | None = None, only: Collection[str] = (), **own: Any) -> Any:
+def given(
+    cls: type, prefix: str | None = None, only: Collection[str] = (), fixed: Collection[str] = (), **own: Any
+) -> Any:
     """Return a field that holds, as a dict (`Given`), those options of the dataclass `cls` that the user gave.
 
-    only: names of fields, by default all. own: defaults that replace those of `cls`; the dict always holds them.
+    only: names of fields, by default all. fixed: those that may not grow when this command is resumed. own: defaults
+    that replace those of `cls`; the dict always holds them.
     """
-    metadata = {"given": cls, "only": only}
+    metadata = {"given": cls, "only": only, "fixed": fixed}
     names = {} if prefix is None else {"prefix": prefix}
     return field(default_factory=functools.partial(dict, own), metadata=metadata | names)
 
@@ -98,8 +102,10 @@ def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, .
             for theirs in dataclasses.fields(source):
                 if "help" in theirs.metadata and theirs.name in (one.metadata["only"] or (theirs.name,)):
                     name = theirs.metadata.get("flag", inner + theirs.name)
-                    own = default.get(theirs.name, default_of(theirs))
-                    found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, theirs.metadata))
+                    own, about = default.get(theirs.name, default_of(theirs)), dict(theirs.metadata)
+                    if theirs.name in one.metadata["fixed"]:
+                        about["grows"] = False
+                    found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, about))
         elif dataclasses.is_dataclass(kind):
             found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
         else:
@@ -121,10 +127,13 @@ def type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
 
 
 def to_plain(options: Any) -> dict[str, Any]:
-    """Return a command's options as a tree of plain YAML values, keyed by option names."""
+    """Return a command's options as a tree of plain YAML values, keyed by option names.
+
+    Omits what concerns one call alone, so that a file made from it never replaces or continues another output.
+    """
     tree: dict[str, Any] = {}
     for one in options_of(type(options)):
-        if not one.metadata.get("command_line_only"):
+        if not one.metadata.get("command_line_only") and one.name not in ("overwrite", "resume"):
             *groups, last = one.name.split(".")
             place = functools.reduce(lambda inner, name: inner.setdefault(name, {}), groups, tree)
             place[last] = _plain(one.value(options))
@@ -193,7 +202,10 @@ def decode(option_type: Any, value: Any) -> Any:
 
 
 def _expand(value: Any) -> Any:
-    return value.expanduser() if isinstance(value, Path) else value  # shells do not expand the tilde in `--root=~/x`
+    """Expand the tilde in a path, such as `~/x`, `carry:~/x` and `mesh:~/x`: shells do so only in a word of its own."""
+    if isinstance(value, str):
+        return re.sub(r"^(\w+:)?~/", lambda found: f"{found[1] or ''}{Path.home()}/", value)
+    return value.expanduser() if isinstance(value, Path) else value
 
 
 def without_none(option_type: Any) -> Any:

@@ -21,7 +21,13 @@ if TYPE_CHECKING:
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
 # File -> text in it that identifies this program's output: only our datasets have an `executed_action`.
-_MARKS = {CONFIG_FILE: CONFIG_HEADER, "meta/info.json": '"executed_action"', "eval.json": '"fingerprint"'}
+_MARKS = {
+    CONFIG_FILE: CONFIG_HEADER,
+    "meta/info.json": '"executed_action"',
+    "eval.json": '"fingerprint"',
+    "manip_il.json": '"action_meaning"',
+    "recording.json": '"only_successes"',
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +75,8 @@ def _inputs(options: Any) -> list[Path]:
         if one.name != "output_dir":
             items = value if isinstance(value, list) else [value]
             found += [Path(item).expanduser() for item in items if isinstance(item, Path) or one.is_open]
+            words = [word for item in items if isinstance(item, str) for word in (item, *item.split(":"))]
+            found += [Path(word) for word in words if word and Path(word).is_file()]  # of a task, a suite, a mesh, ...
     return found
 
 
@@ -120,8 +128,8 @@ def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] =
     files = {folder / name: mark.encode() for name, mark in _MARKS.items() if (folder / name).is_file()}
     if not any(mark in path.read_bytes() for path, mark in files.items()):
         raise UsageError(
-            f"{folder} holds files that manip-il did not make (it has no config.yaml, meta/info.json or eval.json of "
-            "ours); choose another folder, or delete it by hand"
+            f"{folder} holds files that manip-il did not make (none of {', '.join(_MARKS)} in it is ours); choose "
+            "another folder, or delete it by hand"
         )
 
 

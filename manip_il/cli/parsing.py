@@ -190,8 +190,8 @@ def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, pa
 
 def _decode(one: _Value) -> Any:
     kind = Any if one.option.is_open else one.option.type
-    if one.option.is_open and not one.origin.startswith("--"):
-        return one.value
+    if one.option.is_open and (not one.origin.startswith("--") or one.origin.endswith(".path")):
+        return one.value  # of YAML, or a path: 2024_01_05 is a folder, not a number
     try:
         value = decode(kind, one.value)
     except ManipError:  # from a class with its own `parse`

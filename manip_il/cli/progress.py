@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Generator
@@ -36,6 +37,11 @@ def say(*lines: str) -> None:
     """Print lines on standard output."""
     for line in lines:
         _print(printable(line), sys.stdout)
+
+
+def say_next(*words: object, what: str = "next") -> None:
+    """Print a command of this program to copy, quoted for a shell. what: what it is for."""
+    say(f"{what}: {shlex.join(['manip-il', *map(str, words)])}")
 
 
 def warn(*lines: str) -> None:

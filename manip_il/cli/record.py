@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 from manip_il import checks
 from manip_il.cli.common_options import EngineOptions, Varied, env_config
 from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, save_options
-from manip_il.cli.progress import Stages, say, warn
+from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, require_replaceable, save_options
+from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import MismatchError
@@ -64,13 +64,15 @@ class RecordOptions(Varied, Seeded, Resumable):
         root = self.dataset.root or Path("datasets") / repo_id.rpartition("/")[2]
         journals = root.with_name(f"{root.name}.journals")
         with exclusive(root):
+            for folder in () if self.resume else (root, journals):  # both, before either is emptied
+                require_replaceable(folder, self.overwrite)
             prepare_output(root, resume=self.resume, overwrite=self.overwrite)
             prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
             if self.resume:
                 check_same_options(journals, self)
             self._record(job, root, journals, repo_id)
-        say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
-        say(f"to watch the expert: manip-il view --robot.type={env.robot} --task.type={env.task}")
+        say_next("train", f"--dataset.root={root}", f"--output_dir=runs/{root.name}")
+        say_next("view", f"--robot.type={env.robot}", f"--task.type={env.task}", what="to watch the expert")
 
     def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import command_line, group, to_plain
 from manip_il.cli.outputs import Output, OutputFile, publish
-from manip_il.cli.progress import progress, say
+from manip_il.cli.progress import progress, say, say_next
 from manip_il.data.atomic import write_file, write_json
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import Seeded, option
@@ -47,7 +47,7 @@ class IrlOptions(OfDataset, Seeded):
         with self.output.open(self) as folder:
             page = inverse.inverse_report(found, command_line(), to_plain(self))
             publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page)
-        say(f"next: manip-il eval --policy.type=expert --task.type=carry:{folder / inverse.FILE_NAME}")
+        say_next("eval", "--policy.type=expert", f"--task.type=carry:{folder / inverse.FILE_NAME}")
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class PairsOptions(Seeded):
         clips = choose_pairs(find_datasets(self.sources), self.clip, self.count, self.seed, rng, reward)
         write_json(self.file.output, clips.pairs.to_json())
         say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {self.file.output}")
-        say(f"next: manip-il reward ask {self.file.output} --output=ask.html")
+        say_next("reward", "ask", self.file.output, "--output=ask.html")
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class AskOptions(OfPairs):
         page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
         write_file(self.file.output, page.encode())
         say(f"{len(clips.pairs):,} pairs: {self.file.output}")
-        say(f"next: manip-il reward fit {self.pairs} preferences.json --output_dir=runs/reward")
+        say_next("reward", "fit", self.pairs, "preferences.json", "--output_dir=runs/reward")
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class AnswerOptions(OfPairs, Seeded):
         rng = rng_for(stream_base("training", self.seed), "teacher")
         write_json(self.file.output, answer_pairs(teacher, clips, rng).to_json())
         say(f"{len(clips.pairs):,} answers: {self.file.output}")
-        say(f"next: manip-il reward fit {self.pairs} {self.file.output} --output_dir=runs/reward")
+        say_next("reward", "fit", self.pairs, self.file.output, "--output_dir=runs/reward")
 
 
 @dataclass(frozen=True)
@@ -170,4 +170,4 @@ class FitOptions(OfPairs, Seeded):
             write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
             write_json(folder / "fit.json", found.to_json())
         say(*summary_lines(found, answers))
-        say(f"next: manip-il data score DATASET --reward={folder} --output_dir=runs/scores")
+        say_next("data", "score", "DATASET", f"--reward={folder}", "--output_dir=runs/scores")

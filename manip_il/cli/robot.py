@@ -11,7 +11,7 @@ from manip_il import checks
 from manip_il.cli.common_options import EngineOptions, env_config
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import Output, OutputFile, Replacing, publish
-from manip_il.cli.progress import progress, say
+from manip_il.cli.progress import progress, say, say_next
 from manip_il.data.atomic import write_file, write_json
 from manip_il.errors import ManipError, RenderError
 from manip_il.option import Seeded, option
@@ -53,7 +53,7 @@ class RobotNewOptions(Replacing):
         say(verdict(checked), *(f"change: {line}" for line in advice(checked)))
         if len(checked.failed) == len(NAMES):
             raise ManipError(f"{target} cannot do any task yet; see above")
-        say(f"look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
+        say_next("view", f"--robot.type={target}", "--task.type=pick_place", what="look at the robot")
 
 
 @dataclass(frozen=True)

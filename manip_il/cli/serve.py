@@ -18,7 +18,7 @@ from manip_il.tasks.config import EnvConfig
 
 SERVO = "servo"  # a value of --vary
 
-_IDLE = ("late", "random_actions")  # conditions that do not affect a served arm
+_IDLE = ("late", "random_actions", "dynamics")  # conditions that do not affect a served arm
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import ClassVar
 from manip_il.cli.common_options import DatasetRoots, Trusting, start_policy
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
-from manip_il.cli.progress import Stages, progress, say, set_quiet
+from manip_il.cli.progress import Stages, progress, say, say_next, set_quiet
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import PLAIN
@@ -96,7 +96,8 @@ class TrainOptions(Seeded, Trusting):
                 stages.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
                 path = trainer.fit(stages.log)
         if writes:
-            say(f"checkpoint: {path}", f"next: manip-il eval --policy.path={path} --output_dir={folder}/eval")
+            say(f"checkpoint: {path}")
+            say_next("eval", f"--policy.path={path}", f"--output_dir={folder}/eval")
 
     def config(self) -> FitConfig:
         """Return the trainer's configuration; `UsageError` if options contradict each other."""

@@ -9,7 +9,7 @@ from typing import ClassVar
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import group
 from manip_il.cli.outputs import OutputFile, Replacing, prepare_output, require_replaceable, save_options
-from manip_il.cli.progress import has_bars, progress, say
+from manip_il.cli.progress import has_bars, progress, say, say_next
 from manip_il.data.atomic import new_folder, write_file
 from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
@@ -52,7 +52,7 @@ class PushOptions:
         done = "would be " if self.dry_run else ""
         say(f"{remote.name}: {len(plan.upload)} files, {size}, {done}uploaded; {len(plan.remove)} {done}removed")
         if not self.dry_run:
-            say(f"next: manip-il pull {remote.name} FOLDER")
+            say_next("pull", remote.name, "FOLDER")
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class McapExportOptions(OfDataset, Replacing):
         if missing := left_out(dataset.info):
             say(f"left out, because MCAP cannot hold them: {', '.join(missing)}")
         say(f"exported {dataset.info.episodes:,} episodes to {self.out}")
-        say(f"to convert back: manip-il data from-mcap {self.out} DATASET --mapping={self.out / MAPPING}")
+        say_next("data", "from-mcap", self.out, "DATASET", f"--mapping={self.out / MAPPING}", what="to convert back")
 
 
 @dataclass(frozen=True)

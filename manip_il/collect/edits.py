@@ -52,6 +52,11 @@ class EditSource:
     env: EnvConfig
     warnings: tuple[str, ...] = ()
 
+    def check_has_no_sag(self, what: str) -> None:
+        """Raise `ManipError` if the labels hold the sag of `serve`'s servos. what: an edit that would drop it."""
+        if _is_served(self.dataset.provenance):
+            raise ManipError(f"the labels in {self.dataset.root} hold the sag of serve's servos; {what} would drop it")
+
 
 def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> EditSource:
     """Open a dataset whose states are to be restored.
@@ -102,6 +107,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     action by more than `NOTICEABLE`, its phase, or its validity. Raises what `Dataset.read_episodes` and
     `rewrite_columns` raise, and `ManipError` if a worker dies.
     """
+    source.check_has_no_sag("data relabel")
     scale, dataset = env_actions(source.env).scale, source.dataset
     changed = 0
 
@@ -144,6 +150,8 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     The same seed gives the same scenes; a larger number of frames only adds scenes at the end. Raises
     `NothingToLearnError` if no scene has a valid label.
     """
+    if scenes.branch_steps > 1:
+        source.check_has_no_sag("--branch_steps")
     columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
     drawn = {
         "scenes": scenes.anew,
@@ -233,12 +241,18 @@ def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> 
 def _leads(source: EditSource, columns: Columns) -> NDArray[np.float64]:
     """Return recorded minus expert labels, (T, n): the servos' sag, if `serve --log=` wrote the dataset; else 0."""
     action = columns[schema.ACTION].astype(np.float64)
-    if source.dataset.provenance.get("driver") != SERVED:
+    if not _is_served(source.dataset.provenance):
         return np.zeros_like(action)
     expert = make_expert(source.env)
     labels = [expert.label(State.from_vector(state)) for state in columns[schema.SIM_STATE]]
     own = np.stack([label.action for label in labels])
     return np.where(columns[schema.LABEL_VALID].reshape(-1, 1) > 0, action - own, 0.0)
+
+
+def _is_served(provenance: Mapping[str, Any]) -> bool:
+    """Whether our servos recorded a dataset, or one of those merged into it."""
+    merged = provenance.get("merged", ())
+    return provenance.get("driver") == SERVED or any(_is_served(one["provenance"]) for one in merged)
 
 
 def _draw_scenes(

@@ -88,8 +88,7 @@ class RolloutJob:
         if self.label == "last":
             return to_episode(frames, self.round, beta, labelled=False)
         if self.label == "takeover":
-            frames = cut_at_takeover(frames, self.env.horizon)
-            own = next(place for place, frame in enumerate(frames, 1) if frame.done)  # the learner's frames decide
+            frames, own = cut_at_takeover(frames)
             return to_episode(frames, self.round, beta, path=own)
         frames = labelled(frames, self.query, expert)
         if branch_env is None:
@@ -107,9 +106,7 @@ def run_steps(
     """Run a job's episodes in these environments and yield every step. act: replaces the job's driver."""
     policies = tuple(_load(job, path, envs[0]) for path in job.driver.policies)
     setting = Setting(env_actions(job.env), job.env.horizon, policies)
-    takeover = job.label == "takeover"
-    horizon = (2 if takeover else 1) * job.env.horizon  # a takeover gives the expert a horizon of its own
-    rules = Rules(horizon, job.hold, job.patience, takeover)
+    rules = Rules(job.env.horizon, job.hold, job.patience, takeover=job.label == "takeover")
     gate = gate_of(job.label, job.query, setting)
     return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)
 

@@ -150,14 +150,12 @@ def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[T
     return frames
 
 
-def cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
-    """Return the learner's frames, at most `horizon`, the last one `done`, then the expert's if it took over."""
-    taken = next((i for i, frame in enumerate(frames) if frame.actor != Actor.LEARNER), None)
-    if taken == 0:
-        return frames
-    last = min(len(frames) if taken is None else taken, horizon) - 1
-    rest = [] if taken is None else frames[taken:]
-    return [*frames[:last], replace(frames[last], done=True), *rest]
+def cut_at_takeover(frames: list[Transition]) -> tuple[list[Transition], int]:
+    """Return an episode's frames, the learner's last one also `done`, and the number of the learner's frames."""
+    own = next((i for i, frame in enumerate(frames) if frame.actor != Actor.LEARNER), len(frames))
+    if own > 0:
+        frames = [*frames[: own - 1], replace(frames[own - 1], done=True), *frames[own:]]
+    return frames, own
 
 
 def branch(env: Environment, expert: Labeller, first: State, seed: int, steps: int) -> Iterator[Transition]:

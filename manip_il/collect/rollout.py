@@ -68,7 +68,8 @@ class Rules:
     """When an episode ends.
 
     horizon: most control steps. hold: continue for this many steps after success, then end; None: to the horizon.
-    patience: also end after this many steps without progress. takeover: once queried, the expert drives to the end.
+    patience: also end after this many steps without progress. takeover: once queried, the expert drives to the end, for
+    at most `horizon` steps more than the learner alone has.
     """
 
     horizon: int
@@ -169,7 +170,8 @@ def _advance(slot: _Slot, rules: Rules) -> Transition:
     slot.step += 1
     solved = slot.env.solved
     slot.held += slot.held > 0 or solved
-    done = slot.step >= rules.horizon or (rules.hold is not None and slot.held > rules.hold)
+    done = slot.step >= (2 if slot.taken_over else 1) * rules.horizon
+    done |= rules.hold is not None and slot.held > rules.hold
     done |= rules.patience is not None and not slot.held and slot.is_stuck(rules.patience)
     return Transition(
         seed=slot.seed,

@@ -137,7 +137,7 @@ class LocalPool:
         """Submit some seeds of a job."""
         self._pool = self._pool or open_pool(self.count, learned=job.policy is not None)
         try:
-            return self._pool.submit(run_task, job, seeds, journal)
+            return self._pool.submit(_in_worker, run_task, job, seeds, journal)
         except BrokenExecutor:
             self.close()
             return self.submit(job, seeds, journal)
@@ -160,11 +160,11 @@ def map_in_order[T, R](function: Callable[[T], R], items: Iterable[T], workers: 
         return
     pool, items = open_pool(workers), iter(items)
     try:
-        waiting = deque((item, pool.submit(function, item)) for item in islice(items, workers + 1))
+        waiting = deque((item, pool.submit(_in_worker, function, item)) for item in islice(items, workers + 1))
         while waiting:
             item, result = waiting.popleft()
             yield item, result.result()
-            waiting.extend((item, pool.submit(function, item)) for item in islice(items, 1))
+            waiting.extend((item, pool.submit(_in_worker, function, item)) for item in islice(items, 1))
     except BrokenExecutor as error:
         raise ManipError("a worker died (out of memory?); try fewer --workers") from error
     finally:
@@ -225,11 +225,16 @@ def run_seeds(job: RolloutJob, seeds: Sequence[int], journal: Journal | None) ->
 
 def run_task(job: RolloutJob, seeds: Seeds, journal: Journal | None) -> list[Episode]:
     """Run some seeds in a local worker; return their episodes without pictures."""
+    return [episode.without_pictures() for episode in run_seeds(job, seeds, journal)]
+
+
+def _in_worker[**P, R](function: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
+    """Call a function in a worker. Raises `ManipError` for any exception: it may not be picklable."""
     try:
-        return [episode.without_pictures() for episode in run_seeds(job, seeds, journal)]
+        return function(*arguments, **options)
     except ManipError:
         raise
-    except Exception as error:  # may not be picklable
+    except Exception as error:
         raise ManipError(told(error)) from None
 
 

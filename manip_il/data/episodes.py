@@ -66,7 +66,7 @@ def to_episode(
         seed=frames[0].seed,
         columns=columns,
         success=any(frame.success for frame in decides),
-        success_at_end=decides[-1].success,
+        success_at_end=bool(decides) and decides[-1].success,
         instruction=frames[0].observation.instruction,
     )
 
@@ -74,7 +74,7 @@ def to_episode(
 def parts(episode: Episode) -> list[Episode]:
     """Split a rollout after every frame with `next.done`; each part is an episode of a dataset."""
     ends = np.flatnonzero(episode.columns[schema.DONE].ravel()) + 1
-    if len(ends) < 2:
+    if not len(ends):
         return [episode]
     found: list[Episode] = []
     for start, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):

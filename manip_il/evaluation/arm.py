@@ -65,10 +65,14 @@ class Member:
         result = trial.measure(self.policy, self.name, folder / FOLDER / words, engine, progress)
         return replace(self, result=result)
 
-    def env(self, task: str | None = None) -> EnvConfig:
-        """Return the environment in which the member's run was validated. task: the task's file, for a custom task."""
+    def env(self, task: str | None = None, shape: str | None = None) -> EnvConfig:
+        """Return the environment in which the member's run was validated.
+
+        task, shape: the file of an own task, and the object if it is a mesh: results hold only their names.
+        """
         found = EvalResult.read(_round_folder(self.path, self.history[0]))
-        return found.settings.env(found.robot, task or found.task)
+        settings = replace(found.settings, object=shape or found.settings.object)
+        return settings.env(found.robot, task or found.task)
 
     @property
     def conditions(self) -> tuple[Condition, ...]:

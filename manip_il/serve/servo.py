@@ -35,7 +35,7 @@ class Follower:
         """Use servos with these parameters; the current joint positions become their goals."""
         self.config = config
         for model in (self._world.scene.model, self._world.model):
-            model.body_gravcomp[model.jnt_bodyid[:]] = 0.0
+            model.body_gravcomp[:] = 0.0
             model.dof_damping[self._dof] = config.torque / config.speed  # the motor's back EMF
             model.dof_frictionloss[self._dof] = config.friction
         self._at = self._world.data.qpos[self.q]

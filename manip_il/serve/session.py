@@ -101,7 +101,8 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
         f"lerobot-record --robot.type=so101_follower --robot.port={root}/follower --robot.id=follower "
         f"--robot.calibration_dir={root}{seen} --teleop.type=so101_leader --teleop.port={root}/leader "
         f"--teleop.id=leader --teleop.calibration_dir={root} --dataset.repo_id=local/so101 "
-        f'--dataset.single_task="{station.env.task_description}" --dataset.push_to_hub=false',
+        f'--dataset.single_task="{station.env.task_description}" --dataset.push_to_hub=false '
+        f"--dataset.fps={station.env.config.control_hz}",
     ]
 
 

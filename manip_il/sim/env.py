@@ -62,7 +62,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.look, self._view = look or (cameras.look if cameras else Look()), cameras
         self.config = config
         self.world = World(build_scene(robot, task, config.physics_step))
-        self._task = task
+        self._task = self.world.scene.task
         self._conditions = tuple(conditions)
         self._begin(0, {})
         require_cameras(cameras, CAMERAS)
@@ -210,8 +210,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         world = self._measured()
         seen: tuple[dict[str, Picture], dict[str, F32]] = {}, {}
         if self._view:
-            points = np.stack([*points_in(self.world).values()])
-            seen = self._pictures(self._view), projections(self.scene, self._view, points)
+            points = [*points_in(self.world).values()]
+            keypoints = projections(self.scene, self._view, np.stack(points)) if points else {}
+            seen = self._pictures(self._view), keypoints
         self._pictured.append(seen)
         (images, keypoints), text = self._pictured[0], self.task_description
         self._observed.append(

@@ -73,18 +73,20 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
         return
     name = objects_in(world.scene.task, world)[0]
     one = world.scene.objects[name]
-    start, half = world.data.qpos[one.q : one.q + 7].copy(), min(world.extents(name)) / 2
+    before, start = world.physics(), world.data.qpos[one.q : one.q + 7].copy()
+    half = min(world.extents(name)) / 2
     for _ in range(_MAX_DRAWS):
         angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(*distance)
         pose = start.copy()
         pose[:2] += length * np.array([np.cos(angle), np.sin(angle)])
-        pose[2] = max(pose[2] + height, half)
+        if height > 0 or name not in world.scene.hulls:  # a mesh may lie lower than that
+            pose[2] = max(pose[2] + height, half)
         if height > 0:
             turn = rng.normal(size=4)
             pose[3:] = turn / np.linalg.norm(turn)
         if world.reach.has([*pose[:2], half]) and _is_on_table(world, pose) and _place(world, name, pose):
             return
-    _place(world, name, start)
+    world.restore(before, world.variation)
 
 
 def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None:
@@ -237,5 +239,6 @@ def _place(world: World, name: str, pose: F64) -> bool:
     """Put an object at rest at `pose` (7,); return False if it overlaps something."""
     world.place(name, pose[:3], pose[3:])
     _settle(world)
-    geom = world.scene.objects[name].geom
-    return all(contact.dist > _OVERLAP for contact in world.data.contact if geom in (contact.geom1, contact.geom2))
+    body, bodies = world.scene.objects[name].body, world.model.geom_bodyid
+    own = (bodies[world.data.contact.geom] == body).any(axis=1)
+    return bool((world.data.contact.dist[own] > _OVERLAP).all())

@@ -26,7 +26,7 @@ def points_in(world: World) -> dict[str, F64]:
     found = {
         name: np.asarray(value)
         for name, value in world.scene.task.observe(world).items()
-        if any(mujoco.mj_name2id(model, kind, name) >= 0 for kind in _NAMED)
+        if np.ndim(value) and any(mujoco.mj_name2id(model, kind, name) >= 0 for kind in _NAMED)
     }
     for name, one in world.scene.objects.items():
         if model.geom_type[one.geom] == mujoco.mjtGeom.mjGEOM_BOX:

@@ -46,6 +46,7 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object of the task,
     or has one to grasp that is too wide for the gripper.
     """
+    task = task.fitted(robot) if isinstance(task, Fitting) else task
     try:
         spec = scene_spec(robot, task)
         spec.option.timestep = step
@@ -75,7 +76,7 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_cameras(spec, robot)
-    (task.fitted(robot) if isinstance(task, Fitting) else task).build(spec)
+    task.build(spec)
     return spec
 
 

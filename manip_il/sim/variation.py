@@ -173,7 +173,9 @@ def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, sh
     if kind != _MESH:
         nodes = slice(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body])
         changed.geom_size[geom], changed.geom_rbound[geom] = size, like.geom_rbound[at]
-        changed.geom_aabb[geom, 3:] = changed.bvh_aabb[nodes, 3:] = like.geom_aabb[at, 3:]
+        others = plain.bvh_aabb[nodes, 3:] if plain.body_geomnum[one.body] > 1 else 0.0
+        changed.geom_aabb[geom, 3:] = like.geom_aabb[at, 3:]
+        changed.bvh_aabb[nodes, 3:] = np.maximum(like.geom_aabb[at, 3:], others)
     changed.geom_type[geom], changed.geom_condim[geom] = kind, condim
     changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
     # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn friction gets it.

@@ -21,6 +21,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.finding import journals_of
 from manip_il.errors import ManipError
+from manip_il.learn.checkpoint import policy_sha256
 from manip_il.sim.conditions import NOMINAL
 from manip_il.store.errors import redact
 from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
@@ -72,10 +73,12 @@ def policy_facts(root: Path) -> dict[str, Any]:
         raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
     found = {name: root / inside / f"{name}.json" for name in ("config", "manip_il", "train_config")}
     facts = {name: checks.read_json(path, "JSON") if path.is_file() else {} for name, path in found.items()}
-    evaluations = [  # without disturbances; `is_test`: false if the policy was chosen by this evaluation
+    own = policy_sha256(root / inside)
+    evaluations = [  # of this policy, undisturbed; `is_test`: false if the policy was chosen by this evaluation
         {**one, "is_test": not path.parent.name.startswith("round_") and path.parent.parent.name != "validation"}
         for path in root.rglob("eval.json")
-        if (one := checks.read_json(path, "JSON")).get("policy") != "expert"
+        if (one := checks.read_json(path, "JSON")).get("policy_sha256", own) == own
+        and one.get("policy") != "expert"
         and one.get("settings", {}).get("suite", NOMINAL.name) == NOMINAL.name
     ]
     order = ("is_test", "n_episodes", "success_rate")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from manip_il.checks import check_unchanged
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 from manip_il.robots import ROBOTS
@@ -73,17 +74,21 @@ def complete(config: EnvConfig) -> EnvConfig:
 def _with_task(config: EnvConfig) -> EnvConfig:
     """Canonicalise the object (the default becomes "") and the task's argument; fill in rate and limits."""
     from manip_il.robots.table import get_robot  # imported here: help needs no robot and no simulator
+    from manip_il.sim.mesh import mesh_path
     from manip_il.sim.task import TakesArgument
-    from manip_il.tasks.table import check_unchanged, get_task
+    from manip_il.tasks.table import get_task
 
-    task = get_task(config.task)
-    check_unchanged(config.task)
+    task, robot = get_task(config.task), get_robot(config.robot)
+    for file in (config.task, config.robot, mesh_path(config.object) or ""):
+        if Path(file).suffix:
+            check_unchanged(Path(file))
     if isinstance(task, TakesArgument):
         config = replace(config, task=task.name)
     if config.object:
-        shape, task = Shape.parse(config.object), get_task(config.task, config.object)
-        config = replace(config, object="" if shape == CUBE else str(shape))
-    limits, control_hz = task.limits, config.control_hz or get_robot(config.robot).fps
+        shape, other = Shape.parse(config.object), get_task(config.task, config.object)
+        is_own = shape == getattr(task, "shape", CUBE)
+        task, config = task if is_own else other, replace(config, object="" if is_own else str(shape))
+    limits, control_hz = task.limits, config.control_hz or robot.fps
     rate = control_hz / LIMITS_HZ
     return replace(
         config,

@@ -58,7 +58,7 @@ def get_task(name: str, shape: str = "") -> Task:
     a file without a task, or for an argument or a shape that is invalid or that the task does not take.
     """
     if name.endswith(SUFFIX):
-        task = _of_file(Path(name).absolute())[0]
+        task = _of_file(Path(name).absolute())
     else:
         base, colon, argument = name.partition(":")
         task = _named(base)
@@ -89,13 +89,6 @@ def source_hash(task: Task) -> str:
     return hashlib.sha256(Path(inspect.getfile(type(task))).read_bytes()).hexdigest()
 
 
-def check_unchanged(name: str) -> None:
-    """Raise `UsageError` if a task's file was edited since this process ran it: a process runs a file only once."""
-    path = Path(name).absolute()
-    if name.endswith(SUFFIX) and checks.read_bytes(path, "a task's Python file") != _of_file(path)[1]:
-        raise UsageError(f"{path} was edited after this process had run it; start Python again")
-
-
 @cache
 def _named(name: str) -> Task:
     if name in TASKS:
@@ -115,15 +108,15 @@ def _entry_point(name: str) -> EntryPoint | None:
 
 
 @cache
-def _of_file(path: Path) -> tuple[Task, bytes]:
-    """Run a file; return its one task and its text."""
+def _of_file(path: Path) -> Task:
+    """Run a file; return its one task."""
     if not path.is_file():
         raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
     name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None  # because the path ends in `.py`
     assert spec.loader is not None
-    text, module = path.read_bytes(), importlib.util.module_from_spec(spec)
+    module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look it up there
     try:
         spec.loader.exec_module(module)
@@ -138,7 +131,7 @@ def _of_file(path: Path) -> tuple[Task, bytes]:
     task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
     if task.name in TASKS:
         raise UsageError(f"{path}: its task has a built-in task's name, {task.name!r}; choose another")
-    return task, text
+    return task
 
 
 def _made(what: str, cls: Any) -> Task:

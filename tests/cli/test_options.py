@@ -154,7 +154,7 @@ any_options = st.builds(
 def test_options_survive_yaml(tmp_path_factory, options):
     path = tmp_path_factory.mktemp("yaml") / "config.yaml"
     path.write_text(dump_yaml(options), encoding="utf-8")
-    assert from_yaml(path, Options) == options
+    assert from_yaml(path, Options) == replace(options, resume=False)  # it concerns one call alone
 
 
 @given(any_options)

@@ -13,6 +13,7 @@ import pytest
 from kept import label_all
 
 from manip_il.collect.edits import (
+    SERVED,
     EditSource,
     EditTarget,
     open_source,
@@ -21,7 +22,7 @@ from manip_il.collect.edits import (
     render_dataset,
     render_states,
 )
-from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.environments import env_fingerprint, env_spec, make_expert
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.scenes import CHUNK, Scenes
@@ -29,6 +30,7 @@ from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
+from manip_il.errors import ManipError
 from manip_il.mdp import Episode, State
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
@@ -52,8 +54,10 @@ def recorded(env: EnvConfig, count: int = 2, **settings) -> list[Episode]:
     return sorted(job.run(stream_seeds("demonstrations", count)), key=lambda episode: episode.seed)
 
 
-def write(episodes: list[Episode], root: Path, env: EnvConfig, cameras: CameraConfig | None = None) -> Path:
-    about = {"fingerprint": env_fingerprint(env, cameras), "provenance": {"round": 3}}
+def write(
+    episodes: list[Episode], root: Path, env: EnvConfig, cameras: CameraConfig | None = None, **provenance
+) -> Path:
+    about = {"fingerprint": env_fingerprint(env, cameras), "provenance": {"round": 3, **provenance}}
     write_dataset(episodes, root, env_spec(env, cameras), repo_id=f"local/{root.name}", **about)
     return root
 
@@ -181,6 +185,22 @@ def test_redrawn_scenes_are_other_scenes_around_the_same_hand_with_the_experts_l
     assert len(episodes) > 0.8 * frames
     assert anew >= len(episodes) / 5  # a hand at the furniture leaves it alone
     assert moved >= 5 or task != "pick_place"
+
+
+def test_labels_with_the_servos_sag_keep_it_in_redrawn_scenes_and_lose_it_nowhere(tmp_path):
+    (episode,) = recorded(REACH, 1)
+    sagging = changed(episode, action=np.add(episode.columns["action"], 0.01, dtype=np.float32))
+    about = {"merged": [{"provenance": {"driver": SERVED}}]}
+    served = open_source(write([sagging], tmp_path / "served", REACH, **about))
+    redraw_dataset(served, Scenes(None, 30), EditTarget(tmp_path / "redrawn"))
+    expert = make_expert(REACH)
+    for scene in Dataset.open(tmp_path / "redrawn").read_episodes():
+        label = expert.label(State.from_vector(scene.columns["sim_state"][0]))
+        np.testing.assert_allclose(scene.columns["action"][0] - label.action, 0.01, atol=1e-6)
+    with pytest.raises(ManipError, match="sag"):
+        relabel_dataset(served, EditTarget(tmp_path / "relabelled"))
+    with pytest.raises(ManipError, match="sag"):
+        redraw_dataset(served, Scenes(None, 3, branch_steps=2), EditTarget(tmp_path / "branches"))
 
 
 @pytest.mark.gl

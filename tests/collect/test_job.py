@@ -120,6 +120,12 @@ def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJo
         assert len(recovery) >= ENV.horizon  # the expert has a horizon of its own
 
 
+def test_what_an_expert_solves_is_not_the_learners_even_if_it_never_drove(job: RolloutJob):
+    for episode in run(replace(job, label="takeover", query=Query("every"))).values():
+        assert not episode.success
+        assert parts(episode)[0].success
+
+
 def test_branches_are_observed_with_the_noise_of_the_run(job: RolloutJob):
     noisy = replace(job, label="branch", query=SELDOM, conditions=(Condition("noise", joint_noise=0.05),))
     for episode in run(noisy).values():

@@ -123,14 +123,14 @@ def test_the_expert_is_queried_where_the_gate_says(steps: list[int]):
     assert expert.queried == [frame.step for frame in frames if frame.label is not None] == steps
 
 
-def test_an_expert_that_takes_over_drives_to_the_end_and_leaves_the_others_alone():
+def test_an_expert_that_takes_over_has_a_horizon_more_and_leaves_the_others_alone():
     def gate(turns, actions):
         return [(turn.seed, turn.step) == (1, 2) for turn in turns]
 
     learner = Halves()
     frames = list(rollout([Counter(), Counter()], [0, 1], learner, Rules(5, takeover=True), Ones(), gate))
     actors = {seed: [frame.actor for frame in frames if frame.seed == seed] for seed in (0, 1)}
-    assert actors == {0: [Actor.LEARNER] * 5, 1: [Actor.LEARNER] * 2 + [Actor.EXPERT] * 3}
+    assert actors == {0: [Actor.LEARNER] * 5, 1: [Actor.LEARNER] * 2 + [Actor.EXPERT] * 8}
     assert learner.rows == [2, 2, 2, 1, 1]
 
 
