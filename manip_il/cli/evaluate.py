@@ -182,9 +182,8 @@ class EvalOptions(Tested, Seeded, Trusting):
         from manip_il.cli.inputs import open_driver
         from manip_il.collect.environments import env_fingerprint, env_spec
         from manip_il.collect.job import RolloutJob
-        from manip_il.data.fingerprint import compare_fingerprints
+        from manip_il.data.fingerprint import compare_fingerprints, policy_sha256
         from manip_il.evaluation.policy_folder import find_policy
-        from manip_il.learn.checkpoint import policy_sha256
 
         settings = replace(result.settings, object=self.env["object"] or result.settings.object)
         env = settings.env(result.robot, self.env["task"] or result.task)

@@ -16,7 +16,7 @@ from manip_il.collect.drivers import Driver, PolicyDriver, driver_of
 from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.data.dataset import Dataset
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.schema import SIM_STATE, check_same_spec
+from manip_il.data.schema import SIM_STATE, check_same_spec, features
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.checkpoint import Checkpoint
@@ -53,6 +53,11 @@ def check_given(config: RunConfig) -> None:
             advice = "train a policy on it with manip-il train, and start from that: --policy.path=RUN"
             raise ManipError(f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}")
         check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
+        check_same_spec(str(root), given.spec, run, here, ["sim_state_size"])
+        if odd := sorted(features(given.spec).keys() ^ features(here).keys()):
+            raise ManipError(
+                f"only one of {root} and this run has {', '.join(odd)}; expected the same --cameras in both"
+            )
         warn(*differences(given))
     if config.start is not None:
         check_policy(Checkpoint.open(config.start), config.env, trust=config.fit.trust)

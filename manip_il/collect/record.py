@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal, episode_path, list_seeds, read_journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
+from manip_il.sim.config import Look
 
 _LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]
@@ -86,6 +88,8 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
     source: dict[str, Any] = {"driver": job.driver.name, "round": job.round, "beta": job.driver.beta}
     if job.conditions:
         source["vary"] = [condition.to_json() for condition in job.conditions]
+    if job.cameras and job.cameras.look != Look():
+        source["rendered"] = {"cameras": asdict(job.cameras)}
     if job.policy is None:
         return source
     steps = {"branch_steps": job.branch_steps} if job.label == "branch" else {}

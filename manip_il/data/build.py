@@ -163,7 +163,7 @@ def merge_datasets(
     about = next((one for one in opened if one.spec.task != UNKNOWN_TASK), opened[0])
     own = opened[0].fingerprint
     for one in opened:
-        also = ("sim_state_size", *(("task",) if one.spec.task != UNKNOWN_TASK else ()))
+        also = ("sim_state_size", "cameras", "image_size", *(("task",) if one.spec.task != UNKNOWN_TASK else ()))
         check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
         for warning in compare_fingerprints(str(roots[0]), own, str(one.root), one.fingerprint):
             _LOG.warning("%s", warning)

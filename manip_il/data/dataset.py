@@ -115,6 +115,7 @@ class Dataset:
             raise ManipError(f"{self.root} has no column {s.ACTION}, so there is nothing to learn from it")
         around = features.get(s.ENVIRONMENT_STATE)
         cameras = [features[key] for key in self.cameras if key.startswith(s.IMAGES) and features[key].is_rgb]
+        points = next((one.labels for key, one in features.items() if key.startswith(s.KEYPOINTS)), ())
         sizes = {one.picture_size for one in cameras}
         if len(sizes) > 1:  # a spec has one size for all cameras
             cameras = []
@@ -130,6 +131,7 @@ class Dataset:
             cameras=tuple(one.key.removeprefix(s.IMAGES) for one in cameras),
             image_size=sizes.pop() if cameras else (0, 0),
             video=not any(one.dtype == "image" for one in cameras),
+            keypoints=tuple(one.removesuffix(".across") for one in points[::3]),
         )
 
     @cached_property

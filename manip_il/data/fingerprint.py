@@ -1,4 +1,4 @@
-"""Fingerprints of environments (versions and hashes that determine the computed bytes) and their comparison."""
+"""Fingerprints of environments (versions and hashes that determine the computed bytes), and the hash of a policy."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import json
 import platform
 from collections.abc import Mapping
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
@@ -16,6 +17,7 @@ from threadpoolctl import threadpool_info
 
 _HASH = 12  # printed characters of a hash
 _LONGEST = 80  # printed characters of any other value
+_FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 
 
@@ -68,3 +70,12 @@ def canonical_json(value: Any) -> str:
     Also takes dataclasses. Raises `TypeError` for anything else.
     """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=dataclasses.asdict)
+
+
+def policy_sha256(policy: Path) -> str:
+    """Return the SHA-256 of everything in a policy's folder that decides how it acts, independent of its path."""
+    digest = hashlib.sha256()
+    for path in sorted(policy.iterdir()):
+        if path.is_file() and path.name not in _FOR_PEOPLE:
+            digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()

@@ -153,7 +153,7 @@ class Study:
         """Arm -> its comparison with the baseline, for every other arm; empty without a baseline."""
         if self.baseline is None:
             return {}
-        [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
+        baseline = next(arm for arm in self.arms if arm.name == self.baseline)
         return {arm.name: Comparison.of(baseline, arm) for arm in self.arms if arm is not baseline}
 
     @property

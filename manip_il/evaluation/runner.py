@@ -16,12 +16,13 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.checkpoint import Checkpoint, policy_sha256
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
 from manip_il.sim.task import objects_in

@@ -7,7 +7,6 @@ configuration and weights are listed in `PLAIN`, their processors' steps in `_ST
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,7 +27,6 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-_FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = (  # options that define an mlp's architecture
     *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled"),
@@ -214,15 +212,6 @@ class Checkpoint:
         """Raise `ManipError` if the policy or its processors load models by name, unless `trust` is given."""
         steps = [step for steps in self.processors.values() for step in steps]
         require_trust(self.config, str(self.path), trust, steps)
-
-
-def policy_sha256(policy: Path) -> str:
-    """Return the SHA-256 of everything in a policy's folder that decides how it acts, independent of its path."""
-    digest = hashlib.sha256()
-    for path in sorted(policy.iterdir()):
-        if path.is_file() and path.name not in _FOR_PEOPLE:
-            digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()
 
 
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:

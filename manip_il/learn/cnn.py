@@ -244,9 +244,11 @@ class CNNPolicy(MLPPolicy):
 
     def _heat_map_losses(self, places: Tensor) -> Tensor:
         """Return each row's loss, averaged over the cameras, (B,). places: (B, cameras, K, 3)."""
-        cameras = zip(self.encoders, places.unbind(1), strict=True)
-        maps = [(cast(KeypointEncoder, one).maps, at) for one, at in cameras]
-        found = [heat_map_losses(one[:, : at.shape[1]], at.to(one.device)) for one, at in maps if one is not None]
+        shapes = [self.config.image_features[key].shape[1:] for key in self.cameras]
+        found = []
+        for encoder, at, shape in zip(self.encoders, places.unbind(1), shapes, strict=True):
+            if (maps := cast(KeypointEncoder, encoder).maps) is not None:
+                found.append(heat_map_losses(maps[:, : at.shape[1]], at.to(maps.device), shape))
         return torch.stack(found).mean(0)
 
     @override
@@ -400,15 +402,15 @@ def _places(height: int, width: int, device: torch.device) -> Tensor:
     return torch.stack([x, y, x.square() + y.square()], dim=1)
 
 
-def heat_map_losses(maps: Tensor, places: Tensor) -> Tensor:
+def heat_map_losses(maps: Tensor, places: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return the mean cross-entropy [nats] of the visible points, (B,), 0 if none is visible.
 
     maps: logarithms of heat maps (B, K, height, width), whose cells are `STRIDE` pixels apart, starting at the first
     pixel. places: x and y from 0 to 1, and whether the point is visible, (B, K, 3); a point between cells is shared
-    among the four around it by bilinear weights.
+    among the four around it by bilinear weights. shape: height and width of the pictures.
     """
     size = torch.tensor([maps.shape[3], maps.shape[2]], device=maps.device)
-    at = (places[..., :2] * STRIDE * size - 0.5) / STRIDE
+    at = (places[..., :2] * torch.tensor([shape[1], shape[0]], device=maps.device) - 0.5) / STRIDE
     grid = 2 * at / (size - 1) - 1  # from -1 at the first cell's centre to 1 at the last one's
     each = maps.flatten(0, 1).unsqueeze(1), grid.view(-1, 1, 1, 2)
     found = grid_sample(*each, padding_mode="border", align_corners=True).view(places.shape[:2])

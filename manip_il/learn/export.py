@@ -19,10 +19,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, GRIPPERS, IMAGES, OPENINGS, SERVOS, STATE, TWO_ARMS
 from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
-from manip_il.learn.checkpoint import policy_sha256
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy

@@ -18,7 +18,7 @@ from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
 from manip_il.data.camera import decode
-from manip_il.data.dataset import joined_columns
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP
 from manip_il.data.schema import ACTION, LABEL_VALID, STATE
@@ -135,8 +135,8 @@ def load_data(
     features = [*(policy.input_features or {}), ACTION]
     cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
-    label = [LABEL_VALID] if LABEL_VALID in meta.features else []
-    table = joined_columns(meta.roots, [*numbers, *_ALWAYS, *label])
+    table = joined_columns(meta.roots, [*numbers, *_ALWAYS])
+    table[LABEL_VALID] = np.concatenate([_label_valid(one) for one in meta.datasets])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     for key in numbers:
         table[key] = table[key].reshape(len(table[key]), -1)  # a column with one number per frame becomes a vector, too
@@ -159,6 +159,13 @@ def load_data(
         usable[train],
         usable[held_out],
     )
+
+
+def _label_valid(dataset: Dataset) -> NDArray[Any]:
+    """Return a dataset's `label_valid`, (N,): 1 without such a column."""
+    if LABEL_VALID not in dataset.features:
+        return np.ones(len(dataset), np.int64)
+    return dataset.columns([LABEL_VALID])[LABEL_VALID].reshape(-1)
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:

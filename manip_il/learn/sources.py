@@ -74,7 +74,7 @@ def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any])
     """
     if "cameras_sha256" not in fingerprint:
         return None
-    sources = [one["provenance"] for one in provenance.get("merged", [])] or [provenance]
-    rendered = [one.get("rendered", {}).get("cameras", {}) for one in sources]  # `record` uses the default lighting
-    looks = [dict(one.get("look", {})) for one in rendered]
+    merged = [] if "rendered" in provenance else [one["provenance"] for one in provenance.get("merged", [])]
+    drawn = [one.get("rendered") or one.get("redrawn") or {} for one in merged or [provenance]]
+    looks = [dict((one.get("cameras") or {}).get("look", {})) for one in drawn]  # `record` uses the default lighting
     return looks[0] if all(look == looks[0] for look in looks) else None

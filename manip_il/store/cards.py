@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 from manip_il import checks
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.finding import journals_of
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import policy_sha256
 from manip_il.sim.conditions import NOMINAL
 from manip_il.store.errors import redact
 from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
@@ -77,7 +77,7 @@ def policy_facts(root: Path) -> dict[str, Any]:
     evaluations = [  # of this policy, undisturbed; `is_test`: false if the policy was chosen by this evaluation
         {**one, "is_test": not path.parent.name.startswith("round_") and path.parent.parent.name != "validation"}
         for path in root.rglob("eval.json")
-        if (one := checks.read_json(path, "JSON")).get("policy_sha256", own) == own
+        if ((one := checks.read_json(path, "JSON")).get("policy_sha256") or own) == own
         and one.get("policy") != "expert"
         and one.get("settings", {}).get("suite", NOMINAL.name) == NOMINAL.name
     ]

@@ -13,7 +13,8 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
-from manip_il.learn.checkpoint import Origin, policy_sha256
+from manip_il.data.fingerprint import policy_sha256
+from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.tasks.config import make_config
 

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
 from manip_il.data.dataset import Dataset
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, SERVOS, STATE, RobotTaskSpec
 from manip_il.errors import ManipError
 from manip_il.learn import export
-from manip_il.learn.checkpoint import Origin, policy_sha256
+from manip_il.learn.checkpoint import Origin
 from manip_il.learn.export import TOLERANCE, export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
