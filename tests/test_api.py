@@ -10,6 +10,8 @@ import pytest
 import manip_il
 from manip_il import api
 from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.fit_config import FitConfig
+from manip_il.sim.conditions import Condition
 
 STUB = Path(manip_il.__file__).with_suffix(".pyi")
 
@@ -32,6 +34,8 @@ def test_a_folder_holds_the_results_of_one_set_of_options(tmp_path: Path, monkey
     (tmp_path / "round_000").mkdir()
     with pytest.raises(MismatchError, match="seed differs"):
         manip_il.dagger(tmp_path, env, rounds=2, seed=7)
+    with pytest.raises(MismatchError, match="fit differs"):
+        manip_il.dagger(tmp_path, env, rounds=2, fit=FitConfig(lr=0.5))
 
 
 def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
@@ -55,5 +59,5 @@ def test_a_policys_rollouts_hold_the_experts_labels_and_its_evaluation_knows_its
     assert table["label_valid"].all()
     assert (table["action"] != table["executed_action"]).any()
     assert (made.provenance["beta"], made.provenance["round"]) == (0.5, 1)
-    found = manip_il.evaluate(policy, episodes=2)
-    assert (found.robot, found.task, found.success.n) == ("panda", "reach", 2)
+    found = manip_il.evaluate(policy, episodes=2, conditions=(Condition("knocked", action_noise=0.1),))
+    assert (found.robot, found.task, found.success.n, found.settings.suite) == ("panda", "reach", 2, "knocked")

@@ -117,6 +117,7 @@ def sides(here: Path, policy: Path) -> None:
         (["run", "other_seeds"], 2, "training seeds differ: run has [None], other_seeds [5, 6]"),
         (["two", "three"], 1, "test episodes of two and three differ; evaluate both with the same --seed"),
         (["two", "lift"], 1, "task differs: two has reach, lift has lift"),
+        (["two", "two", "--suite=knocked"], 2, "options of suite change nothing for two evaluations"),
         (["three", "run"], 2, "only one of them is an evaluation; give two eval.json, or two policies"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

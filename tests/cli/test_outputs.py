@@ -77,6 +77,9 @@ def test_overwrite_deletes_what_this_program_made_and_nothing_else(tmp_path, nam
         assert (tmp_path / "run" / name).read_text() == content
 
 
+EVAL = ["eval", "--policy.type=expert", "--robot.type=fetch", "--task.type=reach", "--workers=1"]
+
+
 def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
     (tmp_path / "link").symlink_to(ours)
     with pytest.raises(UsageError, match="is a link"):
@@ -86,6 +89,9 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
         prepare_output(ours, overwrite=True, sources=[ours / "inside"])
     (ours / "dagger").mkdir()
     assert main(["theory", str(ours / "dagger"), f"--output_dir={ours}", "--overwrite=true"]) == 2
+    assert main(["data", "build", str(ours), str(ours), "--overwrite=true"]) == 2
+    (ours / "mine.yaml").write_text("joint_noise: 0.1\n")
+    assert main([*EVAL, f"--suite={ours}/mine.yaml", f"--output_dir={ours}", "--overwrite=true"]) == 2
     assert (ours / "dagger").is_dir()
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
@@ -93,9 +99,6 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
     overwrite(ours)
     assert list(ours.iterdir()) == []
     assert (tmp_path / "thesis" / "main.tex").exists()
-
-
-EVAL = ["eval", "--policy.type=expert", "--robot.type=fetch", "--task.type=reach", "--workers=1"]
 
 
 @pytest.mark.parametrize("how", ["", "--overwrite=true"])

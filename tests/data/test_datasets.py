@@ -95,12 +95,13 @@ def test_a_merge_equals_writing_all_episodes(tmp_path, make_episode, spec):
     assert Dataset.open(tmp_path / "merged").provenance == {"merged": sources}
 
 
-@pytest.mark.parametrize("change", [{"robot": "fetch"}, {"task": "reach"}])
-def test_a_merge_of_different_robots_or_tasks_is_refused_naming_both(root, tmp_path, episodes, spec, change):
+@pytest.mark.parametrize("change", [{"robot": "fetch"}, {"task": "reach"}, {"image_size": (8, 8)}])
+def test_a_merge_of_different_robots_tasks_or_pictures_is_refused_naming_both(root, tmp_path, episodes, spec, change):
     write_dataset(episodes, tmp_path / "other", dataclasses.replace(spec, **change), **OPTIONS)
     ((what, value),) = change.items()
     with pytest.raises(
-        MismatchError, match=rf"{what} differs: .*lift has {re.escape(getattr(spec, what))}, .*other has {value}"
+        MismatchError,
+        match=rf"{what} differs: .*lift has {re.escape(str(getattr(spec, what)))}, .*other has {re.escape(str(value))}",
     ):
         merge_datasets([root, tmp_path / "other"], tmp_path / "merged", repo_id="x/y")
     assert not (tmp_path / "merged").exists()

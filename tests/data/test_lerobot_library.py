@@ -199,6 +199,7 @@ def test_episodes_deleted_by_lerobots_command(tmp_path, recorded, edit, seen):
     edit("--repo_id", REPO, "--root", str(root), "--new_root", str(kept), *words)
     assert_holds(kept, [episodes[0], *episodes[3:]])
     s.check_same_spec("before", seen, "after", Dataset.open(kept).spec)  # LeRobot drops our file
+    assert Dataset.open(kept).spec.keypoints == seen.keypoints
     assert (Dataset.open(kept).spec.instruction, Dataset.open(kept).count_successes()) == (seen.instruction, 3)
     assert dataset_tools.recompute_stats(load(kept)).meta.stats is not None
 

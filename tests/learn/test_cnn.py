@@ -16,7 +16,7 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 from manip_il.data.schema import features
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn import mlp
-from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder
+from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder, heat_map_losses
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.lerobot_policy import build_policy
 from manip_il.learn.losses import LOSSES
@@ -281,3 +281,11 @@ def test_named_points_get_keypoints_of_their_own_that_learn_where_they_are(named
     policy.save_pretrained(tmp_path)
     again = CNNPolicy.from_pretrained(tmp_path, strict=True)
     assert torch.equal(again.eval().select_action(batch), policy.eval().select_action(batch))
+
+
+@pytest.mark.parametrize("side", [90, 96, 128])
+def test_a_points_place_in_a_heat_map_is_its_pixels_whatever_the_side(side):
+    cells = -(-side // 4)
+    maps = torch.arange(cells, dtype=torch.float32).expand(1, 1, cells, cells)  # every cell holds its column
+    place = torch.tensor([[[(34 + 0.5) / side, 0.5, 1.0]]])  # the middle of pixel 34
+    assert -heat_map_losses(maps, place, (side, side)).item() == pytest.approx(34 / 4, abs=1e-4)

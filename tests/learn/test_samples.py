@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
+from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
 from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
@@ -92,6 +94,19 @@ def test_tasks_of_several_datasets_are_numbered_together(spec, tmp_path):
     assert batch["task"] == ["reach", "reach", "touch", "touch"]
     assert batch["index"].tolist() == [0, 239, 240, 479]
     assert batch["episode_index"].tolist() == [0, 11, 12, 23]
+
+
+def test_unlabelled_frames_count_in_no_dataset_that_says_so(spec, tmp_path):
+    table, other = make_table(), make_table()
+    table["label_valid"][:100] = 0
+    sources = [*write_table(table, tmp_path / "half", spec), *write_table(other, tmp_path / "whole", spec)]
+    info = tmp_path / "whole" / "meta" / "info.json"
+    told = json.loads(info.read_text())
+    del told["features"]["label_valid"]
+    info.write_text(json.dumps(told))
+    made = [sources[0], Dataset.open(tmp_path / "whole")]
+    data = Trainer(made, FitConfig(steps=2, batch_size=8), tmp_path / "run").data
+    assert len(data.train) + len(data.held_out) == 140 + 240
 
 
 def test_an_environment_state_of_one_number_is_a_vector(spec, tmp_path):

@@ -97,6 +97,19 @@ def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: 
         np.testing.assert_allclose(getattr(changed, name), getattr(compiled, name), rtol=1e-9, err_msg=name)
 
 
+def test_every_geom_of_an_object_touches_the_table_whatever_is_drawn():
+    bar = """<mujoco><worldbody><geom type="box" size="1 1 0.02" pos="0 0 -0.02"/>
+    <body name="bar" pos="0 0 0.041"><freejoint/><geom type="box" size="0.1 0.01 0.005" mass="0.1"/>
+    <geom type="box" size="0.01 0.01 0.04" pos="0.1 0 0" mass="0.1"/>
+    <geom type="box" size="0.01 0.01 0.04" pos="-0.1 0 0" mass="0.1"/></body></worldbody></mujoco>"""
+    plain = mujoco.MjSpec.from_string(bar).compile()
+    changed, like = copy.copy(plain), np.array([0.1, 0.01, 0.005, 0.3, 1.0, *NOTHING_DRAWN])
+    apply(changed, plain, {"bar": Object("bar", 1, 1, 0, 0)}, NO_MOTORS, with_drawn(like, {"friction": 0.9}))
+    data = mujoco.MjData(changed)
+    mujoco.mj_step(changed, data, 500)
+    assert data.qpos[2] == pytest.approx(0.04, abs=1e-3)
+
+
 @pytest.mark.parametrize("lacks", OLDER)
 def test_an_older_state_lacks_numbers_at_the_end_of_which_nothing_was_drawn(lacks: int):
     like = np.array([*CUBE, *NOTHING_DRAWN])

@@ -89,7 +89,8 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     write_checkpoint(run / "best" / "pretrained_model", "act", spec, origin=meta)
     assert "not measured" in cards(run, "policy", "user/act")[CARD].decode()
     better = EVALUATION | {"success_rate": 0.97, "n_episodes": 500}
-    for place, more in {"eval": {}, "validation/3": better, "easy": better | {"settings": {"suite": "easy"}}}.items():
+    others = {"easy": better | {"settings": {"suite": "easy"}}, "round_0": better | {"policy_sha256": "another"}}
+    for place, more in {"eval": {}, "validation/3": better, **others}.items():
         (run / place).mkdir(parents=True)
         (run / place / "eval.json").write_text(json.dumps(EVALUATION | more))
     text = cards(run, "policy", "user/act")[CARD].decode()

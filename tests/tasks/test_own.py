@@ -20,8 +20,10 @@ from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
+from manip_il.sim.points import point_names
 from manip_il.tasks import table
 from manip_il.tasks.config import make_config
+from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
@@ -41,6 +43,58 @@ def test_the_expert_solves_a_task_from_a_file(robot, example, tmp_path):
     (tmp_path / "own.py").write_text(example)
     episodes = RolloutJob(make_config(robot, str(tmp_path / "own.py")), hold=0).run(range(5))
     assert all(episode.success for episode in episodes)
+
+
+FITTED = """
+    tall = 0.1
+
+    def fitted(self, robot):
+        small = Touch()
+        small.tall = 0.02
+        return small
+"""
+
+
+def test_a_task_that_fits_itself_to_the_arm_is_that_task_throughout(tmp_path):
+    (tmp_path / "own.py").write_text(TOUCH + FITTED)
+    env = manip_il.make_env("panda", str(tmp_path / "own.py"))
+    assert env.scene.task.tall == env._task.tall == 0.02
+
+
+CYLINDER = """
+from dataclasses import dataclass
+from manip_il.sim.shape import Shape
+from manip_il.tasks.pick_place import PickPlace
+
+@dataclass(frozen=True)
+class Tin(PickPlace):
+    name: str = "tin"
+    shape: Shape = Shape.parse("cylinder:0.04x0.06")
+"""
+
+
+def test_an_own_object_is_replaced_by_the_one_that_is_asked_for(tmp_path):
+    (tmp_path / "own.py").write_text(CYLINDER)
+    asked = {name: make_config("panda", str(tmp_path / "own.py"), object=name) for name in ("", "box:0.05", "sphere")}
+    assert [one.object for one in asked.values()] == ["", "box:0.05", "sphere:0.05"]
+    assert make_config("panda", str(tmp_path / "own.py"), object="cylinder:0.04x0.06") == asked[""]
+
+
+def test_files_that_were_edited_since_they_were_read_are_refused(tmp_path, touch):
+    arm = tmp_path / "arm.yaml"
+    arm.write_bytes(ROBOTS["so101"].read_bytes())
+    make_config(str(arm), str(touch))
+    for file in (arm, touch):
+        before = file.read_bytes()
+        file.write_bytes(before + b"\n# edited\n")
+        with pytest.raises(UsageError, match=f"{file.name} was edited"):
+            make_config(str(arm), str(touch))
+        file.write_bytes(before)
+
+
+def test_a_number_is_no_point_of_the_scene(tmp_path):
+    (tmp_path / "own.py").write_text(TOUCH.replace('"cube": cube,', '"cube": cube[2],'))
+    assert "cube" not in point_names(scene_of("panda", str(tmp_path / "own.py")))
 
 
 def test_gymnasium_and_python_take_the_path(touch):
@@ -112,6 +166,10 @@ def test_a_node_gets_the_file(touch):
 MISTAKES = {
     "is not Python": ("def (", "cannot be run: SyntaxError"),
     "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
+    "another object": (
+        TOUCH.replace('objects = ("cube",)', 'objects = ("cubes",)'),
+        "unknown object of task touch 'cubes'",
+    ),
     "one name": (TOUCH.replace("    def draw(", '    grasped = "cube"\n\n    def draw('), "expected a tuple of names"),
     "observes two": (
         TOUCH.replace('"cube": cube,', '"cube": cube[:2],'),
