@@ -144,7 +144,8 @@ class RedrawOptions(Edit, Varied, Seeded):
     """Randomise the goals, untouched objects and appearance of visited states; label and render each scene.
 
     TARGET is a LeRobot dataset for training policies on pictures; each scene is one episode. Scenes without a valid
-    label are left out. --vary takes view, clutter, object (its colour), or YAML files of ranges.
+    label are left out. --vary takes view, clutter, object (its colour), sensing (its noise), or YAML files of
+    ranges.
     """
 
     example: ClassVar[str] = "manip-il data redraw runs/dagger datasets/redrawn --frames=20000"

@@ -18,7 +18,7 @@ from manip_il.collect.environments import make_env, make_expert
 from manip_il.collect.query import branch
 from manip_il.mdp import Actor, Label, State, Transition
 from manip_il.seeding import rng_for, stream_seeds
-from manip_il.sim.conditions import PICTURED, Condition, draw
+from manip_il.sim.conditions import MEASURED, PICTURED, Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import TakesArgument
@@ -40,9 +40,10 @@ _TRIES = 5  # scenes drawn for a state before the visited scene itself is used
 class Scenes:
     """How scenes are drawn from a dataset's states. cameras: None for scenes without pictures.
 
-    anew: whether to also randomise goals and objects, not only appearance. conditions: ranges of the appearance.
-    branch_steps: control steps that the expert drives from every state, for policies that predict chunks. first: number
-    of the first scene in the random stream, so that datasets redrawn with the same seed can differ.
+    anew: whether to also randomise goals and objects, not only appearance. conditions: ranges of the appearance and
+    of the observations' noise. branch_steps: control steps that the expert drives from every state, for policies that
+    predict chunks. first: number of the first scene in the random stream, so that datasets redrawn with the same seed
+    can differ.
     """
 
     cameras: CameraConfig | None
@@ -74,7 +75,9 @@ class SceneDrawer:
     """Draws, labels and renders scenes of one environment."""
 
     def __init__(self, config: EnvConfig, scenes: Scenes):
-        self._env, self._shape = make_env(config, scenes.cameras), config.object
+        noise = [one.only(MEASURED) for one in scenes.conditions]
+        self._env, self._shape = make_env(config, scenes.cameras, noise), config.object
+        self._has_noise = any(one.ranges for one in noise)
         self._expert = make_expert(config)
         self._scenes = scenes
 
@@ -85,6 +88,8 @@ class SceneDrawer:
         `seed` column. lead: offset added to the label of a single frame, (n,).
         """
         rng = rng_for(number, "redraw")
+        if self._has_noise:
+            self._env.start(number)  # draws the noise of the scene's observations
         visited = self._with_look(replace(visited, streak=0, ever=False), number)
         for _ in range(_TRIES if self._scenes.anew else 0):
             state = self.redrawn(visited, rng)

@@ -210,9 +210,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         world = self._measured()
         seen: tuple[dict[str, Picture], dict[str, F32]] = {}, {}
         if self._view:
-            points = [*points_in(self.world).values()]
-            keypoints = projections(self.scene, self._view, np.stack(points)) if points else {}
-            seen = self._pictures(self._view), keypoints
+            points, images = [*points_in(self.world).values()], self._pictures(self._view)
+            seen = images, projections(self.scene, self._view, np.stack(points)) if points else {}
         self._pictured.append(seen)
         (images, keypoints), text = self._pictured[0], self.task_description
         self._observed.append(

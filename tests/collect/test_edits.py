@@ -203,6 +203,15 @@ def test_labels_with_the_servos_sag_keep_it_in_redrawn_scenes_and_lose_it_nowher
         redraw_dataset(served, Scenes(None, 3, branch_steps=2), EditTarget(tmp_path / "branches"))
 
 
+def test_redrawn_scenes_are_observed_with_noise(visited, tmp_path):
+    noisy = Scenes(None, 10, conditions=(Condition("noise", joint_noise=0.05),))
+    redraw_dataset(visited, noisy, EditTarget(tmp_path / "noisy"))
+    env = env_of(visited.env)
+    for scene in Dataset.open(tmp_path / "noisy").read_episodes():
+        env.set_state(State.from_vector(scene.columns["sim_state"][0]))
+        assert 0.01 < np.abs(scene.columns["observation.state"][0] - env.observe().state).max() < 0.5
+
+
 @pytest.mark.gl
 @pytest.mark.slow
 def test_redrawing_depends_on_the_seed_alone_and_more_frames_begin_with_the_same(visited, tmp_path):
