@@ -15,7 +15,6 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
-from manip_il.doctor import examine
 from manip_il.doctor.examine import examine_folder
 
 from ..damage import DATA, EPISODES, cut, edit_json, edit_table
@@ -208,19 +207,15 @@ PLANTS: tuple[Plant, ...] = (
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("made")
-    return [make(folder / f"set{number:02d}", number) for number in range(20)]
+    return [make(folder / f"set{number:02d}", number) for number in range(10)]
 
 
-@pytest.fixture(autouse=True)
-def no_child(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process for each examination would take most of the time; others test it."""
-    monkeypatch.setattr(examine, "check_arrived", lambda root, strict: None)
-
-
+@pytest.mark.usefixtures("no_child")
 def test_no_false_alarms(made):
     assert [(root.name, str(finding)) for root in made for finding in examine_folder(root)] == []
 
 
+@pytest.mark.usefixtures("no_child")
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
 def test_planted_defects_are_found(made, tmp_path, plant):
     missed: list[str] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +23,24 @@ from .teaching import make
 FRONT = "observation.images.front"
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    make(folder / "ours", 3)
+    make(folder / "theirs", 2)
+    return folder
+
+
 @pytest.fixture
-def ours(tmp_path: Path) -> Path:
+def ours(made: Path, tmp_path: Path) -> Path:
     """One with cameras, beside its journals."""
-    return make(tmp_path / "ours", 3)
+    return shutil.copytree(made, tmp_path / "copy") / "ours"
 
 
 @pytest.fixture
-def theirs(tmp_path: Path) -> Path:
+def theirs(made: Path, tmp_path: Path) -> Path:
     """One of LeRobot's."""
-    return make(tmp_path / "theirs", 2)
+    return shutil.copytree(made, tmp_path / "copy") / "theirs"
 
 
 def mend(root: Path) -> list[str]:
@@ -55,6 +64,7 @@ def test_journals_that_hold_less_than_the_dataset_replace_nothing(ours):
     assert digests(ours) == before
 
 
+@pytest.mark.usefixtures("no_child")
 def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     whole = json.loads((theirs / layout.STATS).read_text())
     edit_json(theirs / layout.INFO, lambda info: info.update(total_frames=3, total_episodes=1))
@@ -80,6 +90,7 @@ def test_what_a_link_leads_to_is_not_changed(theirs):
     assert json.loads(elsewhere.read_text())["total_frames"] == 3
 
 
+@pytest.mark.usefixtures("no_child")
 def test_lerobots_tool_deletes_the_episodes_that_a_remedy_names(theirs, warm_lerobot: Warm):
     edit_table(theirs / DATA, lambda table: table[s.ACTION].__setitem__(4, [float("nan")] * 5))
     [finding] = [one for one in examine_folder(theirs) if "not finite" in one.text]
