@@ -55,13 +55,6 @@ def test_the_file_holds_every_case_and_what_follows_from_them():
     assert (empty["n"], empty["left_out"], empty["success_rate"], empty["interval"]) == (0, 4, None, None)
 
 
-def test_the_table_shows_the_numbers():
-    many = row("action", tuple(Case(i, 0, i + 2, 1) for i in range(40)))  # gaps of 1 to 40
-    made = certificate(row("action", ACTIONS))
-    assert certificate(many).table().rows[2][2:4] == ("20.5", "40")
-    assert made.table().rows[2][1:] == ("75.0 % [30.1, 95.4]", "17.5", "50", "4", "0")
-
-
 @pytest.mark.parametrize("kind", ["random", "opposite"])
 def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate, kind: str):
     expert = Expert(scene_of("fetch", "pick_place"))

@@ -1,7 +1,6 @@
 """Intervals and tests agree with published tables, or with counting every flip of signs, and keep their properties."""
 
 import itertools
-import math
 import random
 
 import pytest
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 from manip_il.evaluation.intervals import (
     PairCounts,
     Proportion,
-    confidence_sequence,
     sign_flip_exact,
     wilson_interval,
 )
@@ -49,17 +47,6 @@ def test_a_confidence_sequence_holds_at_every_look_where_wilsons_does_not():
                 missed[sequential] += wrong[sequential]
         assert missed[True] <= 5  # 5 % of 100
         assert missed[False] > 15  # peeking costs so much
-
-
-def test_the_edge_of_a_confidence_sequence_is_where_the_bet_reaches_twenty():
-    successes, n = 45, 50
-    grid = [(i + 0.5) / 20_000 for i in range(20_000)]
-    # The mixture by a sum over rates in place of the beta function: another way to the same ratio.
-    prior = [1 / math.sqrt(p * (1 - p)) for p in grid]
-    likelihood = [p**successes * (1 - p) ** (n - successes) for p in grid]
-    mixture = sum(w * x for w, x in zip(prior, likelihood, strict=True)) / sum(prior)
-    for edge in confidence_sequence(successes, n):
-        assert mixture / (edge**successes * (1 - edge) ** (n - successes)) == pytest.approx(20, rel=0.01)
 
 
 @pytest.mark.parametrize(

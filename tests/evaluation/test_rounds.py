@@ -25,12 +25,6 @@ def records(successes: tuple[float, ...] = SUCCESS, labels: int = 100, seconds: 
 RUN = history(records(), "runs/x")
 
 
-def test_wall_clock_adds_up_without_validating():
-    assert [one.seconds for one in RUN] == [10, 20, 30, 40, 50]
-    assert (RUN[2].labels, RUN[2].steps, RUN[2].episodes) == (300, 300, 9)
-    assert str(RUN[1].validation) == "90.0 % [59.6, 98.2]"
-
-
 def test_validated_iterations_are_rounds_and_cost_what_all_before_them_took():
     lines = [
         {"iteration": i, "steps": 100 * i, "episodes": 2 * i, "validation_success": rate, "validation_episodes": 10}

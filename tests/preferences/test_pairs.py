@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import MismatchError
 from manip_il.preferences.answers import Answer, Preferences
 from manip_il.preferences.frames import find_datasets
 from manip_il.preferences.pairs import Pairs, choose_pairs, disagreement, join_pairs, read_clips
@@ -26,19 +26,6 @@ def test_no_pair_is_there_twice_and_no_clip_is_compared_with_itself(clips):
     every = [frozenset(pair) for pair in clips.pairs.pairs]
     assert len(set(every)) == len(every)
     assert all(len(pair) == 2 for pair in every)
-
-
-def test_clips_are_whole(clips):
-    episodes = np.concatenate([one.episodes + 1_000 * number for number, one in enumerate(clips.frames)])
-    assert (np.ptp(episodes[clips.rows], axis=-1) == 0).all()
-
-
-def test_episodes_shorter_than_a_clip_are_left_out(datasets):
-    roots = [datasets / "good", datasets / "bad"]
-    clips = clips_of(roots, 10, 31)
-    assert {clip.source for pair in clips.pairs.pairs for clip in pair} == {1}
-    with pytest.raises(ManipError, match="--clip is 61 control steps; the longest episode has 60"):
-        clips_of(roots, 1, 61)
 
 
 def test_the_same_seed_chooses_the_same_pairs(datasets):

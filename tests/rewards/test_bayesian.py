@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from manip_il.rewards.bayesian import Choices, Posterior, draw_posterior, fit, sample
-from manip_il.rewards.paths import Demonstration, PathProblem, add_rivals, open_features, rivals
+from manip_il.rewards.paths import Demonstration, PathProblem, open_features, rivals
 from tests.rewards.grids import acyclic, all_paths, demonstrations, excess
 
 TRUTH = np.array([1.0, 4.0, 2.0])
@@ -62,17 +62,6 @@ def test_many_choices_leave_the_weights_that_made_them():
 def test_what_is_learnt_plans_as_the_demonstrator_on_unseen_grids():
     found = fit(demonstrations(15, TRUTH, **SIZE), np.random.default_rng(0))
     assert excess(found.mean, TRUTH, **SIZE) < 0.01
-
-
-def test_rivals_are_paths_other_than_the_demonstration_each_once():
-    shown, rng = demonstrations(8, TRUTH, **SIZE), np.random.default_rng(0)
-    found = rivals(shown, rng.exponential(3.0, (30, 3)))
-    again = add_rivals(shown, found, np.array([TRUTH]))
-    assert max(map(len, found)) > 2
-    for one, sums, more in zip(shown, found, again, strict=True):
-        assert sums[0] == pytest.approx(one.sums)
-        assert len(np.unique(sums.round(6), axis=0)) == len(sums)
-        assert len(more) == len(sums)  # the demonstration is what its own taste finds
 
 
 def test_a_feature_in_which_all_agree_is_open_and_keeps_its_prior():

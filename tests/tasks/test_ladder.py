@@ -18,19 +18,12 @@ from manip_il.robots.reach import Reach
 from manip_il.robots.rotations import angle_ahead, angle_between, angle_from_down, hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import Pose
-from manip_il.tasks.grasp import FUNNEL_RADIUS, HOVER, LEAN, MAX_TILT, OPEN_SLACK, grasp_of, lie_of
+from manip_il.tasks.grasp import HOVER, LEAN, MAX_TILT, OPEN_SLACK, grasp_of, lie_of
 from manip_il.tasks.ladder import (
-    AT_GOAL,
-    AT_GRASP_ANGLE,
     CLEAR,
-    LiftProfile,
-    carry,
-    carry_progress,
-    let_go,
     pick_progress,
     pick_rungs,
 )
-from manip_il.tasks.reach import ReachGoal
 
 OPEN, EDGE = 0.08, 0.05  # of the hand; of the cube where a test says no other [m]
 LOWEST = 0.021  # of the hand over the table [m]
@@ -162,28 +155,6 @@ def test_the_ladder_leads_to_the_goal(world: Placed, name: str, opening: float, 
     np.testing.assert_allclose(target.position, position)
 
 
-@given(widths)
-def test_hovering_and_waiting_count_from_the_top_whatever_the_objects_size(edge: float):
-    raised = max(0.0, LOWEST - edge / 2)  # a low cube is gripped above its middle
-    hovering = at(-0.2, 0.1, 0.2, edge=edge)
-    assert rung(hovering)[1].position[2] == pytest.approx(top(hovering) + HOVER + raised)
-    for waiting in (tipped(0.1, MAX_TILT + 0.1, edge=edge), at(0, 0, 0.1, edge=edge, opening=0.0)):
-        assert rung(waiting)[1].position[2] == pytest.approx(top(waiting) + CLEAR + raised)
-
-
-@given(st.floats(0, 0.2), st.floats(0, 0.2), widths)
-def test_the_nearer_to_being_over_the_object_the_lower_the_hand_may_go(one: float, other: float, edge: float):
-    near, far = (grasp_of(at(off, 0, 0.3, edge=edge), "object").height for off in sorted((one, other)))
-    assert 0 <= near <= far <= edge / 2 + HOVER
-
-
-def test_beside_a_wide_object_the_fingers_have_less_room_than_beside_a_narrow_one():
-    small, large = at(0.9 * FUNNEL_RADIUS, 0, 0.1, edge=0.03), at(0.9 * FUNNEL_RADIUS, 0, 0.1, edge=0.07)
-    assert grasp_of(small, "object").height == 0
-    assert grasp_of(large, "object").height > 0
-    assert rung(small)[1].position[2] < rung(large)[1].position[2] - 0.005
-
-
 @given(st.floats(0.06, 0.2), st.floats(0, 2 * np.pi), st.floats(-0.02, 0.04), widths)
 def test_beside_the_object_a_hand_that_is_too_low_only_rises(off: float, direction: float, height: float, edge: float):
     world = at(off * np.cos(direction), off * np.sin(direction), height, edge=edge)
@@ -221,12 +192,6 @@ def test_fingers_that_closed_too_early_open_before_the_hand_descends(opening: fl
     assert target.position[2] >= top(world) + CLEAR
 
 
-@given(st.floats(0.03, 0.0799))
-def test_a_hand_that_is_all_open_goes_around_whatever_it_can(edge: float):
-    assert grasp_of(at(0, 0, 0.1, edge=edge), "object").open_enough
-    assert not grasp_of(at(0, 0, 0.1, edge=edge, opening=edge), "object").open_enough
-
-
 def test_fingers_that_touch_the_cube_between_them_hold_it_and_others_do_not():
     assert rung(at(0, 0, 0, opening=EDGE, touching=True))[0] == "carry"
     assert rung(at(0, 0, 0, opening=EDGE))[0] != "carry"
@@ -234,36 +199,10 @@ def test_fingers_that_touch_the_cube_between_them_hold_it_and_others_do_not():
     assert rung(at(0, 0, 0.07, opening=EDGE, touching=True))[0] != "carry"
 
 
-def test_a_turned_hand_does_not_close():
-    askew = at(0, 0, 0, AT_GRASP_ANGLE + 0.1)
-    assert rung(askew)[0] == "descend"
-    np.testing.assert_allclose(rung(askew)[1].rotation, hand_down(0.0))
-
-
 @pytest.mark.parametrize(("way", "yaw"), [((0.03, 0.0), 0.0), ((0.0, 0.03), np.pi / 2), ((0.0, -0.07), 0.0)])
 def test_the_fingers_go_down_where_no_neighbour_stands(way: tuple[float, float], yaw: float):
     world = at(0, 0, 0.1, around=(way,))
     assert abs(grasp_of(world, "object").yaw) == pytest.approx(yaw)
-
-
-def test_what_has_to_rise_first_does_so_without_moving_sideways():
-    world, to = held((0, 0, 0)), np.array([0.3, 0.1, 0.15])
-    low = carry(world, "object", to, LiftProfile(most=0.05, slope=1.0, free=0.01, rise_first=0.03))
-    np.testing.assert_allclose(low.position - world.ee.position, [0, 0, 0.05])
-    np.testing.assert_allclose(carry(world, "object", to).position - world.ee.position, [-0.2, 0, 0.05])
-
-
-def test_carrying_is_done_where_the_object_is_to_go_and_nowhere_else():
-    world = held((0, 0, 0))
-    at_place, beside = (carry_progress(world, "object", world.cube.position + [x, 0, 0]) for x in (0, 0.05))
-    assert beside < at_place == 1
-
-
-def test_a_hand_lets_go_before_it_rises():
-    grips, free = (at(0, 0, 0, opening=opening, touching=opening == EDGE) for opening in (EDGE, EDGE + 0.02))
-    np.testing.assert_array_equal(let_go(grips, "object", 0.1).position, grips.ee.position)
-    assert let_go(free, "object", 0.1).position[2] == pytest.approx(free.cube.position[2] + 0.1)
-    assert let_go(grips, "object", 0.1).opening == let_go(free, "object", 0.1).opening > EDGE
 
 
 def tipped(z: float, tilt: float, turn: float = 0.0, **changes: Any) -> Placed:
@@ -290,20 +229,6 @@ def test_an_object_that_leans_on_something_is_gripped_by_its_upright_sides(tilt:
     assert abs(float(target.rotation[:, 1] @ leaning.cube.rotation[:, 0])) == pytest.approx(1.0)
 
 
-def test_at_the_goal_the_fingers_stay_closed():
-    name, target = rung(held((0.004, 0, -0.004)))
-    assert (name, target.opening) == ("at_goal", 0.0)
-
-
-def test_without_an_object_the_hand_goes_to_the_goal():
-    rungs, world = ReachGoal().rungs, at(-0.2, 0.1, 0.2, yaw=0.3)
-    name, target = rung(world, rungs)
-    assert name == "carry"
-    np.testing.assert_array_equal(target.position, world.goal)
-    there = replace(world, ee=Pose(world.goal + 0.005, hand_down(0.3)))
-    assert rung(there, rungs)[0] == "at_goal"
-
-
 @given(st.floats(0, 0.2), st.floats(0, 2 * np.pi), st.floats(-0.02, 0.3), st.floats(0, OPEN), widths, st.booleans())
 def test_no_target_is_in_the_table(
     off: float, direction: float, height: float, opening: float, edge: float, touching: bool
@@ -321,12 +246,6 @@ def test_no_target_is_in_the_table(
 def test_progress_is_a_share_and_holding_is_more_than_any_way_to_it(x, y, z, opening: float, edge: float, yaw: float):
     free = pick_progress(at(x, y, z, yaw, edge=edge, opening=opening), "object")
     assert 0 < free < 0.5 <= pick_progress(held((x, y, z), edge), "object") <= 1
-
-
-def test_progress_is_whole_at_the_goal_alone():
-    assert pick_progress(held((0, 0, 0)), "object") == 1
-    assert pick_progress(held((0, 0, 2 * AT_GOAL)), "object") < 1
-    assert pick_progress(replace(held((0, 0, 0)), touching=False), "object") < 0.5
 
 
 @given(st.floats(-np.pi / 4, np.pi / 4), st.floats(-np.pi, np.pi))
