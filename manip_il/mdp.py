@@ -108,7 +108,7 @@ class Transition:
     """One control step of one episode: all content of a dataset's frame.
 
     `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from after it.
-    `success`: whether the last steps, as many as required, were all within the tolerance. `done` marks the last frame.
+    `success`: whether the last `success_steps` steps were all within the tolerance. `done` marks the last frame.
     """
 
     seed: int

@@ -28,9 +28,9 @@ _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
 
 def round_policy(settings: Open) -> tuple[Open, Path | None]:
-    """Return the policy options of the later rounds, and the `pretrained_model` folder to start from, if any.
+    """Return the policy options for fits, and the `pretrained_model` folder to start from, if any.
 
-    If that folder holds an mlp, its stored options replace `path`: they are needed before LeRobot is imported.
+    For an mlp, the options stored in that folder replace the key `path`: they are needed before LeRobot is imported.
     """
     if "path" not in settings:
         return settings, None

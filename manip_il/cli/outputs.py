@@ -128,7 +128,7 @@ def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] =
     files = {folder / name: mark.encode() for name, mark in _MARKS.items() if (folder / name).is_file()}
     if not any(mark in path.read_bytes() for path, mark in files.items()):
         raise UsageError(
-            f"{folder} holds files that manip-il did not make (none of {', '.join(_MARKS)} in it is ours); choose "
+            f"{folder} holds files that manip-il did not make (it wrote no {' or '.join(_MARKS)} there); choose "
             "another folder, or delete it by hand"
         )
 

@@ -46,7 +46,7 @@ class Own:
 
 
 class Dataset:
-    """A dataset on disk. Everything is read once, on first use.
+    """A dataset on disk. Tables are read once, on first use; columns and pictures at every call.
 
     Raises `ManipError` naming a file that cannot be read.
     """
@@ -80,7 +80,7 @@ class Dataset:
 
     @cached_property
     def own(self) -> Own | None:
-        """Content of `meta/manip_il.json`; None in a dataset of another program."""
+        """Content of `meta/manip_il.json`; None if there is none, as in a dataset of another program."""
         path = self.root / layout.OURS
         if not path.exists():
             return None

@@ -125,9 +125,10 @@ def read_arm(path: Path) -> Arm:
 
 
 def require_pair(left: Arm, right: Arm) -> None:
-    """Raise `UsageError` unless two arms can be compared: both or neither are evaluations, with equal training seeds.
+    """Raise `UsageError` unless two arms can be compared.
 
-    Two single policies can be compared whatever their seeds.
+    Both must be evaluations, or both policies to evaluate, with the same training seeds; the seeds of two arms with one
+    policy each may differ.
     """
     if len({member.result is None for arm in (left, right) for member in arm.members}) > 1:
         raise UsageError(

@@ -128,7 +128,7 @@ def rates_figure(bars: Sequence[Bar]) -> Figure:
 
 @dataclass(frozen=True)
 class Curve:
-    """Validation success by round of one arm, one run per training seed. costs: which of its costs are known."""
+    """Validation success by round for one arm, one run per training seed. costs: those that are known (labels, ...)."""
 
     name: str
     runs: tuple[History, ...]

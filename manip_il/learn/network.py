@@ -199,7 +199,7 @@ class MLPNetwork(nn.Module):
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads in a `with` block. Waiting ones spin: on one core, two are far slower than one."""
+    """Let torch use `count` threads in a `with` block. Idle ones busy-wait: two on one core are far slower than one."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -192,7 +192,7 @@ class LearnedReward:
 
     @torch.inference_mode()
     def members(self, inputs: F32) -> F64:
-        """Return every network's reward, (M, B), for inputs (B, n + k + n), in log-odds per step."""
+        """Return every network's reward in log-odds per step, (M, B). inputs: as in `__call__`."""
         with threads(1):
             parts = [self.network.members(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
         return np.concatenate(parts, axis=1).astype(np.float64)

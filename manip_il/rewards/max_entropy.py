@@ -122,8 +122,8 @@ def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float 
 def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     """Return the smallest weights (K,) [1/m] for which the sum over all paths is guaranteed to be finite.
 
-    The weight of length is the log of the largest number of edges from a node, divided by the length of the shortest
-    edge [m]; the other weights are 0.
+    The weight of length is just above the log of the largest number of edges from a node, divided by the length of the
+    shortest edge [m]; the other weights are 0.
     """
     found = np.zeros(demonstrations[0].problem.features.shape[1])
     shortest = min(float(one.problem.features[:, LENGTH].min()) for one in demonstrations)

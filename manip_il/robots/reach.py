@@ -110,9 +110,9 @@ class Reach:
         return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
 
     def leaning(self, position: Sequence[float] | F64) -> bool:
-        """Return whether a leaning hand gets near `position` (3,) [m].
+        """Return whether a hand that may lean gets near `position` (3,) [m], by a rule of thumb.
 
-        It does if the downward hand gets near `position`, or near the point 13 cm closer to the map's middle.
+        The downward hand must get near it, or near the point up to 13 cm closer, horizontally, to the map's centre.
         """
         if self.nearly(position):
             return True

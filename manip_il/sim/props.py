@@ -52,7 +52,7 @@ class Prop(NamedTuple):
 def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
     """Return the visual objects of a scene's world; poses of mocap bodies and joints in `data` must be up to date.
 
-    clutter: (2,) number of objects, and the seed of their kinds and places.
+    clutter: (2,) largest number of objects, and the seed of their kinds and places.
     """
     return [*_stand(scene, data), *_clutter(scene, data, int(clutter[0]), int(clutter[1]))]
 

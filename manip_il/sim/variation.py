@@ -125,7 +125,7 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of a variation's objects, (o, 3) [m], and their MuJoCo geom type if drawn, else None."""
+    """Return `geom_size` of all objects, (o, 3) [m], and their MuJoCo geom type, None unless a shape was sampled."""
     shape = float(part(variation, "shape")[0])
     sizes = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)[:, _SIZE]
     return sizes, None if shape == _OWN else int(shape)

@@ -81,7 +81,8 @@ def lower_end(world: World) -> F64:
 def upper_axis(world: World) -> F64:
     """Return the direction along the peg to its intended upper end, (3,).
 
-    For a held peg this is the end that the hand points away from; for a lying peg, the one away from the robot.
+    For a standing peg this is the end on top; for a held peg, the end that the hand points away from; for a lying peg,
+    the end whose yaw is closer to the hand's and to straight ahead.
     """
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]

@@ -1,1 +1,1 @@
-"""Theorems on imitation, compared with exactly solved processes, linear systems and an arm."""
+"""Proven bounds of imitation learning, beside exactly solved MDPs, linear systems and a robot arm."""

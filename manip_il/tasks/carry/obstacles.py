@@ -38,7 +38,7 @@ _LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle
 
 
 def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add every obstacle with its contact box, the table's edge, and mocap bodies whose positions hold the weights."""
+    """Add the obstacles, their contact boxes, the table's edge, and bodies whose positions are the reward's weights."""
     for name, obstacle in OBSTACLES.items():
         body = add_furniture(spec, name)
         body.pos = [0.5, 0, -PARKED]

@@ -43,7 +43,7 @@ class AlohaExpert:
         self._arms = {side: _Arm(self._env, number, side) for number, side in enumerate(SIDES)}
 
     def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's action in `state`, (14,). Raises `MismatchError` for another task's state."""
+        """Return the expert's label of `state`, action (14,). Raises `MismatchError` for another task's state."""
         env = self._env
         env.set_state(state)
         scene = env.scene(self._kind)
