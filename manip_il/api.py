@@ -35,11 +35,11 @@ from manip_il.seeding import stream_base, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.tasks.config import EnvConfig, make_config
 
-Policy = Checkpoint | Path
+Policy = Checkpoint | Path | str
 
 
 def record(
-    root: Path,
+    root: Path | str,
     env: EnvConfig,
     episodes: int = 50,
     *,
@@ -57,6 +57,7 @@ def record(
     default 1 with a policy, else 0.
     Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder exists.
     """
+    root = Path(root).expanduser()
     driver = RolloutJob.driver if policy is None else PolicyDriver((_folder(policy),), beta)
     chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)} | options
     job, journals = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals")
@@ -77,7 +78,7 @@ def record(
 
 def train(
     datasets: Dataset | Sequence[Dataset],
-    output_dir: Path,
+    output_dir: Path | str,
     *,
     seed: int = 0,
     on_log: Callable[[dict[str, Any]], None] | None = None,
@@ -93,11 +94,11 @@ def train(
 
     opened = (datasets,) if isinstance(datasets, Dataset) else tuple(datasets)
     config = FitConfig(seed=stream_base("training", seed), **options)
-    return Checkpoint.open(Trainer(opened, config, output_dir).fit(on_log))
+    return Checkpoint.open(Trainer(opened, config, Path(output_dir).expanduser()).fit(on_log))
 
 
 def dagger(
-    output_dir: Path,
+    output_dir: Path | str,
     env: EnvConfig,
     *,
     beta: str | None = None,
@@ -110,8 +111,10 @@ def dagger(
 
     beta, query: as on the command line, such as `"linear:5"` and `"probability:0.1"`. options: other fields of
     `RunConfig`. A folder with finished rounds is continued with the same options, except that `rounds` may be larger.
-    Raises `UsageError` for options that contradict each other, `MismatchError` if they differ from the folder's.
+    Raises `UsageError` for options that contradict each other, or a folder with other files, `MismatchError` if they
+    differ from the folder's.
     """
+    output_dir = Path(output_dir).expanduser()
     options |= {} if beta is None else {"beta": BetaSchedule.parse(beta)}
     options |= {} if query is None else {"query_rule": parse_query(query)}
     config = RunConfig(env=env, fit=fit or FitConfig(), **options)
@@ -159,6 +162,8 @@ def _check_same(path: Path, config: RunConfig) -> None:
     now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
     now["fit"] = {one.name: now["fit"][one.name] for one in fields(FitConfig) if not one.metadata.get("free")}
     has_begun = any(path.parent.glob("round_*"))
+    if not has_begun and not path.is_file() and any(path.parent.glob("[!.]*")):
+        raise FolderExistsError(path.parent)
     before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
     for key in now:
         if key in before and before[key] != now[key]:  # earlier versions did not store the fit
@@ -167,4 +172,4 @@ def _check_same(path: Path, config: RunConfig) -> None:
 
 
 def _folder(policy: Policy) -> Path:
-    return policy.path if isinstance(policy, Checkpoint) else find_policy(policy)
+    return policy.path if isinstance(policy, Checkpoint) else find_policy(Path(policy).expanduser())

@@ -40,7 +40,10 @@ def test_a_folder_holds_the_results_of_one_set_of_options(tmp_path: Path, monkey
 
 def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
     with pytest.raises(UsageError, match="already exists"):
-        manip_il.record(tmp_path, manip_il.make_config("panda", "reach"), 1)
+        manip_il.record(str(tmp_path), manip_il.make_config("panda", "reach"), 1)
+    (tmp_path / "best").mkdir()
+    with pytest.raises(UsageError, match="already exists"):
+        manip_il.dagger(tmp_path, manip_il.make_config("panda", "reach"))
 
 
 def test_without_a_policy_the_environment_must_be_given():

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, Open, given
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
@@ -34,12 +34,28 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
 
     values = {name: value for name, value in env.items() if value is not None}
     if origin is not None:
+        if lacking := [one for one in own_files(origin.robot, origin.task) if one[2:].partition(".")[0] not in values]:
+            raise UsageError(
+                f"the policy is for {origin.robot} {origin.task}, of a file of your own; give {' '.join(lacking)}"
+            )
         of_policy: dict[str, Any] = {"robot": origin.robot, "control_hz": origin.fps}
         of_policy |= {} if origin.task == UNKNOWN_TASK else {"task": origin.task}
         values = of_policy | values
         if values.get("task") == origin.task:
             values.setdefault("object", origin.object)
     return make_config(**values)
+
+
+def own_files(robot: str, task: str) -> list[str]:
+    """Return the options, with FILE for a path, that commands need for a robot or a task that is not built in."""
+    from manip_il.data.dataset import UNKNOWN_TASK
+    from manip_il.robots.table import is_robot
+    from manip_il.tasks.table import is_task
+
+    if robot in stock.ROBOTS or task == UNKNOWN_TASK:
+        return []
+    robots = [] if is_robot(robot) else ["--robot.type=FILE.yaml"]
+    return robots + ([] if is_task(task) else ["--task.type=FILE.py"])
 
 
 _FILES = (".py", ".yaml", ".yml")  # suffixes of files with a user's own task or robot

@@ -58,11 +58,16 @@ class Output(Replacing):
         """
         folder, resume = self.output_dir, getattr(self, "resume", False)
         with exclusive(folder):
-            prepare_output(folder, resume=resume, overwrite=self.overwrite, sources=[*_inputs(options), *sources])
-            if resume:
+            if resume:  # before anything is deleted
                 check_same_options(folder, options)
+            prepare_output(folder, resume=resume, overwrite=self.overwrite, sources=[*_inputs(options), *sources])
             save_options(folder, options)
             yield folder
+
+    def check(self, options: Any) -> None:
+        """Raise what `open` raises for the folder of a run that is not resumed; for use before slow imports."""
+        if not getattr(self, "resume", False):
+            require_replaceable(self.output_dir, self.overwrite, _inputs(options))
 
 
 def _inputs(options: Any) -> list[Path]:
@@ -169,4 +174,5 @@ def check_same_options(folder: Path, options: Any) -> None:
         was, now = known.value(before), known.value(options)
         has_grown = known.metadata.get("grows") and None not in (was, now) and now >= was
         if was != now and not known.metadata.get("free") and not has_grown:
-            raise MismatchError(f"--{known.name}", str(path), was, "the command line", now)
+            what = f"--{known.name}{', which may only grow,' if known.metadata.get('grows') else ''}"
+            raise MismatchError(what, str(path), was, "the command line", now)

@@ -13,7 +13,7 @@ from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, 
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import MismatchError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.suites import varied
 from manip_il.option import Seeded, option
 from manip_il.seeding import stream_seeds
@@ -66,10 +66,12 @@ class RecordOptions(Varied, Seeded, Resumable):
         with exclusive(root):
             for folder in () if self.resume else (root, journals):  # both, before either is emptied
                 require_replaceable(folder, self.overwrite)
+            if self.resume:
+                if any(root.glob("*")) and not any(journals.glob("*")):
+                    raise UsageError(f"{root} cannot be continued without {journals}; choose another --dataset.root")
+                check_same_options(journals, self)
             prepare_output(root, resume=self.resume, overwrite=self.overwrite)
             prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
-            if self.resume:
-                check_same_options(journals, self)
             self._record(job, root, journals, repo_id)
         say_next("train", f"--dataset.root={root}", f"--output_dir=runs/{root.name}")
         say_next("view", f"--robot.type={env.robot}", f"--task.type={env.task}", what="to watch the expert")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from manip_il.cli.common_options import DatasetRoots, Trusting, start_policy
+from manip_il.cli.common_options import DatasetRoots, Trusting, own_files, start_policy
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
 from manip_il.cli.progress import Stages, progress, say, say_next, set_quiet
@@ -68,6 +68,8 @@ class TrainOptions(Seeded, Trusting):
         datasets = open_datasets(self.dataset.root, pictures=config.takes_images, language=language)
         for one in datasets:
             input_columns(config, one.root, one.info)  # raises if the dataset lacks an input
+        if writes:
+            self.output.check(self)
         # Imported after the datasets are checked: these take seconds.
         from manip_il.learn.lerobot_config import lerobot_options
         from manip_il.learn.samples import rabc_weights
@@ -97,7 +99,8 @@ class TrainOptions(Seeded, Trusting):
                 path = trainer.fit(stages.log)
         if writes:
             say(f"checkpoint: {path}")
-            say_next("eval", f"--policy.path={path}", f"--output_dir={folder}/eval")
+            own = own_files(datasets[0].spec.robot, datasets[0].spec.task)
+            say_next("eval", f"--policy.path={path}", *own, f"--output_dir={folder}/eval")
 
     def config(self) -> FitConfig:
         """Return the trainer's configuration; `UsageError` if options contradict each other."""

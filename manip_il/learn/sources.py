@@ -18,7 +18,6 @@ from manip_il.data.info import Info
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.names import CNN
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 
@@ -62,7 +61,8 @@ def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
     if lacking:
         raise ManipError(
             f"{root}: the dataset has no {' and no '.join(lacking)}, which --observation={config.observes} needs; "
-            f"choose another --observation (--policy.type={CNN} takes images), or record with manip-il record"
+            f"choose another --observation or --policy.type, or record with manip-il record"
+            f"{' --cameras=front,side' if config.takes_images else ''}"
         )
     return [*numbers, *cameras]
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.errors import UsageError, shorten
 from manip_il.robots.robot import Robot
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
@@ -52,6 +53,11 @@ class Start:
     """
 
     poses: Mapping[str, tuple[F64, F64]]
+
+    def __post_init__(self) -> None:
+        for name, pose in self.poses.items():
+            if [np.size(part) for part in pose] != [3, 4]:
+                raise UsageError(f"Start: {name} has {shorten(pose)}; expected (position (3,), quaternion wxyz (4,))")
 
 
 @dataclass(frozen=True)

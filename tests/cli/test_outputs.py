@@ -77,6 +77,13 @@ def test_overwrite_deletes_what_this_program_made_and_nothing_else(tmp_path, nam
         assert (tmp_path / "run" / name).read_text() == content
 
 
+def test_nothing_is_deleted_in_a_folder_that_cannot_be_resumed(tmp_path):
+    (tmp_path / "notes").touch()
+    (tmp_path / ".film.partial").touch()
+    assert main([*EVAL, f"--output_dir={tmp_path}", "--resume=true"]) == 2
+    assert len([*tmp_path.iterdir()]) == 2
+
+
 EVAL = ["eval", "--policy.type=expert", "--robot.type=fetch", "--task.type=reach", "--workers=1"]
 
 

@@ -43,6 +43,12 @@ def test_resuming_what_never_began_begins(recorded, tmp_path, capsys):
     assert files(tmp_path / "demos") == files(recorded)
 
 
+def test_a_folder_that_no_journals_made_is_not_continued(tmp_path):
+    (tmp_path / "demos" / "thesis").mkdir(parents=True)
+    assert main(record(tmp_path / "demos", "--resume=true")) == 2
+    assert (tmp_path / "demos" / "thesis").is_dir()
+
+
 def test_the_journals_give_the_datasets_bytes_again(recorded, tmp_path):
     assert main(["data", "build", str(journals_of(recorded)), str(tmp_path / "again")]) == 0
     assert files(tmp_path / "again") == files(recorded)

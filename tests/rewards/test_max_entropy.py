@@ -33,12 +33,5 @@ def test_the_gradient_is_that_of_central_differences(prior):
         assert np.abs(gradient - differences).max() / np.abs(gradient).max() <= 1e-6
 
 
-def test_expected_features_are_the_demonstrations():
-    shown = demonstrations(40)
-    weights = fit(shown)
-    expected = np.mean([soft_plan(one.problem, weights).features(one.start) for one in shown], axis=0)
-    assert expected == pytest.approx(np.mean([one.sums for one in shown], axis=0), abs=1e-3)
-
-
 def test_weights_are_those_that_drew_the_demonstrations():
     assert fit(demonstrations(300)) == pytest.approx(WEIGHTS, abs=0.8)

@@ -177,13 +177,6 @@ def test_within_a_rung_targets_are_continuous(x, y, z, edge: float, opening: flo
     assert beside.opening == target.opening
 
 
-def test_closing_goes_on_once_it_has_begun():
-    beside = 0.018  # too far to begin with
-    half = EDGE + 0.75 * OPEN_SLACK
-    assert rung(at(beside, 0, 0))[0] != "grasp"
-    assert rung(at(beside, 0, 0, opening=half))[0] == "grasp"
-
-
 @pytest.mark.parametrize("opening", [0.0, 0.03, EDGE + OPEN_SLACK / 2])
 def test_fingers_that_closed_too_early_open_before_the_hand_descends(opening: float):
     world = at(0, 0, 0.09, opening=opening)

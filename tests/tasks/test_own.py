@@ -148,7 +148,7 @@ def test_a_policy_of_it_is_evaluated_by_its_path_without_a_warning(touch, tmp_pa
     capsys.readouterr()
     last = ["--policy.path=run/best", "--eval.n_episodes=2", "--eval.films=0", "--workers=1", "--output_dir=e"]
     assert main(["eval", *last]) == 2
-    assert "unknown task 'touch'" in capsys.readouterr().err
+    assert "give --task.type=FILE.py" in capsys.readouterr().err
     assert main(["eval", f"--task.type={touch}", "--env.horizon=40", *last]) == 0
     assert "differs" not in capsys.readouterr().err
 
