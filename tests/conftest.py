@@ -47,7 +47,7 @@ IMPORTED_ONCE = [
 forkserver.set_forkserver_preload(IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
 
-LARGE, VERY_LARGE = 1_000_000_000, 1_500_000_000  # of a process [bytes]
+LARGE = 1_000_000_000  # of a process [bytes]
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
 
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
@@ -87,10 +87,10 @@ def _take_back() -> None:
 def _caches_are_freed(request: pytest.FixtureRequest) -> Iterator[None]:
     """Free what a file keeps for its own tests after them.
 
-    Caches of the package and of MuJoCo are kept for the next file unless this process has grown very large.
+    Caches of the package and of MuJoCo are kept for the next file unless this process has grown large.
     """
     yield
-    large = _resident() > VERY_LARGE
+    large = _resident() > LARGE
     modules = [module for name, module in sys.modules.items() if large and name.startswith("manip_il.")]
     for kept in [one for module in (request.module, *modules) for one in vars(module).values()]:
         if isinstance(kept, functools._lru_cache_wrapper):
