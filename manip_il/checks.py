@@ -13,17 +13,19 @@ import pickle
 import re
 import resource
 import signal
+import stat
 import subprocess
 import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from manip_il.errors import ManipError, UsageError, shorten
 
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
+LARGEST_READ = 256 * 2**20  # of a file that is read as a whole [bytes]
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
@@ -127,12 +129,43 @@ def read_yaml(path: Path, what: str) -> Any:
         raise UsageError(f"{path} is not YAML: {error}") from error
 
 
-def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a file's content; raises `refusal` if it cannot be read. what: expected content, for the message."""
+def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) -> BinaryIO:
+    """Open a file from outside for reading; every file that this program did not just write is opened here.
+
+    It never blocks, and it opens only regular files and links to them: no pipes, devices or sockets.
+
+    Args:
+        path: The file.
+        what: Its expected content, for the message.
+        refusal: Class of the error that is raised if the file cannot be opened or is not regular.
+    """
     try:
-        return path.read_bytes()
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise refusal(f"cannot read {path}: it is not a regular file; expected {what}")
+    return os.fdopen(descriptor, "rb")
+
+
+def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError, most: int = LARGEST_READ) -> bytes:
+    """Return the content of a file that `open_outside` opens.
+
+    Args:
+        path: The file.
+        what: Its expected content, for the message.
+        refusal: Class of the error that is raised if the file cannot be read or is too large.
+        most: Largest size [bytes].
+    """
+    with open_outside(path, what, refusal) as file:
+        try:
+            content = file.read(most + 1)
+        except OSError as error:
+            raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
+    if len(content) > most:
+        raise refusal(f"{path} is larger than {most:,} bytes; expected {what}")
+    return content
 
 
 def check_unchanged(path: Path) -> None:
