@@ -38,7 +38,9 @@ class State:
 
     physics: MuJoCo's integration state, (p,), including goals and fixed furniture as mocap poses. variation: every
     model parameter that was drawn for the episode, (v,). step: control steps since reset. streak: consecutive control
-    steps within the tolerance. ever: whether the episode has succeeded at some step.
+    steps within the tolerance. ever: whether the episode has succeeded at some step. seed: of the episode, which
+    decides the noise and knocks of its later steps; None in a state that was read from a dataset, whose `seed` column
+    has it. begun: whether the knock of the control step that follows, if there is one, has happened already.
     """
 
     physics: F64
@@ -46,6 +48,8 @@ class State:
     step: int = 0
     streak: int = 0
     ever: bool = False
+    seed: int | None = None
+    begun: bool = True
 
     def __post_init__(self) -> None:
         require_finite("State.physics", self.physics)

@@ -49,9 +49,13 @@ def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
     return range(base, base + count)
 
 
-def rng_for(seed: int, purpose: str) -> np.random.Generator:
-    """Return a generator for one purpose within one episode (`reset`, `mixture`, `noise`, ...)."""
-    return np.random.default_rng([seed, zlib.crc32(purpose.encode())])
+def rng_for(seed: int, purpose: str, *step: int) -> np.random.Generator:
+    """Return a generator for one purpose (`reset`, `mixture`, `noise`, ...) in the episode of a seed, or in one step.
+
+    What happens in a step of an environment is drawn from a generator of that step, and so does not depend on the steps
+    that the environment has made before: a restored state has the same future.
+    """
+    return np.random.default_rng([seed, zlib.crc32(purpose.encode()), *step])
 
 
 def _block(stream: str) -> int:

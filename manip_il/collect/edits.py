@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.caching import PerThread
 from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, make_env, make_expert
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
@@ -269,4 +270,4 @@ def _origin(source: EditSource) -> dict[str, str]:
     return {"from": source.dataset.root.name, "sha256": dataset_sha256(source.dataset.root)}
 
 
-_drawer = lru_cache(1)(SceneDrawer)
+_drawer = PerThread(SceneDrawer, 1)

@@ -8,10 +8,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from manip_il.caching import cached_per_thread
 from manip_il.collect.expert import Expert
 from manip_il.collect.rollout import Environment, Labeller
 from manip_il.data.fingerprint import canonical_json, environment_fingerprint
@@ -56,9 +57,9 @@ def make_env(
     return env_of(config, cameras, conditions)
 
 
-@lru_cache(SCENES_KEPT)
+@cached_per_thread(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
-    """Return the expert of an environment, cached."""
+    """Return the expert of an environment, cached for this thread."""
     return make_stock_expert(config.robot, config.task) if config.robot in STOCK else Expert(config_scene(config))
 
 

@@ -94,7 +94,6 @@ class RolloutJob:
         if branch_env is None:
             return to_episode(frames, self.round, beta)
         path = [replace(frame, label=None) for frame in frames]
-        branch_env.start(frames[0].seed)  # draws the noise of its observations
         starts = [frame for frame in frames if frame.label is not None and frame.label.valid]
         found = (branch(branch_env, expert, one.state, one.seed, self.branch_steps) for one in starts)
         return to_episode([*path, *itertools.chain(*found)], self.round, beta, path=len(path))

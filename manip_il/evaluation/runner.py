@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from manip_il.caching import PerThread
 from manip_il.collect.drivers import ExpertDriver, PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
@@ -26,7 +27,7 @@ from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
 from manip_il.sim.task import objects_in
-from manip_il.sim.world import World, once_per_scene
+from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene
 from manip_il.tasks.stock.envs import described_stock
@@ -37,7 +38,7 @@ HOLD = 10  # control steps for which an episode continues after success, to see 
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
 FOLDER = "evaluations"  # folder for the evaluations of several policies
-_world = once_per_scene(World)
+_world = PerThread(World, 1)
 
 
 class Progress(Protocol):

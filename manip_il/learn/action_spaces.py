@@ -34,12 +34,12 @@ every policy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.caching import cached_per_thread
 from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
@@ -142,7 +142,7 @@ def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = N
     return found
 
 
-@cache
+@cached_per_thread()
 def _arm_ik(robot: str) -> ArmIK:
     from manip_il.robots.ik import ArmIK
     from manip_il.robots.table import get_robot

@@ -38,7 +38,9 @@ class PoseProgram:
         self.model, self.data = model, self._configuration.data
         orientation, posture = costs
         self.frame = mink.FrameTask(site, "site", _POSITION_COST, orientation, lm_damping=_LM_DAMPING)
-        self._target = self.frame.transform_target_to_world = mink.SE3.identity()
+        # Overwritten by `solve`; all of mink's identities share one array.
+        self._target = mink.SE3(mink.SE3.identity().wxyz_xyz.copy())
+        self.frame.transform_target_to_world = self._target
         self.posture = mink.PostureTask(model, posture)  # without it a label would depend on the path to the posture
         self.posture.set_target(home)
         limit = mink.ConfigurationLimit(model)

@@ -40,7 +40,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     Reward is 1 while the task is solved, else 0. An episode ends only at the horizon (truncated), so that
     "solved once" and "solved at the end" can both be measured. conditions: how episodes differ from the nominal world;
     they take turns by seed, and `drawn` has the current episode's values. `get_state` returns the true state, without
-    the noise and delay of observations.
+    the noise and delay of observations. Everything after it depends on the state, the actions and the conditions alone,
+    except that observations from before it do not arrive late after `set_state`.
     render_mode: `rgb_array`, or `human`, with which `reset` and `step` update MuJoCo's viewer in real time.
     Raises `UnknownName` for an unknown camera or render_mode, `UsageError` if the scene cannot be built,
     `RenderError` for `human` without a display.
@@ -63,8 +64,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.config = config
         self.world = World(build_scene(robot, task, config.physics_step))
         self._task = self.world.scene.task
+        self._conditions: tuple[Condition, ...] = ()
+        self._begin(0)  # nothing is drawn before an episode starts
         self._conditions = tuple(conditions)
-        self._begin(0, {})
         require_cameras(cameras, CAMERAS)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UnknownName("render_mode", render_mode, self.metadata["render_modes"])
@@ -109,7 +111,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def start(self, seed: int) -> None:
         """Start the episode of a seed: `reset` without making an observation."""
         world, scene, rng = self.world, self.scene, rng_for(seed, "reset")
-        self._begin(seed, draw(self._conditions, seed, ANY if self.scene.draws_shape else ""))
+        self._begin(seed)
         world.vary(with_drawn(scene.nominal, self.drawn))
         data, robot = world.data, scene.robot
         mujoco.mj_resetData(world.model, data)
@@ -124,11 +126,13 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         world.update()
         mujoco.mj_forward(world.model, data)
 
-    def _begin(self, seed: int, drawn: dict[str, Any]) -> None:
-        """Reset counters, events and observations for an episode with these drawn values."""
-        self.drawn, self._step, self._streak, self._ever = drawn, 0, 0, False
+    def _begin(self, seed: int) -> None:
+        """Reset counters, events and observations for the episode of a seed."""
+        self._seed = seed
+        drawn = draw(self._conditions, seed, ANY if self.scene.draws_shape else "")
+        self.drawn = drawn
+        self._step, self._streak, self._ever, self._begun = 0, 0, False, False
         self._events = Events(self.world, drawn, seed)
-        self._noise = rng_for(seed, "observation noise")
         self._observed: deque[Observation] = deque(maxlen=drawn.get("delay", 0) + 1)
         self._pictured: deque[tuple[dict[str, Picture], dict[str, F32]]] = deque(
             maxlen=drawn.get("picture_delay", 0) + 1
@@ -143,12 +147,13 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._observation(), float(self.solved), False, self._step >= self.config.horizon, self._info()
 
     def begin_step(self) -> None:
-        """Apply the events of the control step that begins: a knock, a perturbation.
+        """Apply the events of the control step that begins, once: a knock, a perturbation.
 
         A perturbation resets the count of steps within the tolerance.
         """
-        if self._events.before(self._step):
+        if not self._begun and self._events.before(self._step):
             self._streak = 0
+        self._begun = True
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
         """Apply one action (n,) for one control step; return it as changed by events, before clipping.
@@ -169,6 +174,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def count_step(self) -> None:
         """Count a control step, and the consecutive ones within the tolerance."""
         self._step += 1
+        self._begun = False
         self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
         self._ever = self._ever or self.solved
 
@@ -192,13 +198,27 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return min(1.0, max(0.0, self._task.progress(self.world)))
 
     def get_state(self) -> State:
-        """Return the true state of the world and the step counts, which `set_state` restores bit for bit."""
-        return State(self.world.physics(), self.world.variation.copy(), self._step, self._streak, self._ever)
+        """Return everything that the world's future depends on, which `set_state` restores bit for bit."""
+        return State(
+            self.world.physics(),
+            self.world.variation.copy(),
+            self._step,
+            self._streak,
+            self._ever,
+            self._seed,
+            self._begun,
+        )
 
     def set_state(self, state: State) -> None:
-        """Restore a state of the same scene. Raises `MismatchError` for a state of another scene."""
+        """Restore a state of the same scene; one without a seed goes on with the events of the current episode.
+
+        Raises `MismatchError` for a state of another scene.
+        """
         self.world.restore(state.physics, state.variation)
+        if state.seed is not None:
+            self._begin(state.seed)
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
+        self._begun = state.begun
         self._observed.clear()
         self._pictured.clear()
 
@@ -225,10 +245,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         if not joints and not position:
             return self.world
         scene, world = self.scene, self._sensed
+        rng = rng_for(self._seed, "observation noise", self._step)
         world.restore(self.world.physics(), self.world.variation)
-        world.data.qpos[scene.arm_q] += self._noise.normal(0.0, joints, len(scene.arm_q))
+        world.data.qpos[scene.arm_q] += rng.normal(0.0, joints, len(scene.arm_q))
         for one in scene.objects.values():
-            world.data.qpos[one.q : one.q + 3] += self._noise.normal(0.0, position, 3)
+            world.data.qpos[one.q : one.q + 3] += rng.normal(0.0, position, 3)
         world.update()
         return world
 

@@ -162,20 +162,13 @@ class Perturbation(Condition):
         return {self.name: self.moments[seed]}
 
 
-class _Training(Condition):
-    """A condition whose knock `Events` draws, not `draw`, so that a seed gives the same knock as in earlier data."""
-
-    def draw(self, seed: int) -> dict[str, Any]:
-        return super().draw(seed) | {name: self.ranges[name] for name in ("knock", "knock_step")}
-
-
 def standard_in(varied: Sequence[Condition]) -> Condition:
     """Return `STANDARD` with the ranges of other conditions added; `STANDARD` itself if they have none."""
     ranges = {name: range_ for condition in varied for name, range_ in condition.ranges.items()}
-    return _Training(STANDARD.name, **{**ranges, **STANDARD.ranges}) if ranges else STANDARD
+    return Condition(STANDARD.name, **{**ranges, **STANDARD.ranges}) if ranges else STANDARD
 
 
-STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), knock_step=(5, 24))
+STANDARD = Condition("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), knock_step=(5, 24))
 
 
 class Events:
@@ -183,15 +176,14 @@ class Events:
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
         self._world = world
-        self._share, self._random = drawn.get("action_noise", 0.0), drawn.get("random_actions", 0.0)
-        self._noise, self._random_rng = rng_for(seed, "action noise"), rng_for(seed, "random actions")
-        self._knock, self._knock_rng = _ends(drawn.get("knock", 0.0)), rng_for(seed, "knock")
-        self._knock_step = (
-            int(self._knock_rng.integers(*_ends(drawn["knock_step"]), endpoint=True)) if "knock" in drawn else -1
-        )
-        name = next((name for name in drawn if name in KINDS), "")
-        self._kind, self._kind_step = KINDS.get(name), drawn.get(name)
-        self._kind_rng = rng_for(seed, f"perturbation {name}")
+        self._seed = seed
+        self._share = drawn.get("action_noise", 0.0)
+        self._random = drawn.get("random_actions", 0.0)
+        self._knock = drawn.get("knock", 0.0)
+        self._knock_step = drawn.get("knock_step", -1)
+        self._name = next((name for name in drawn if name in KINDS), "")
+        self._kind = KINDS.get(self._name)
+        self._kind_step = drawn.get(self._name)
 
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; return whether a perturbation changed it.
@@ -201,11 +193,11 @@ class Events:
         """
         world = self._world
         if step == self._knock_step:
-            move_object(world, self._knock_rng, self._knock)
+            move_object(world, rng_for(self._seed, "knock"), (self._knock, self._knock))
         if self._kind is None or self._kind.change is None or step != self._kind_step:
             return False
         before, qpos = world.physics(), world.data.qpos.copy()
-        self._kind.change(world, self._kind_rng)
+        self._kind.change(world, self._kind_rng())
         if np.abs(world.data.qpos - qpos).max() >= _NOTICEABLE:
             return True
         world.restore(before, world.variation)
@@ -214,14 +206,17 @@ class Events:
     def action(self, action: F64, step: int) -> F64:
         """Return the action (n,) that is executed at a step: `action`, with noise or replaced if an event says so."""
         if self._kind is not None and self._kind.wrong is not None and step == self._kind_step:
-            return self._kind.wrong(action, self._world, self._kind_rng)
-        if self._random and self._random_rng.uniform() < self._random:
-            return random_action(action, self._world, self._random_rng)
-        return noisy(action, self._world, self._share, self._noise) if self._share else action
+            return self._kind.wrong(action, self._world, self._kind_rng())
+        if self._random:
+            rng = rng_for(self._seed, "random actions", step)
+            if rng.uniform() < self._random:
+                return random_action(action, self._world, rng)
+        if self._share:
+            return noisy(action, self._world, self._share, rng_for(self._seed, "action noise", step))
+        return action
 
-
-def _ends(value: Any) -> tuple[Any, Any]:
-    return value if isinstance(value, tuple) else (value, value)
+    def _kind_rng(self) -> np.random.Generator:
+        return rng_for(self._seed, f"perturbation {self._name}")
 
 
 def _settle(world: World) -> None:

@@ -1,11 +1,10 @@
-"""Off-screen pictures of a simulator state: one OpenGL context per process, for any number of environments."""
+"""Off-screen pictures of a simulator state: one OpenGL context per thread, for any number of environments."""
 
 from __future__ import annotations
 
 import atexit
 import math
 import os
-from functools import cache, lru_cache
 from importlib import import_module
 from typing import Any
 
@@ -13,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.caching import cached_per_thread
 from manip_il.errors import RenderError
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.props import Prop, props
@@ -46,7 +46,7 @@ def pictures(
 
 
 def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
-    """Return where points (K, 3) of the world [m] are in this process's last `pictures`: name -> (K, 3).
+    """Return where points (K, 3) of the world [m] are in this thread's last `pictures`: name -> (K, 3).
 
     Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside the picture. A
     point inside may be hidden behind others. Raises `RenderError` as `pictures` does.
@@ -69,17 +69,17 @@ def framed_picture(
 
 
 def close() -> None:
-    """Free this process's OpenGL context; the next picture makes another."""
-    if _context.cache_info().currsize:
+    """Free this thread's OpenGL context; the next picture makes another."""
+    if _context.own.cache_info().currsize:
         gl = _context()
         gl.make_current()
-        _prepared.cache_clear()
+        _prepared.own.cache_clear()
         gl.free()
-        _context.cache_clear()
+        _context.own.cache_clear()
 
 
 def _renderer(scene: Scene, look: Look) -> _Renderer:
-    """The renderer that was used last, or a new one in its place, in this process's OpenGL context."""
+    """The renderer that was used last, or a new one in its place, in this thread's OpenGL context."""
     try:
         _context().make_current()
         return _prepared(scene, look)
@@ -87,9 +87,9 @@ def _renderer(scene: Scene, look: Look) -> _Renderer:
         raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}") from error
 
 
-@cache
+@cached_per_thread()
 def _context() -> Any:
-    """This process's OpenGL context."""
+    """This thread's OpenGL context."""
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()  # mujoco may have been imported before it was set
     made_by = import_module(f"mujoco.{backend if backend in ('egl', 'osmesa') else 'glfw'}").GLContext
     setattr(made_by, "_context", None)  # noqa: B010 - its destructor needs it even if its constructor failed
@@ -98,7 +98,7 @@ def _context() -> Any:
     return gl
 
 
-@lru_cache(1)
+@cached_per_thread(1)
 def _prepared(scene: Scene, look: Look) -> _Renderer:
     return _Renderer(scene, look)
 

@@ -94,3 +94,41 @@ def test_pictures_show_the_episodes_own_look_and_plain_ones_after_it():
             assert np.array_equal(ours[camera], theirs[camera]) == (seed % 2 == 1)
         if seed % 2 == 0:
             assert ours["front"].mean() < 0.85 * theirs["front"].mean()
+
+
+@pytest.mark.parametrize("other_has_begun", [False, True])
+def test_a_restored_state_has_the_same_future_in_any_environment(other_has_begun: bool):
+    condition = Condition(
+        "all", action_noise=(0.1, 0.1), random_actions=(0.3, 0.3), knock=(0.05, 0.05), knock_step=(6, 6),
+        joint_noise=(0.01, 0.01), position_noise=(0.01, 0.01), mass=(0.05, 0.3),
+    )  # fmt: skip
+    env, other = (make_env("panda", "lift", conditions=[condition, NOMINAL]) for _ in range(2))
+
+    def future(of: ManipEnv) -> list[Any]:
+        found: list[Any] = []
+        for _ in range(10):
+            seen, reward, *_ = of.step(np.zeros(len(of.scene.actions), np.float32))
+            found += [*(value.tolist() for value in seen.values()), reward, of.get_state().to_vector().tolist()]
+        return found
+
+    env.reset(seed=4)
+    for _ in range(3):
+        env.step(np.zeros(len(env.scene.actions), np.float32))
+    state = env.get_state()
+    first = future(env)
+    env.set_state(state)
+    assert future(env) == first
+    if other_has_begun:
+        other.reset(seed=5)
+    other.set_state(state)
+    assert future(other) == first
+
+
+def test_a_knock_that_has_happened_does_not_happen_again_in_a_restored_state():
+    env = make_env("panda", "lift", conditions=[Condition("knocked", knock=(0.05, 0.05), knock_step=(0, 0))])
+    env.reset(seed=0)
+    env.begin_step()
+    state = env.get_state()
+    env.set_state(state)
+    env.begin_step()
+    np.testing.assert_array_equal(env.get_state().physics, state.physics)

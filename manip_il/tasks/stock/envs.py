@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 
+from manip_il.caching import cached_per_thread
 from manip_il.errors import UsageError
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, require_cameras
@@ -44,7 +44,7 @@ def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
     require_cameras(cameras, known)
 
 
-@cache
+@cached_per_thread()
 def described_stock(robot: str, task: str) -> StockEnvironment:
-    """Return a cached environment to read names and sizes from; no episode runs in it."""
+    """Return an environment, cached for this thread, to read names and sizes from; no episode runs in it."""
     return make_stock(robot, task)

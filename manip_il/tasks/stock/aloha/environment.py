@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from importlib import import_module
 from typing import Any, override
 
@@ -11,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.caching import cached_per_thread
 from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
@@ -167,9 +167,9 @@ class AlohaEnv(StockBase):
             raise RenderError(f"{ALOHA} cannot be rendered ({error}); {REMEDY}") from error
 
 
-@cache
+@cached_per_thread()
 def _painter(task: str, *, fine: bool) -> AlohaEnv:
-    """The environment that draws a task's states in this process, so that one OpenGL context is enough.
+    """The environment that draws a task's states in this thread, so that one OpenGL context is enough.
 
     Unless `fine`, its meshes have fewer faces and its shadows are coarser, which is 3.5 times faster in software.
     """
