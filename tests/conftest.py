@@ -89,12 +89,15 @@ def _caches_are_freed(request: pytest.FixtureRequest) -> Iterator[None]:
 
     Caches of the package and of MuJoCo are kept for the next file unless this process has grown large.
     """
+    from manip_il.caching import PerThread
+
     yield
     large = _resident() > LARGE
     modules = [module for name, module in sys.modules.items() if large and name.startswith("manip_il.")]
     for kept in [one for module in (request.module, *modules) for one in vars(module).values()]:
-        if isinstance(kept, functools._lru_cache_wrapper):
-            kept.cache_clear()
+        cache = kept.own if isinstance(kept, PerThread) else kept
+        if isinstance(cache, functools._lru_cache_wrapper):
+            cache.cache_clear()
     if large:
         import mujoco  # imported here: manip_il chooses its OpenGL platform first
 
