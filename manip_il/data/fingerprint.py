@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -18,6 +19,9 @@ from threadpoolctl import threadpool_info
 _HASH = 12  # printed characters of a hash
 _LONGEST = 80  # printed characters of any other value
 _FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
+_CPU_INFO = Path("/proc/cpuinfo")
+_CPU_NAMES = ("vendor_id", "cpu family", "model", "CPU implementer", "CPU part")  # x86_64, then aarch64
+_SECOND_CACHE = Path("/sys/devices/system/cpu/cpu0/cache/index2/size")
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 
 
@@ -38,16 +42,32 @@ def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> di
 
 @functools.cache
 def processor() -> str:
-    """Return what affects the last bits of float arithmetic: vector extensions, BLAS and its kernels, the C library.
+    """Return what affects the last bits of float arithmetic.
 
-    For example `x86_64 AVX512_ICL, openblas 0.3.29 SkylakeX, glibc 2.36`.
+    Its maker, family and model, because libraries choose other code for other makers with the same vector extensions;
+    the size of its second cache, after which BLAS divides matrices; vector extensions, BLAS and its kernels, and the C
+    library. For example `x86_64 GenuineIntel 6 106 1280K AVX512_ICL, openblas 0.3.29 SkylakeX, glibc 2.36`.
     """
     extensions = [name for name, found in __cpu_features__.items() if found]
     libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
     # Other packages may have loaded their own BLAS into this process.
     numpys = [one for one in libraries if "numpy" in one["filepath"]] or libraries or [{}]
     blas = " ".join(str(numpys[0].get(key, "")) for key in ("internal_api", "version", "architecture"))
-    return f"{platform.machine()} {extensions[-1] if extensions else ''}, {blas}, {' '.join(platform.libc_ver())}"
+    made = [platform.machine(), *_model(), *extensions[-1:]]
+    return f"{' '.join(made)}, {blas}, {' '.join(platform.libc_ver())}"
+
+
+def _model() -> list[str]:
+    """The processor's maker, family, model and size of its second cache, as far as Linux says them."""
+    words: dict[str, str] = {}
+    with contextlib.suppress(OSError):
+        for line in _CPU_INFO.read_text().splitlines():
+            name, _, value = line.partition(":")
+            words.setdefault(name.strip(), value.strip())
+    found = [words[name] for name in _CPU_NAMES if name in words]
+    with contextlib.suppress(OSError):
+        found.append(_SECOND_CACHE.read_text().strip())
+    return found
 
 
 def compare_fingerprints(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from manip_il.data import fingerprint
 from manip_il.data import schema as s
 from manip_il.data.fingerprint import canonical_json, compare_fingerprints, environment_fingerprint
 from manip_il.errors import MismatchError
@@ -65,3 +66,13 @@ def test_configs_have_one_canonical_text():
     assert canonical_json({"gains": (1.0, 2.0), "config": Config()}) == '{"config":{"rate":0.5},"gains":[1.0,2.0]}'
     with pytest.raises(TypeError, match="dataclass"):
         canonical_json({"x": object()})
+
+
+def test_two_makers_processors_with_the_same_extensions_have_two_fingerprints(tmp_path, monkeypatch):
+    found = []
+    for maker, family, model in (("GenuineIntel", 6, 143), ("AuthenticAMD", 25, 17)):
+        said = f"processor : 0\nvendor_id : {maker}\ncpu family : {family}\nmodel : {model}\n"
+        (tmp_path / "cpuinfo").write_text(said)
+        monkeypatch.setattr(fingerprint, "_CPU_INFO", tmp_path / "cpuinfo")
+        found.append(fingerprint.processor.__wrapped__())
+    assert len(set(found)) == 2
