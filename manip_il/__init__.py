@@ -26,6 +26,7 @@ _HOMES = {  # public name -> module
     "Expert": "collect.expert",
     "FitConfig": "learn.fit_config",
     "LearnedPolicy": "learn.policy",
+    "State": "mdp",
     "dagger": "api",
     "evaluate": "api",
     "make_config": "tasks.config",

@@ -4,6 +4,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.mdp import State
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env
@@ -15,6 +16,7 @@ __all__ = [
     "Expert",
     "FitConfig",
     "LearnedPolicy",
+    "State",
     "dagger",
     "evaluate",
     "make_config",

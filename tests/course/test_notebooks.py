@@ -120,3 +120,13 @@ def test_a_notebook_is_small_and_holds_no_output(path: Path):
     cells = [cell for cell in read(path.stem).cells if cell.cell_type == "code"]
     assert path.stat().st_size < 200_000
     assert [cell for cell in cells if cell.outputs or cell.execution_count] == []
+
+
+def test_they_use_public_functions_alone():
+    words = [word for path in COURSE.glob("*.ipynb") for cell in read(path.stem).cells for word in imported(cell)]
+    assert set(words) == {"manip_il", "manip_il.chapter"}
+
+
+def imported(cell: nbformat.NotebookNode) -> list[str]:
+    lines = cell.source.splitlines() if cell.cell_type == "code" else []
+    return [line.split()[1] for line in lines if line.startswith(("from manip_il", "import manip_il"))]
