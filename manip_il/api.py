@@ -1,7 +1,8 @@
 """The commands as functions, for notebooks and scripts: record, train, dagger, evaluate.
 
 Options are fields of the same classes that the commands use, with the same names and defaults. Episodes run in
-`workers` processes: 1 is this process alone, None is one per core.
+`workers` processes: 1 is this process alone, None is one per core. An environment may be given by its name, `panda` or
+`panda/lift`, and a dataset or a policy by its path.
 """
 
 from __future__ import annotations
@@ -31,16 +32,20 @@ from manip_il.evaluation.runner import HOLD, episode_hold
 from manip_il.evaluation.runner import evaluate as run_episodes
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
-from manip_il.seeding import stream_base, stream_seeds
+from manip_il.option import make_options, takes
+from manip_il.seeding import BLOCK, stream_base, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.tasks.config import EnvConfig, make_config
 
 Policy = Checkpoint | Path | str
+Data = Dataset | Path | str
+_MOST_EPISODES = BLOCK // MAX_TRIES
 
 
+@takes(RolloutJob, "driver")
 def record(
     root: Path | str,
-    env: EnvConfig,
+    env: EnvConfig | str,
     episodes: int = 50,
     *,
     policy: Policy | None = None,
@@ -57,10 +62,12 @@ def record(
     default 1 with a policy, else 0.
     Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder exists.
     """
-    root = Path(root).expanduser()
+    root = _path(root)
     driver = RolloutJob.driver if policy is None else PolicyDriver((_folder(policy),), beta)
     chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)} | options
-    job, journals = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals")
+    job = make_options(RolloutJob, env=_env(env), driver=driver, **chosen)
+    episodes = checks.whole("episodes", episodes, 1, _MOST_EPISODES)
+    journals = root.with_name(f"{root.name}.journals")
     if found := next((one for one in (root, journals) if one.exists()), None):
         raise FolderExistsError(found)
     recording = Recording("local/recorded", provenance=provenance(job), only_labelled=not job.labels_all)
@@ -76,8 +83,9 @@ def record(
     return Dataset.open(root)
 
 
+@takes(FitConfig)
 def train(
-    datasets: Dataset | Sequence[Dataset],
+    datasets: Data | Sequence[Data],
     output_dir: Path | str,
     *,
     seed: int = 0,
@@ -92,14 +100,16 @@ def train(
     """
     from manip_il.learn.train import Trainer  # LeRobot's trainer takes seconds to import
 
-    opened = (datasets,) if isinstance(datasets, Dataset) else tuple(datasets)
-    config = FitConfig(seed=stream_base("training", seed), **options)
-    return Checkpoint.open(Trainer(opened, config, Path(output_dir).expanduser()).fit(on_log))
+    given = (datasets,) if isinstance(datasets, Data) else datasets
+    opened = tuple(one if isinstance(one, Dataset) else Dataset.open(_path(one)) for one in given)
+    config = make_options(FitConfig, seed=stream_base("training", seed), **options)
+    return Checkpoint.open(Trainer(opened, config, _path(output_dir)).fit(on_log))
 
 
+@takes(RunConfig, "query_rule")
 def dagger(
     output_dir: Path | str,
-    env: EnvConfig,
+    env: EnvConfig | str,
     *,
     beta: str | None = None,
     query: str | None = None,
@@ -114,19 +124,24 @@ def dagger(
     Raises `UsageError` for options that contradict each other, or a folder with other files, `MismatchError` if they
     differ from the folder's.
     """
-    output_dir = Path(output_dir).expanduser()
+    output_dir = _path(output_dir)
     options |= {} if beta is None else {"beta": BetaSchedule.parse(beta)}
     options |= {} if query is None else {"query_rule": parse_query(query)}
-    config = RunConfig(env=env, fit=fit or FitConfig(), **options)
+    if "datasets" in options:
+        options["datasets"] = tuple(map(_root, options["datasets"]))
+    if options.get("start") is not None:
+        options["start"] = _folder(options["start"])
+    config = make_options(RunConfig, env=_env(env), fit=fit or FitConfig(), **options)
     check_labels(config)
     _check_same(output_dir / "settings.json", config)
     with Engine(workers) as engine:
         return list(Run(config, output_dir, engine).results())
 
 
+@takes(RolloutJob, "driver")
 def evaluate(
     policy: Policy | None = None,
-    env: EnvConfig | None = None,
+    env: EnvConfig | str | None = None,
     episodes: int = 100,
     *,
     stream: Literal["test", "validation"] = "test",
@@ -146,9 +161,11 @@ def evaluate(
         if origin is None:
             raise UsageError("env is missing, and the policy does not name one")
         env = make_config(origin.robot, origin.task, origin.fps, object=origin.object)
+    env = _env(env)
     driver = RolloutJob.driver if path is None else PolicyDriver((path,))
     chosen: dict[str, Any] = {"hold": episode_hold(env), "label": "last"} | options
-    job = RolloutJob(env, driver, **chosen)
+    job = make_options(RolloutJob, env=env, driver=driver, **chosen)
+    episodes = checks.whole("episodes", episodes, 1, BLOCK)
     suite = "_".join(one.name for one in job.conditions) or NOMINAL.name
     with Engine(workers) as engine:
         return run_episodes(engine, job, stream_seeds(stream, episodes, seed), str(path or "expert"), suite=suite)
@@ -171,5 +188,22 @@ def _check_same(path: Path, config: RunConfig) -> None:
     write_json(path, now)
 
 
+def _env(env: EnvConfig | str) -> EnvConfig:
+    if not isinstance(env, str):
+        return env
+    robot, _, task = env.partition("/")
+    return make_config(robot, task or EnvConfig.task)
+
+
+def _root(dataset: Data) -> Path:
+    return dataset.root if isinstance(dataset, Dataset) else _path(dataset)
+
+
 def _folder(policy: Policy) -> Path:
-    return policy.path if isinstance(policy, Checkpoint) else find_policy(Path(policy).expanduser())
+    return policy.path if isinstance(policy, Checkpoint) else find_policy(_path(policy))
+
+
+def _path(path: Path | str) -> Path:
+    if not isinstance(path, Path | str):
+        raise UsageError(f"path is {checks.shorten(path)}; expected a path")
+    return Path(path).expanduser()

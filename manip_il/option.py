@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+import numbers
+import sys
+import types
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any
 
-from manip_il.errors import UsageError
+from manip_il.errors import UnknownName, UsageError, shorten
 
 
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
@@ -39,9 +44,71 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
 
 
 def check_bounds(options: Any, prefix: str = "") -> None:
-    """Raise `UsageError` if a field of a dataclass instance is outside the bounds in its metadata."""
+    """Raise `UsageError` if a field of a dataclass instance has another type, or is outside its metadata's bounds."""
     for one in fields(options):
-        check_bound(prefix + one.name, getattr(options, one.name), one.metadata)
+        value = getattr(options, one.name)
+        _check_type(prefix + one.name, value, one, type(options))
+        check_bound(prefix + one.name, value, one.metadata)
+
+
+def _check_type(name: str, value: Any, one: Field[Any], cls: type) -> None:
+    try:
+        kind = type_of(cls, one)
+    except NameError:  # a name that only type checkers import
+        return
+    if not _is_of(value, kind):
+        known = kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
+        raise UsageError(f"{name} is {shorten(value)}; expected {known}")
+
+
+def type_of(cls: type, one: Field[Any]) -> Any:
+    """Return the type of one field of a dataclass. The annotations of its other fields are not evaluated."""
+    home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
+    return eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    """Whether a value is of a field's type; what is in a list or a mapping is not looked at."""
+    origin = typing.get_origin(kind) or kind
+    if origin in (typing.Union, types.UnionType):
+        return any(_is_of(value, one) for one in typing.get_args(kind))
+    if origin is typing.Literal:
+        return value in typing.get_args(kind)
+    if origin in (int, float):
+        numbers_of = numbers.Integral if origin is int else numbers.Real
+        return isinstance(value, numbers_of) and not isinstance(value, bool)
+    if not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+        return True
+    return isinstance(value, origin)
+
+
+def make_options[T](cls: type[T], **options: Any) -> T:
+    """Return an instance of a dataclass of options. Raises `UnknownName` for an option that it does not have."""
+    known = [one.name for one in fields(typing.cast(Any, cls))]
+    for name in options:
+        if name not in known:
+            raise UnknownName("option", name, known)
+    return cls(**options)
+
+
+def takes[**P, R](cls: type, *without: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Return a decorator that shows the fields of `cls` in a function's signature, in place of its `**options`.
+
+    without: fields that the function sets itself.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+        shown = {name: one for name, one in signature.parameters.items() if one.kind is not one.VAR_KEYWORD}
+        for one in fields(cls):
+            if one.name not in (*shown, *without):
+                default = one.default if one.default_factory is MISSING else None
+                kind = inspect.Parameter.KEYWORD_ONLY
+                shown[one.name] = inspect.Parameter(one.name, kind, default=default, annotation=one.type)
+        vars(function)["__signature__"] = signature.replace(parameters=list(shown.values()))
+        return function
+
+    return decorate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import ast
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import manip_il
 from manip_il import api
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.conditions import Condition
 
+SAMPLE = Path(__file__).parents[1] / "datasets" / "sample"
 STUB = Path(manip_il.__file__).with_suffix(".pyi")
 
 
@@ -23,8 +26,37 @@ def test_every_public_name_is_there_and_typed():
 
 
 def test_an_option_that_is_not_known_is_an_error(tmp_path: Path):
-    with pytest.raises(TypeError, match="epochs"):
+    with pytest.raises(UnknownName, match="epochs"):
         manip_il.dagger(tmp_path / "run", manip_il.make_config("panda", "reach"), epochs=3)
+
+
+MISTAKES: dict[str, Callable[[Path], object]] = {
+    "unknown option 'stepz' (did you mean 'steps'?)": lambda folder: manip_il.train(SAMPLE, folder, stepz=3),
+    "steps is 'many'": lambda folder: manip_il.train(str(SAMPLE), folder, steps="many"),
+    "unknown option 'horizonn' (did you mean 'horizon'?)": lambda _: manip_il.make_config(horizonn=3),
+    "horizon is 'far'": lambda _: manip_il.make_config(horizon="far"),
+    "unknown robot 'pandaa'": lambda folder: manip_il.record(folder / "d", "pandaa", 1),
+    "env is 3": lambda folder: manip_il.record(folder / "d", 3, 1),
+    "episodes is 'few'": lambda folder: manip_il.record(folder / "d", "panda", "few"),
+    "cameras is 'front'": lambda folder: manip_il.record(folder / "d", "panda/reach", 1, cameras="front"),
+    "path is 3": lambda _: manip_il.evaluate(3),
+    "is not a LeRobot dataset": lambda folder: manip_il.train(folder, folder / "clone"),
+}
+
+
+@pytest.mark.parametrize("said", MISTAKES)
+def test_a_mistake_is_one_line_as_on_the_command_line(tmp_path: Path, said: str):
+    with pytest.raises(ManipError) as caught:
+        MISTAKES[said](tmp_path)
+    assert said in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_options_stand_in_the_signature():
+    assert {"steps", "batch_size", "policy"} <= inspect.signature(manip_il.train).parameters.keys()
+    assert {"rounds", "fit", "label"} <= inspect.signature(manip_il.dagger).parameters.keys()
+    assert {"cameras", "conditions", "hold"} <= inspect.signature(manip_il.record).parameters.keys()
+    assert "driver" not in inspect.signature(manip_il.evaluate).parameters
 
 
 def test_a_folder_holds_the_results_of_one_set_of_options(tmp_path: Path, monkeypatch):
@@ -54,9 +86,10 @@ def test_without_a_policy_the_environment_must_be_given():
 @pytest.mark.slow
 def test_a_policys_rollouts_hold_the_experts_labels_and_its_evaluation_knows_its_task(tmp_path: Path):
     env = manip_il.make_config("panda", "reach")
-    demos = manip_il.record(tmp_path / "demos", env, 2)
+    demos = manip_il.record(tmp_path / "demos", env, 2).root
     policy = manip_il.train(demos, tmp_path / "clone", seed=1000, policy={"width": 16}, steps=2, batch_size=8)
-    made = manip_il.record(tmp_path / "made", env, 2, policy=policy, beta=0.5)
+    assert len(repr(policy)) < 120 + len(str(tmp_path))
+    made = manip_il.record(tmp_path / "made", "panda/reach", 2, policy=policy, beta=0.5)
     table = made.columns(["action", "executed_action", "actor", "label_valid"])
     assert set(table["actor"].ravel()) == {0, 1}
     assert table["label_valid"].all()

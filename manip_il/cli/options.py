@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal, Union
 
 from manip_il.checks import parse_yaml
+from manip_il.option import type_of
 
 Open = dict[str, Any]  # option -> value as read by YAML
 Given = dict[str, Any]  # field -> value
@@ -118,12 +119,6 @@ def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
     if base is not None:
         return getattr(base, one.name)
     return one.default if one.default_factory is MISSING else one.default_factory()
-
-
-def type_of(cls: type, one: dataclasses.Field[Any]) -> Any:
-    """Return the type of one field of a dataclass. The annotations of its other fields are not evaluated."""
-    home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
-    return eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
 
 
 def to_plain(options: Any) -> dict[str, Any]:

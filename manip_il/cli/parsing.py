@@ -23,12 +23,11 @@ from manip_il.cli.options import (
     metavar,
     options_of,
     to_plain,
-    type_of,
     without_none,
 )
 from manip_il.errors import ManipError, UsageError, nearest
 from manip_il.evaluation.policy_folder import hub_hint
-from manip_il.option import check_bound
+from manip_il.option import check_bound, type_of
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`

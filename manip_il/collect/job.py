@@ -16,6 +16,7 @@ from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import Episode, Transition
+from manip_il.option import check_bounds
 from manip_il.sim.conditions import MEASURED, Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.shape import draws_shape
@@ -51,6 +52,9 @@ class RolloutJob:
     batch: int = LOCKSTEP
     round: int = 0
     cameras: CameraConfig | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
     @property
     def policy(self) -> Path | None:

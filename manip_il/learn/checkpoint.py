@@ -132,6 +132,10 @@ class Checkpoint:
     origin: Origin | None
     processors: Mapping[str, Sequence[Mapping[str, Any]]]
 
+    def __repr__(self) -> str:
+        trained_for = f"{self.origin.robot} {self.origin.task}" if self.origin else "unknown"
+        return f"Checkpoint({self.kind}, {trained_for}, {str(self.path)!r})"
+
     @classmethod
     def open(cls, path: Path) -> Checkpoint:
         """Read and check the files of a folder, except its weights.

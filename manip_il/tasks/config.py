@@ -8,7 +8,7 @@ from typing import Any
 
 from manip_il.checks import check_unchanged
 from manip_il.errors import UnknownName, UsageError
-from manip_il.option import option
+from manip_il.option import check_bounds, make_options, option
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
@@ -50,13 +50,15 @@ def make_config(
 
     settings: other `EnvConfig` fields. Raises `UnknownName` (robot or task) or `UsageError` (a wrong value).
     """
-    return complete(EnvConfig(robot=robot, task=task, control_hz=control_hz, **settings))
+    named = {"robot": robot, "task": task, "control_hz": control_hz}
+    return complete(make_options(EnvConfig, **named, **settings))
 
 
 def complete(config: EnvConfig) -> EnvConfig:
     """Return settings with 0 and empty values filled in from robot and task; raises what `make_config` raises."""
     from manip_il.mdp import LONGEST_EPISODE  # imported here: help needs no numpy
 
+    check_bounds(config)
     config = _of_stock(config) if config.robot in stock.ROBOTS else _with_task(config)
     if not 1 <= config.control_hz <= MOST_HZ:
         raise UsageError(f"control_hz is {config.control_hz}; expected 1 to {MOST_HZ}")
