@@ -80,7 +80,7 @@ def test_a_files_own_metadata_has_nothing_decoded(root: Path, name: str, kind: s
     table = table.append_column("odd", pa.array(rows, layout.PICTURE))
     about = json.dumps({"info": {"features": {"odd": DECODED[kind]}}})
     pq.write_table(table.replace_schema_metadata({"huggingface": about}), root / name)
-    with pytest.raises(ManipError, match=r"decoded as|'odd' has no PNG or JPEG"):
+    with pytest.raises(ManipError, match=rf"{name}: column 'odd' holds struct.*; expected plain values"):
         check_arrived(root)
 
 
@@ -88,5 +88,5 @@ def test_a_playlist_is_no_video(tmp_path: Path, two: s.RobotTaskSpec, filmed: li
     root = write(filmed, tmp_path / "film", two)
     path = next(root.glob("videos/**/*.mp4"))
     path.write_bytes(b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:1/a.ts\n" + path.read_bytes())
-    with pytest.raises(ManipError, match=r"Invalid data found .*\.mp4"):
+    with pytest.raises(ManipError, match=r"\.mp4: Invalid data found"):
         check_arrived(root)
