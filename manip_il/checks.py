@@ -27,7 +27,7 @@ from manip_il.errors import ManipError, UsageError, shorten
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
 LARGEST_READ = 256 * 2**20  # of a file that is read as a whole [bytes]
-LARGEST_YAML = 2**20  # [bytes]
+LARGEST_YAML = 2**18  # [bytes]
 MOST_NODES = 100_000  # in a YAML text whose aliases are expanded
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
@@ -202,7 +202,7 @@ def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError, mo
     """
     with open_outside(path, what, refusal) as file:
         try:
-            content = file.read(most + 1)
+            content = file.read(min(most, os.fstat(file.fileno()).st_size) + 1)
         except OSError as error:
             raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
     if len(content) > most:
