@@ -16,7 +16,8 @@ import signal
 import stat
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,11 +27,14 @@ from manip_il.errors import ManipError, UsageError, shorten
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
 LARGEST_READ = 256 * 2**20  # of a file that is read as a whole [bytes]
+LARGEST_YAML = 2**18  # [bytes]
+MOST_NODES = 100_000  # in a YAML text whose aliases are expanded
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
 _NUMBERS = re.compile(r"\w+=[0-9.e+-]+(,\w+=[0-9.e+-]+)*", re.ASCII)
+_SURROGATE = re.compile("[\ud800-\udfff]")  # not Unicode on its own, so that no file can hold it
 _LONGEST_MESSAGE = 1_000  # [characters]
 _REFUSED = 3  # exit code of the child process if its function raises `ManipError`
 
@@ -69,9 +73,9 @@ def repo_id(what: str, value: object) -> str:
 
 
 def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
-    """Return a string of at most `longest` characters."""
-    if not isinstance(value, str) or len(value) > longest:
-        raise ManipError(f"{what} is {shorten(value)}; expected text of at most {longest} characters")
+    """Return a string of at most `longest` characters, all of them Unicode."""
+    if not isinstance(value, str) or len(value) > longest or _SURROGATE.search(value):
+        raise ManipError(f"{what} is {shorten(value)}; expected text of at most {longest} characters, in Unicode")
     return value
 
 
@@ -112,19 +116,45 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value of a YAML text, read by the safe loader. Raises a one-line `ValueError` if it is invalid."""
+    """Return the value of a YAML text, read by the safe loader.
+
+    Raises a one-line `ValueError` if it is invalid, if it has more than 100,000 nodes after its aliases are expanded,
+    or if it holds text that is not Unicode.
+    """
     import yaml  # imported here because most checks read no YAML
 
     try:
-        return yaml.safe_load(text)
+        loader = yaml.SafeLoader(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        if _expanded_size(node, {}) > MOST_NODES:
+            raise ValueError(f"it expands to more than {MOST_NODES:,} values, or without end")
+        return loader.construct_document(node)
     except Exception as error:  # besides its own errors, it raises those of int() and datetime()
         raise ValueError(one_line(error)) from error
+
+
+def _expanded_size(node: Any, sizes: dict[int, int]) -> int:
+    """Return the number of a YAML node's values after its aliases are expanded; more than allowed for a loop.
+
+    sizes: those of the nodes that were counted before, by id. Raises `UnicodeEncodeError` for lone surrogates.
+    """
+    if id(node) not in sizes:
+        sizes[id(node)] = MOST_NODES + 1  # found again inside itself, a node has no end
+        if isinstance(node.value, str):
+            node.value.encode()
+            parts: list[Any] = []
+        else:
+            parts = [part for entry in node.value for part in (entry if isinstance(entry, tuple) else [entry])]
+        sizes[id(node)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
+    return sizes[id(node)]
 
 
 def read_yaml(path: Path, what: str) -> Any:
     """Return the value of a YAML file; `what` is the expected content. Raises `UsageError` if it cannot be read."""
     try:
-        return parse_yaml(read_bytes(path, what, UsageError).decode())
+        return parse_yaml(read_bytes(path, what, UsageError, LARGEST_YAML).decode())
     except ValueError as error:  # UnicodeDecodeError is a ValueError
         raise UsageError(f"{path} is not YAML: {error}") from error
 
@@ -149,6 +179,18 @@ def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) 
     return os.fdopen(descriptor, "rb")
 
 
+@contextmanager
+def native_path(path: Path, what: str) -> Iterator[str]:
+    """Give libraries that open files themselves another path of the file that `open_outside` opens.
+
+    Args:
+        path: The file.
+        what: Its expected content, for the message.
+    """
+    with open_outside(path, what) as file:
+        yield f"/proc/self/fd/{file.fileno()}"
+
+
 def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError, most: int = LARGEST_READ) -> bytes:
     """Return the content of a file that `open_outside` opens.
 
@@ -160,7 +202,7 @@ def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError, mo
     """
     with open_outside(path, what, refusal) as file:
         try:
-            content = file.read(most + 1)
+            content = file.read(min(most, os.fstat(file.fileno()).st_size) + 1)
         except OSError as error:
             raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
     if len(content) > most:

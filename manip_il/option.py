@@ -26,6 +26,11 @@ def option(default: Any, help_text: str, **metadata: Any) -> Any:
     return field(default=default, metadata=metadata)
 
 
+def bounded(default: Any, low: float, high: float) -> Any:
+    """Return a dataclass field that is no option, but has the bounds of one."""
+    return field(default=default, metadata={"at_least": low, "at_most": high})
+
+
 def option_of(cls: type, name: str) -> Any:
     """Return a field with the default and help of the field `name` of another dataclass."""
     [theirs] = [one for one in fields(cls) if one.name == name]
@@ -38,9 +43,9 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
     if value is None or not {"at_least", "at_most"} & metadata.keys():
         return
     low, high = metadata.get("at_least", -math.inf), metadata.get("at_most", math.inf)
-    if not low <= value <= high:
+    if not isinstance(value, int | float) or not low <= value <= high:
         wanted = f"at least {low}" if high == math.inf else f"{low} to {high:,}"
-        raise UsageError(f"{name} is {value}; expected {wanted}")
+        raise UsageError(f"{name} is {shorten(value)}; expected {wanted}")
 
 
 def check_bounds(options: Any, prefix: str = "") -> None:

@@ -2,12 +2,21 @@
 
 import os
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from manip_il import checks
+from manip_il.data.camera import open_video
+from manip_il.data.journal import read_journal
+from manip_il.data.json_lines import read_lines
+from manip_il.data.parquet_files import count_rows, read_file
 from manip_il.errors import ManipError, UsageError
+from manip_il.learn.network import read_weights
+from manip_il.mcap.read import read_messages, read_topics
+from manip_il.robots.files import ModelFiles
+from manip_il.store.manifest import File
 
 
 @pytest.mark.parametrize("value", ["", ".", "..", ".hidden", "a..b", "../a", "a\\b", "a\n", "a\0", "~", "é", "a" * 101])
@@ -38,6 +47,59 @@ def test_a_child_process_is_bounded_and_its_refusal_comes_home():
         checks.in_child("x.xml", os.abort)
     with pytest.raises(ManipError, match=r"in 4 GB of memory and 0\.5 s: out of time"):
         checks.in_child("x.xml", time.sleep, 30, seconds=0.5)
+
+
+def hide(path: Path, kind: str) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda path: checks.read_json(path, "an x"),
+        lambda path: checks.read_yaml(path, "an x"),
+        read_lines,
+        read_journal,
+        read_topics,
+        lambda path: list(read_messages(path, ["/a"])),
+        open_video,
+        lambda path: read_file(path, ["x"]),
+        count_rows,
+        lambda path: File.of(path),
+    ],
+)
+def test_what_is_not_a_regular_file_is_refused_in_a_line_by_every_reader(read, kind: str, tmp_path: Path):
+    hide(tmp_path / "x", kind)
+    with pytest.raises(ManipError, match=r"cannot read .*/x: it is not a regular file") as error:
+        read(tmp_path / "x")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_so_are_a_models_included_files_and_a_policys_weights(kind: str, tmp_path: Path):
+    (tmp_path / "a.xml").write_text("<mujoco><include file='b.xml'/></mujoco>")
+    (tmp_path / "b.xml").write_text('<mujoco><include file="c.xml"/></mujoco>')
+    hide(tmp_path / "c.xml", kind)
+    with pytest.raises(UsageError, match=r"c\.xml: it is not a regular file; expected an MJCF"):
+        ModelFiles(tmp_path / "a.xml").load("arm")
+    hide(tmp_path / "model.safetensors", kind)
+    with pytest.raises(ManipError, match="it is not a regular file; expected weights"):
+        read_weights(tmp_path)
+
+
+def test_yaml_is_bounded_in_what_it_expands_to_and_holds_unicode(tmp_path: Path):
+    rows = ["a: &a [x, x, x, x, x, x, x, x, x]"]
+    rows += [f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in pairwise("abcdefghi")]
+    for text in ("\n".join(rows), "&a [*a]", "&a {k: *a}"):
+        with pytest.raises(ValueError, match="more than 100,000 values"):
+            checks.parse_yaml(text)
+    assert checks.parse_yaml("a: &a {k: 1}\nb: {<<: *a, l: [*a, *a]}")["b"] == {"k": 1, "l": [{"k": 1}] * 2}
+    with pytest.raises(ValueError, match="surrogates not allowed"):
+        checks.parse_yaml('names: ["\\ud800"]')
+    with pytest.raises(ManipError, match="in Unicode"):
+        checks.text("task", "\ud800")
 
 
 @pytest.mark.parametrize("text", ["a: !!python/object/apply:os.getcwd []", "2001-99-99", "a: [", "\0", b"a: \xff"])

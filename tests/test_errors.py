@@ -4,7 +4,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.cli.progress import say, warn
-from manip_il.errors import UnknownName, nearest
+from manip_il.errors import UnknownName, nearest, shorten
 from manip_il.evaluation.tables import Table, print_table
 
 
@@ -24,3 +24,18 @@ def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.Captur
     assert main(["data", name]) == main(["robot", "check", f"{name}.yaml"]) == 2
     assert not {"\x1b", "\x07", "\x9b", "\udcff"} & set("".join(capsys.readouterr()))
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+@pytest.mark.parametrize(
+    "value", [None, 1.5, "it's", b"x" * 300, (1,), [], {"b": 1, "a": [{}, (), "x" * 300]}, [*range(999)]]
+)
+def test_a_value_is_shown_as_python_prints_it_cut_to_200_characters(value):
+    printed = repr(value)
+    assert shorten(value) == (printed if len(printed) <= 200 else f"{printed[:197]}...")
+
+
+def test_a_huge_structure_is_not_printed_as_a_whole():
+    value: object = "x"
+    for _ in range(60):  # 9^60 values
+        value = {"a": [value] * 9}
+    assert len(shorten(value)) == 200

@@ -19,7 +19,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import write_json
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.episodes import parts
-from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.fingerprint import compare_fingerprints, file_sha256
 from manip_il.data.info import Info, reading
 from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.lerobot_write import Columns, Films, write_dataset
@@ -202,6 +202,5 @@ def dataset_sha256(root: Path) -> str:
     """Return the hash of a dataset's description, statistics and columns, without its videos."""
     digest = hashlib.sha256()
     for path in (root / layout.INFO, root / layout.STATS, *sorted(root.glob(layout.DATA_FILES))):
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+        digest.update(file_sha256(path))
     return digest.hexdigest()

@@ -22,15 +22,15 @@ from typing import Any
 
 import av
 import numpy as np
-import pyarrow.parquet as pq
 from av.container import InputContainer
 from numpy.typing import NDArray
 from PIL import Image
 
+from manip_il import checks
 from manip_il.data.atomic import writing
 from manip_il.data.info import PICTURES, Info, reading
-from manip_il.data.parquet_files import EpisodeTable, read_file
-from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.data.parquet_files import EpisodeTable, count_rows, read_file
+from manip_il.errors import ManipError, UnknownName
 
 I64 = NDArray[np.int64]
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
@@ -41,6 +41,7 @@ _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # no tracks in other files
 }
+_BLOCK = 128  # largest block of pixels by which decoders enlarge pictures
 _OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps open
 
 
@@ -92,7 +93,7 @@ class Camera:
     def rows(self, rows: I64) -> Pictures:
         """Return the decoded pictures, (B, height, width, 3), of these rows, (B,).
 
-        Raises `ManipError` if one is missing, `MismatchError` if one has another size.
+        Raises `ManipError` if one is missing or has another size.
         """
         wanted, places = np.unique(rows, return_inverse=True)
         starts = np.array([part.row for part in self.parts])
@@ -107,14 +108,14 @@ class Camera:
         with reading(path):
             changed = path.stat().st_mtime_ns
             if self.films:
-                pictures = read_frames(_film(path, changed, threading.get_ident()), first, len(rows), self.fps)
+                film = _film(path, changed, threading.get_ident(), self.size)
+                pictures = read_frames(film, first, len(rows), self.fps)
             else:
                 cells = _table(path, changed, self.key)[first : first + len(rows)]
                 # a cell's `path` is never followed
-                pictures = np.stack([decode_picture((cell or {}).get("bytes")) for cell in cells.to_pylist()])
-        if pictures.shape[1:] != (*self.size, 3):
-            what, found = f"shape of {self.key}", pictures.shape[1:]
-            raise MismatchError(what, f"frame {rows[0]}", found, f"info.json of {self.root}", (*self.size, 3))
+                contents = [(cell or {}).get("bytes") for cell in cells.to_pylist()]
+                pictures = np.stack([decode_picture(content, self.size) for content in contents])
+            check_size(pictures.shape[1:3], self.size)
         return pictures
 
 
@@ -145,20 +146,52 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
     return decoded
 
 
-def decode_picture(content: bytes | None) -> Pictures:
+def check_size(found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise `ValueError` unless a picture's height and width are those in `info.json`."""
+    if found != size:
+        raise ValueError(f"its pictures are {found[0]} x {found[1]}; expected {size[0]} x {size[1]}, as in info.json")
+
+
+def decode_picture(content: bytes | None, size: tuple[int, int] | None = None) -> Pictures:
     """Decode a PNG or JPEG file's content to a picture (height, width, 3).
 
-    Raises `ValueError` or `OSError` for another format, another colour mode, or None.
+    Args:
+        content: The file's content.
+        size: The expected height and width [pixels], checked before decoding.
+
+    Raises:
+        ValueError, OSError: The content is None or has another format, size or colour mode.
     """
     with Image.open(BytesIO(content or b""), formats=("PNG", "JPEG")) as picture:
+        if size is not None:
+            check_size((picture.height, picture.width), size)
         if picture.mode != "RGB":
             raise ValueError(f"the picture has colour mode {picture.mode}; expected RGB")
         return np.asarray(picture)
 
 
-def open_video(path: Path) -> InputContainer:
-    """Open an MP4 file for reading, without decoding. Raises `av.FFmpegError` if it is not an MP4 file."""
-    return av.open(f"file:{path}", format="mp4", options=_OPTIONS)
+def open_video(path: Path, size: tuple[int, int] | None = None) -> InputContainer:
+    """Open an MP4 file for reading, without decoding.
+
+    Args:
+        path: The file.
+        size: The expected height and width of the pictures [pixels].
+
+    Raises:
+        ManipError: It is not a regular file.
+        av.FFmpegError: It is not an MP4 file.
+        ValueError: It has no pictures, or they have another size.
+    """
+    with checks.native_path(path, "an MP4 file") as opened:
+        container = av.open(f"file:{opened}", format="mp4", options=_OPTIONS)
+    if size is not None:
+        if not container.streams.video:
+            raise ValueError("it has no pictures")
+        stream = container.streams.video[0]
+        check_size((stream.height, stream.width), size)
+        most = math.prod(side + _BLOCK for side in size)  # sizes may also change within the stream
+        stream.codec_context.options = {"max_pixels": str(most)}
+    return container
 
 
 def read_frames(container: InputContainer, first: int, count: int, fps: float) -> Pictures:
@@ -182,9 +215,9 @@ def read_frames(container: InputContainer, first: int, count: int, fps: float) -
 
 
 @lru_cache(_OPEN_FILMS)
-def _film(path: Path, changed: int, thread: int) -> InputContainer:
+def _film(path: Path, changed: int, thread: int, size: tuple[int, int]) -> InputContainer:
     """Open a video, cached by file, its time of change and thread: opening takes longer than decoding an episode."""
-    return open_video(path)
+    return open_video(path, size)
 
 
 @lru_cache(_OPEN_TABLES)
@@ -201,7 +234,7 @@ def _film_parts(episodes: EpisodeTable, info: Info, key: str) -> list[FrameRange
 
 
 def _table_parts(root: Path, data_files: Sequence[Path]) -> list[FrameRange]:
-    counts = [pq.read_metadata(path).num_rows for path in data_files]
+    counts = [count_rows(path) for path in data_files]
     rows = np.cumsum([0, *counts]).tolist()
     return [
         FrameRange(path.relative_to(root).as_posix(), 0, count, row)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il import checks
@@ -23,6 +22,7 @@ from manip_il.data.camera import Camera
 from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_info, reading
 from manip_il.data.parquet_files import (
     EpisodeTable,
+    count_rows,
     read_episode_table,
     read_file,
     read_picture_statistics,
@@ -162,10 +162,7 @@ class Dataset:
         paths = sorted(self.root.glob(layout.DATA_FILES))
         if not paths:
             raise ManipError(f"{self.root} has no data: no file matches {layout.DATA_FILES}")
-        rows = 0
-        for path in paths:
-            with reading(path):
-                rows += pq.read_metadata(path).num_rows
+        rows = sum(map(count_rows, paths))
         if rows != len(self):
             raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
         return paths

@@ -16,6 +16,8 @@ from typing import Any
 from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 from threadpoolctl import threadpool_info
 
+from manip_il import checks
+
 _HASH = 12  # printed characters of a hash
 _LONGEST = 80  # printed characters of any other value
 _FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
@@ -92,10 +94,16 @@ def canonical_json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=dataclasses.asdict)
 
 
+def file_sha256(path: Path) -> bytes:
+    """Return the SHA-256 of a file's content. Raises `ManipError` if it cannot be opened."""
+    with checks.open_outside(path, "a file") as file:
+        return hashlib.file_digest(file, "sha256").digest()
+
+
 def policy_sha256(policy: Path) -> str:
     """Return the SHA-256 of everything in a policy's folder that decides how it acts, independent of its path."""
     digest = hashlib.sha256()
     for path in sorted(policy.iterdir()):
         if path.is_file() and path.name not in _FOR_PEOPLE:
-            digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+            digest.update(path.name.encode() + b"\0" + file_sha256(path))
     return digest.hexdigest()

@@ -1,14 +1,16 @@
 """The gate for untrusted datasets: every file is opened once in a child process with limited memory and time.
 
 Other readers decode a column as the parquet file's metadata says (audio, PDF, any format that Pillow knows). If a cell
-for a picture has no bytes, they open its `path`, even a URL. Files that would make a reader do either are refused.
+for a picture has no bytes, they open its `path`, even a URL. Only what LeRobot and this program write passes: pictures
+in data files, in the columns that `info.json` calls images, and plain values and lists everywhere else.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +18,19 @@ import av
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from PIL import Image
 
 from manip_il import checks
-from manip_il.data.camera import open_video
-from manip_il.data.info import read_info
+from manip_il.data.camera import check_size, open_video
+from manip_il.data.info import Feature, read_info
 from manip_il.errors import ManipError
 
-_PREFIXES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG
-_DEPTH = (b"II*\0", b"MM\0*")  # TIFF, which this program does not open
-_PLAIN = ("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json", "Array2D", "Array3D", "Array4D", "Array5D")
+_PICTURES = ("PNG", "JPEG")
+_DEPTH = (*_PICTURES, "TIFF")  # this program does not decode TIFF
+_VALUES = ("Value", "ClassLabel", "Json", "Array2D", "Array3D", "Array4D", "Array5D")  # `_type` in the metadata
+_LISTS = ("List", "LargeList", "Sequence")
+_ARRAY = re.compile(rb"datasets\.features\.features\.Array[2-5]DExtensionType")
+_DAMAGES = (ManipError, OSError, ValueError, pa.ArrowException, av.FFmpegError, Image.DecompressionBombError)
 _BATCH = 64  # rows in memory at once
 
 
@@ -39,10 +45,12 @@ def check_arrived(root: Path, *, strict: bool = True) -> None:
 
 def open_files(root: Path, strict: bool = True) -> None:
     """Open every file of a dataset, in the child process. Raises `ManipError` as `check_arrived` does."""
-    pictures: dict[str, tuple[bytes, ...]] = {}  # column -> allowed prefixes of its cells
-    with suppress(ManipError):  # without a valid info.json nothing reads the pictures
-        cameras = read_info(root).of_dtype("image")
-        pictures = {one.key: _PREFIXES if one.is_rgb else (*_PREFIXES, *_DEPTH) for one in cameras}
+    features: Mapping[str, Feature] = {}
+    try:
+        features = read_info(root).features
+    except ManipError:
+        if strict:
+            raise
     for path in sorted(path for path in root.rglob("*") if not path.is_dir()):
         if not path.is_file():
             raise ManipError(
@@ -50,53 +58,96 @@ def open_files(root: Path, strict: bool = True) -> None:
             )
         checks.opening(str(path))
         try:
-            _open_file(path, pictures)
-        except (ManipError, OSError, ValueError, pa.ArrowException, av.FFmpegError) as error:
+            _open_file(path, path.relative_to(root).parts[0], features)
+        except _DAMAGES as error:
             if strict:
-                named = checks.one_line(error) if str(path) in str(error) else f"{path}: {checks.one_line(error)}"
-                raise ManipError(named) from error
+                reason = getattr(error, "strerror", None) or checks.one_line(error)
+                raise ManipError(reason if str(path) in reason else f"{path}: {reason}") from error
 
 
-def _open_file(path: Path, pictures: Mapping[str, tuple[bytes, ...]]) -> None:
-    """Read a whole file of a dataset according to its suffix. Raises what reading raises."""
+def _open_file(path: Path, folder: str, features: Mapping[str, Feature]) -> None:
+    """Read a whole file of a dataset according to its suffix. Raises what reading raises.
+
+    Args:
+        path: The file.
+        folder: The folder at the dataset's root that holds it.
+        features: The columns and cameras in `info.json`.
+    """
     if path.suffix == ".parquet":
-        with pq.ParquetFile(path) as file:
-            schema = file.schema_arrow
-            cells = {one.name: pictures.get(one.name, _PREFIXES) for one in schema if _is_picture(one, pictures)}
-            _check_types(schema, len(cells))
+        present = features if folder == "data" else {}
+        pictures = {key: one for key, one in present.items() if one.dtype == "image"}
+        structs = {*pictures, *(key for key, one in present.items() if one.dtype == "language")}
+        with checks.native_path(path, "a parquet file") as opened, pq.ParquetFile(opened) as file:
+            _check_columns(file.schema_arrow, pictures, structs)
             row = 0
             for batch in file.iter_batches(_BATCH, use_threads=False):
-                for key, prefixes in cells.items():
-                    _check_cells(key, batch.column(key), prefixes, row)
+                for key in pictures.keys() & {*batch.schema.names}:
+                    _check_cells(pictures[key], batch.column(key), row)
                 row += len(batch)
     elif path.suffix == ".mp4":
-        with closing(open_video(path)) as container:
+        camera = features.get(path.parent.parent.name)
+        with closing(open_video(path, camera and camera.picture_size)) as container:
             for _ in container.demux(container.streams.video):
                 pass
     elif path.suffix == ".json":
         checks.parse_json(str(path), checks.read_bytes(path, "JSON"))
 
 
-def _is_picture(column: pa.Field, pictures: Collection[str]) -> bool:
-    return column.name in pictures or (pa.types.is_struct(column.type) and column.type.get_field_index("path") >= 0)
+def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collection[str]) -> None:
+    """Raise `ValueError` if a column has another type, or readers would decode it otherwise, than `info.json` says.
+
+    Args:
+        schema: The columns' types, and the metadata from which Hugging Face's `datasets` decodes them.
+        pictures: The columns of pictures.
+        structs: The columns that may hold structs.
+    """
+    for column in schema:
+        if not _is_plain(column, column.name in structs):
+            raise ValueError(f"column {column.name!r} holds {column.type}; expected plain values")
+    about = checks.parse_json("its metadata", (schema.metadata or {}).get(b"huggingface", b"{}"))
+    table = checks.mapping("info in its metadata", checks.mapping("its metadata", about).get("info", {}))
+    for key, feature in checks.mapping("features in its metadata", table.get("features") or {}).items():
+        is_picture = key in pictures and isinstance(feature, dict) and feature.get("_type") == "Image"
+        if not is_picture and not _is_decoded_plainly(feature, key in structs):
+            raise ValueError(f"column {key!r} is decoded as {checks.shorten(feature)}; expected plain values")
 
 
-def _check_types(schema: pa.Schema, pictures: int) -> None:
-    """Raise `ValueError` if readers would decode more than `pictures` columns, or one as anything but an image."""
-    about = (schema.metadata or {}).get(b"huggingface", b"").decode(errors="replace")
-    decoded = [name for name in re.findall(r'"_type"\s*:\s*"(.*?)"', about) if name not in _PLAIN]
-    if decoded != ["Image"] * len(decoded) or len(decoded) > pictures:
-        raise ValueError(f"its metadata has columns decoded as {checks.shorten(decoded[-1])}; expected plain values")
+def _is_plain(column: pa.Field, structs: bool) -> bool:
+    """Return whether a column's type consists of plain values, lists and, if they are allowed, structs."""
+    kind, extension = column.type, (column.metadata or {}).get(b"ARROW:extension:name")
+    if extension is not None and not _ARRAY.fullmatch(extension):
+        return False
+    if (pa.types.is_struct(kind) and not structs) or pa.types.is_map(kind) or pa.types.is_union(kind):
+        return False
+    if isinstance(kind, pa.BaseExtensionType):
+        return kind == pa.json_()
+    return all(_is_plain(kind.field(place), structs) for place in range(kind.num_fields))
 
 
-def _check_cells(key: str, cells: pa.Array, prefixes: tuple[bytes, ...], first: int) -> None:
-    """Raise `ValueError` unless every cell has the bytes of a picture. first: row of the first cell."""
+def _is_decoded_plainly(feature: Any, structs: bool) -> bool:
+    """Return whether `datasets` decodes a feature in its JSON to plain values, lists and, if allowed, structs."""
+    if isinstance(feature, list):
+        return all(_is_decoded_plainly(one, structs) for one in feature)
+    if not isinstance(feature, dict):
+        return False
+    if "_type" not in feature:
+        return structs and all(_is_decoded_plainly(one, structs) for one in feature.values())
+    if feature["_type"] in _LISTS:
+        return _is_decoded_plainly(feature.get("feature"), structs)
+    return feature["_type"] in _VALUES
+
+
+def _check_cells(camera: Feature, cells: pa.Array, first: int) -> None:
+    """Raise `ValueError` unless every cell holds a picture of the camera's size. first: row of the first cell."""
     kind = cells.type
     place = kind.get_field_index("bytes") if pa.types.is_struct(kind) else -1
     if place < 0 or not (pa.types.is_binary(kind[place].type) or pa.types.is_large_binary(kind[place].type)):
-        raise ValueError(f"column {key!r} should hold pictures as bytes; it holds {checks.shorten(str(kind))}")
-    content: Any = pc.struct_field(cells, "bytes")  # pyright: ignore[reportAttributeAccessIssue]
-    begins: list[bytes | None] = pc.binary_slice(content, 0, 8).to_pylist()  # pyright: ignore[reportAttributeAccessIssue]
-    for row, found in enumerate(begins, first):
-        if not (found or b"").startswith(prefixes):
-            raise ValueError(f"column {key!r} has no PNG or JPEG in row {row:,}; expected a picture file's bytes")
+        raise ValueError(f"column {camera.key!r} should hold pictures as bytes; it holds {checks.shorten(str(kind))}")
+    contents: Any = pc.struct_field(cells, "bytes")  # pyright: ignore[reportAttributeAccessIssue]
+    for row, content in enumerate(contents.to_pylist(), first):
+        try:
+            with Image.open(BytesIO(content or b""), formats=_PICTURES if camera.is_rgb else _DEPTH) as picture:
+                check_size((picture.height, picture.width), camera.picture_size)
+        except Image.UnidentifiedImageError:
+            what = f"column {camera.key!r} has no PNG or JPEG in row {row:,}"
+            raise ValueError(f"{what}; expected a picture file's bytes") from None

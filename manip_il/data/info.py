@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,8 +20,7 @@ NUMBERS = (
 )
 INDEX_FEATURES = (*layout.INDEX_DTYPES,)
 
-# allows only LeRobot's placeholders (`str.format` would also read attributes) and paths inside the dataset
-_TEMPLATE = re.compile(r"(?!/)(?!.*\.\.)(?:[^{}]|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
+_PATHS = {"data_path": layout.DATA_PATH, "video_path": layout.VIDEO_PATH}
 _MOST = 2**53  # highest accepted number of frames or episodes
 
 
@@ -74,7 +72,6 @@ class Info:
     frames: int
     tasks: int | None
     robot: str
-    video_path: str
 
     def of_dtype(self, *dtypes: str) -> list[Feature]:
         """Return features of these dtypes."""
@@ -96,7 +93,7 @@ def reading(path: Path) -> Generator[None]:
 def read_info(root: Path) -> Info:
     """Read `meta/info.json` of a dataset.
 
-    Raises `ManipError` if it is missing, has another version, or has a name or path that leads outside the dataset.
+    Raises `ManipError` if it is missing, has another version, or names files otherwise than LeRobot does.
     """
     path = root / layout.INFO
     if not path.exists():
@@ -107,9 +104,9 @@ def read_info(root: Path) -> Info:
         older = "; LeRobot converts datasets of v2.1" if version == "v2.1" else ""
         raise ManipError(f"{path}: codebase_version is {checks.shorten(version)}; expected {layout.VERSION!r}{older}")
     with reading(path):
-        video_path = raw.get("video_path") or layout.VIDEO_PATH
-        if not _TEMPLATE.fullmatch(video_path):
-            raise ManipError(f"video_path is {video_path!r}; expected a path with {{chunk_index}} and {{file_index}}")
+        for key, template in _PATHS.items():
+            if (found := raw.get(key) or template) != template:
+                raise ManipError(f"{key} is {checks.shorten(found)}; expected {template!r}, as LeRobot names its files")
         tasks = raw.get("total_tasks")
         return Info(
             fps=checks.number("fps", raw["fps"], 1, 1e6),
@@ -118,7 +115,6 @@ def read_info(root: Path) -> Info:
             frames=checks.whole("total_frames", raw["total_frames"], 0, _MOST),
             tasks=None if tasks is None else checks.whole("total_tasks", tasks, 0, _MOST),
             robot=checks.text("robot_type", raw.get("robot_type") or "", checks.LONGEST_NAME),
-            video_path=video_path,
         )
 
 

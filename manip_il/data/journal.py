@@ -110,7 +110,7 @@ def read_journal(path: Path) -> tuple[Journal, Episode]:
     Raises `ManipError` naming the file if it is truncated, changed, not ours or of an older version.
     """
     try:
-        with path.open("rb") as stream:
+        with checks.open_outside(path, "a journal") as stream:
             return _read(path.parent, stream)
     except Exception as error:  # a foreign file with valid checksums can make a parser raise anything
         why = checks.one_line(error) or type(error).__name__

@@ -21,7 +21,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
     Non-finite numbers are None. Raises `ManipError` naming any other line that is not a JSON object.
     """
-    lines = path.read_bytes().splitlines(keepends=True) if path.is_file() else []
+    lines = checks.read_bytes(path, "JSON lines").splitlines(keepends=True) if path.exists() else []
     whole = [line for line in lines if line.endswith(b"\n")]
     names = (f"{path}, line {number}" for number in itertools.count(1))
     return [checks.mapping(name, checks.parse_json(name, line)) for name, line in zip(names, whole, strict=False)]

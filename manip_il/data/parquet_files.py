@@ -7,7 +7,8 @@ keeps the column, its split and delete drop it; the draws are also part of `sim_
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -109,9 +110,32 @@ def _to_png(picture: NDArray[np.uint8]) -> bytes:
     return stream.getvalue()
 
 
+@contextmanager
+def open_parquet(path: Path) -> Iterator[pq.ParquetFile]:
+    """Open a parquet file for reading. Raises `ManipError` if it is damaged or not regular."""
+    with (
+        reading(path),
+        checks.native_path(path, "a parquet file") as opened,
+        pq.ParquetFile(opened, page_checksum_verification=True) as file,
+    ):
+        yield file
+
+
+def column_names(path: Path) -> list[str]:
+    """Return the names of a parquet file's columns. Raises what `open_parquet` raises."""
+    with open_parquet(path) as file:
+        return file.schema_arrow.names
+
+
+def count_rows(path: Path) -> int:
+    """Return the number of rows in a parquet file. Raises what `open_parquet` raises."""
+    with open_parquet(path) as file:
+        return file.metadata.num_rows
+
+
 def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return the requested columns that a file has. Raises `ManipError` if it is damaged."""
-    with reading(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
+    """Return the requested columns that a file has. Raises what `open_parquet` raises."""
+    with open_parquet(path) as file:
         # one thread: distributing pieces of one episode costs more than reading them
         return file.read(list(columns), use_threads=False).replace_schema_metadata(None)
 
@@ -120,7 +144,7 @@ def read_tasks(root: Path) -> dict[int, str]:
     """Return the task texts by `task_index`. The file has them in pandas' index column, which may have no name."""
     path = root / layout.TASKS
     with reading(path):
-        table = read_file(path, pq.read_schema(path).names)
+        table = read_file(path, column_names(path))
         texts = [one.name for one in table.schema if one.type in (pa.string(), pa.large_string())]
         name = "task" if "task" in texts else texts[-1]  # pandas writes the index after the columns
         return dict(zip(table.column(layout.TASK_INDEX).to_pylist(), table.column(name).to_pylist(), strict=True))
@@ -174,7 +198,7 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
     if not paths:
         raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
     with reading(root / "meta/episodes"):
-        names = [[name for name in pq.read_schema(path).names if not name.startswith("stats/")] for path in paths]
+        names = [[name for name in column_names(path) if not name.startswith("stats/")] for path in paths]
         tables = [read_file(path, wanted) for path, wanted in zip(paths, names, strict=True)]
         table = pa.concat_tables(tables, promote_options="permissive")
 
@@ -186,7 +210,7 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
                 *(numbers(f"videos/{key}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True
             )
             files = [
-                info.video_path.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places
+                layout.VIDEO_PATH.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places
             ]
             return VideoSpans(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
@@ -214,7 +238,7 @@ def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statisti
     found: list[Statistics] = []
     for path in sorted(root.glob(layout.EPISODES_FILES)):
         names = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
-        here = [name for name in pq.read_schema(path).names if name in names]
+        here = [name for name in column_names(path) if name in names]
         for row in read_file(path, [layout.EPISODE_INDEX, *here]).to_pylist():
             own: Statistics = {}
             for column in here:

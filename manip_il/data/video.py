@@ -23,6 +23,7 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.camera import Pictures, open_video
 from manip_il.data.dataset import Dataset
@@ -58,7 +59,8 @@ class CameraFiles:
             self.close()
             name, chunk, file = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
             (self._folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, self._folder / name)
+            with checks.native_path(source, "an MP4 file") as opened:
+                shutil.copyfile(opened, self._folder / name)
             self._copied[dataset, source] = chunk, file
             self._number += 1
         return VideoSpan(*self._copied[dataset, source], first, frames)

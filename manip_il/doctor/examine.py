@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from manip_il import checks
 from manip_il.data.atomic import exclusive
@@ -20,6 +19,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
 from manip_il.data.info import NUMBERS
 from manip_il.data.lerobot_layout import DATA_FILES, EPISODE_INDEX, INFO, STATS, write_json
+from manip_il.data.parquet_files import count_rows
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, to_lists
 from manip_il.doctor import files, learning
 from manip_il.doctor.finding import Finding, journals_of, mend
@@ -125,7 +125,7 @@ def _rebuild(root: Path, kept: Path) -> str:
 def _recount(root: Path) -> dict[str, Any]:
     """Return info.json with the actual counts of episodes, rows and tasks; {} if they are right."""
     dataset, about = Dataset.open(root), checks.read_json(root / INFO, "a dataset's description")
-    rows = sum(pq.read_metadata(path).num_rows for path in root.glob(DATA_FILES))
+    rows = sum(count_rows(path) for path in root.glob(DATA_FILES))
     counts = {"total_episodes": len(dataset.episodes), "total_frames": rows, "total_tasks": len(dataset.tasks)}
     corrected = {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}}
     return {} if about.items() >= counts.items() else corrected

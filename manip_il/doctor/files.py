@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
@@ -18,6 +17,7 @@ from manip_il.data import schema as s
 from manip_il.data.camera import open_video
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, reading
+from manip_il.data.parquet_files import column_names, read_file
 from manip_il.doctor.finding import Finding, journals_of, list_first, of_episodes, warning
 
 _AXES = (["height", "width", "channels"], ["height", "width", "channel"], ["channels", "height", "width"])
@@ -52,7 +52,7 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
             yield Finding(f"{layout.INFO}: {feature.key}", text, remedy, is_error=not some_train)
     wanted = {key for key, feature in dataset.features.items() if feature.dtype != "video"} | {*INDEX_FEATURES}
     for path in dataset.data_files:
-        if odd := sorted(wanted ^ {*pq.read_schema(path).names}):
+        if odd := sorted(wanted ^ {*column_names(path)}):
             text = f"differs from {layout.INFO} in columns, so LeRobot cannot load it: {list_first(odd)}"
             yield Finding(path.relative_to(dataset.root).as_posix(), text)
 
@@ -131,13 +131,14 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
     table, root = dataset.episodes, dataset.root
     for key in [feature.key for feature in dataset.info.of_dtype("image")]:
         for path in dataset.data_files:
-            cells: Any = pq.read_table(path, columns=[key]).column(key).combine_chunks()
+            cells: Any = read_file(path, [key]).column(key).combine_chunks()
             if lacking := cells.field("bytes").null_count:
                 place = f"{path.relative_to(root).as_posix()}: {key}"
                 yield Finding(place, f"{lacking:,} of {len(cells):,} rows have no picture")
-    for clips in table.clips.values():
+    for key, clips in table.clips.items():
+        size = dataset.features[key].picture_size
         for name in dict.fromkeys(clips.files):
-            with reading(root / name), closing(open_video(root / name)) as container:
+            with reading(root / name), closing(open_video(root / name, size)) as container:
                 [stream] = container.streams.video
                 tick = float(stream.time_base or 1)
                 times = np.sort([one.pts * tick for one in container.demux(stream) if one.pts is not None])

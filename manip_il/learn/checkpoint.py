@@ -27,6 +27,7 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = (  # options that define an mlp's architecture
     *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled"),
@@ -147,14 +148,14 @@ class Checkpoint:
         processors = {name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
         with in_one_line(f"{path / CONFIG} has features that cannot be read"):
             inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
-            action = math.prod(outputs[ACTION][1])
+            action = _size(ACTION, outputs[ACTION][1])
             pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
             sizes = {name: (height, width) for name, (_, height, width) in pictures.items()}
             space, robot, grippers = _space(config, processors.get(PROCESSORS[1], []))
         return cls(
             path,
             config,
-            numbers={key: math.prod(shape) for key, (kind, shape) in inputs.items() if kind in ("STATE", "ENV")},
+            numbers={key: _size(key, shape) for key, (kind, shape) in inputs.items() if kind in ("STATE", "ENV")},
             pictures={name: size for name, size in sizes.items() if not name.startswith(_PLACEHOLDER)},
             action=action,
             space=space,
@@ -221,6 +222,10 @@ class Checkpoint:
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Return name -> kind and shape of a policy's inputs or outputs."""
     return {key: (str(value["type"]), tuple(map(int, value["shape"]))) for key, value in features.items()}
+
+
+def _size(key: str, shape: Sequence[int]) -> int:
+    return checks.whole(f"the number of values of {key}", math.prod(shape), 0, MOST_VALUES)
 
 
 def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str, tuple[int, ...]]:

@@ -27,18 +27,20 @@ from manip_il.data.schema import (
     STATE,
     check_same_spec,
 )
-from manip_il.errors import UsageError
+from manip_il.errors import UsageError, shorten
+from manip_il.learn.checkpoint import MOST_VALUES
 from manip_il.learn.mlp import MLPConfig, MLPPolicy, offsets_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics, perceptron
 from manip_il.learn.samples import Table, valid_frames
-from manip_il.option import option
+from manip_il.option import bounded, option
 
 __all__ = ["CNNConfig", "CNNPolicy", "make_cnn_pre_post_processors"]
 __path__: list[str] = []
 
 NUMBERS = 4  # numbers per keypoint: x, y, spread, strength
+_MOST_LAYERS = 16
 STRIDE = 4  # distance between cells of the heat maps [pixels]
 _LIGHT, _COLOUR = 4.0, 16.0  # pictures vary far more in brightness than in colour; these scales equalise them
 _SHARPNESS = 3.0  # gain before the softmax
@@ -72,12 +74,12 @@ class CNNConfig(MLPConfig):
     """
 
     channels: tuple[int, ...] = (16, 32, 32, 32)
-    keypoints: int = option(32, "keypoints per camera", at_least=1)
+    keypoints: int = option(32, "keypoints per camera", at_least=1, at_most=1024)
     aux_weight: float = option(0.5, "weight of the loss of the predicted state", at_least=0)
     heatmap_weight: float = option(0.0, "weight of the loss of the heat maps", at_least=0)
     states: str = option("", "dataset of states; the policy then acts on joints and predicted state alone")
-    privileged_size: int = 0  # size of the predicted state; taken from the dataset
-    named_points: int = 0  # number of points with a heat map; taken from the dataset
+    privileged_size: int = bounded(0, 0, MOST_VALUES)  # size of the predicted state; taken from the dataset
+    named_points: int = bounded(0, 0, 1024)  # number of points with a heat map; taken from the dataset
 
     depth: int = 2
     loss: str = "l1"
@@ -87,9 +89,10 @@ class CNNConfig(MLPConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.channels = tuple(self.channels)
-        if len(self.channels) < 2 or min(self.channels) < 1:
+        if not 2 <= len(self.channels) <= _MOST_LAYERS or not 1 <= min(self.channels) <= max(self.channels) <= 1024:
             raise UsageError(
-                f"policy.channels is {list(self.channels)}; expected at least two layers, of at least one channel each"
+                f"policy.channels is {shorten(list(self.channels))}; expected 2 to {_MOST_LAYERS} layers, "
+                "of 1 to 1,024 channels each"
             )
 
     @override

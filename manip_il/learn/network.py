@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from manip_il.checks import native_path
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import LAST
-from manip_il.learn.checkpoint import WEIGHTS, in_one_line
+from manip_il.learn.checkpoint import MOST_VALUES, WEIGHTS, in_one_line
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
 from manip_il.option import check_bounds, option
@@ -50,12 +51,12 @@ class Shape:
     Raises `UnknownName` for an unknown loss or activation, `UsageError` for a size out of range.
     """
 
-    width: int = option(256, "units per layer", at_least=1)
-    depth: int = option(3, "hidden layers", at_least=1)
+    width: int = option(256, "units per layer", at_least=1, at_most=4096)
+    depth: int = option(3, "hidden layers", at_least=1, at_most=32)
     activation: str = "silu"
     loss: str = "l1"
-    components: int = option(5, "Gaussians in a mixture", at_least=1)
-    bins: int = option(21, "bins per dimension", at_least=2)
+    components: int = option(5, "Gaussians in a mixture", at_least=1, at_most=1000)
+    bins: int = option(21, "bins per dimension", at_least=2, at_most=1000)
     sigma: float | None = option(None, "smearing of categorical targets [bins]; by default 3", at_least=0)
     clamp: float = option(10.0, "bound on the inputs [standard deviations]", at_least=1e-9)
     action_space: str = JOINT_DELTA
@@ -72,6 +73,8 @@ class Shape:
                 raise UnknownName(name, str(value), known)
         if not all(scale > 0 for scale in self.scales):
             raise UsageError(f"policy.scales is {list(self.scales)}; expected lengths of more than 0")
+        if (added := len(self.scales) * len(self.scaled)) > MOST_VALUES:
+            raise UsageError(f"policy.scales adds {added:,} inputs; expected at most {MOST_VALUES:,}")
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Shape:
@@ -211,8 +214,8 @@ def threads(count: int) -> Iterator[None]:
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
     """Return weights (n, d) and statistics (n,) by name from a folder; `ManipError` if they cannot be read."""
     path = Path(pretrained_model) / WEIGHTS
-    with in_one_line(f"{path} cannot be read"):
-        return {name.removeprefix("model."): tensor for name, tensor in load_file(path).items()}
+    with in_one_line(f"{path} cannot be read"), native_path(path, "weights") as opened:
+        return {name.removeprefix("model."): tensor for name, tensor in load_file(opened).items()}
 
 
 @torch.no_grad()

@@ -32,6 +32,7 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import generator_of
 from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one_line, read_config, read_origin
 from manip_il.learn.network import read_weights, threads
+from manip_il.option import bounded, check_bounds
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 PREFERENCE = "preference"  # type of a learnt reward in config.json
@@ -53,12 +54,15 @@ class RewardShape:
     input columns that the networks do not use.
     """
 
-    members: int = 8
-    width: int = 32
-    depth: int = 2
+    members: int = bounded(8, 1, 64)
+    width: int = bounded(32, 1, 4096)
+    depth: int = bounded(2, 1, 32)
     ways: tuple[tuple[int, ...], ...] = ()
     unread: tuple[int, ...] = ()
     logarithms: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:

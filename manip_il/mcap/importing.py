@@ -153,7 +153,7 @@ def _value(where: str, source: TopicSource, content: Any) -> Any:
         if not all(isinstance(one, str if source.dtype == TEXT else int | float) for one in values):
             raise ValueError(f"the message has {checks.shorten(values)}; expected values of type {source.dtype}")
         if source.dtype == TEXT:
-            return values[0]
+            return checks.text("the message", values[0], len(values[0]))
         given = np.array(values, object)
         with np.errstate(over="ignore"):  # the next line checks for infinity
             numbers = given.astype(source.dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,10 @@ class TopicSource:
             raise UsageError(f"tolerance is {self.tolerance}; expected seconds, 0 or more")
         for path in self.paths:
             check_path(path)
+        try:
+            json.dumps(self.names, ensure_ascii=False).encode()
+        except (TypeError, ValueError) as error:  # a UnicodeEncodeError is a ValueError
+            raise UsageError(f"names is {checks.shorten(self.names)}, which info.json cannot hold: {error}") from error
 
     @property
     def is_camera(self) -> bool:
@@ -78,6 +83,7 @@ class Mapping:
 
     def __post_init__(self) -> None:
         checks.number("fps", self.fps, 1, MOST_FPS)
+        checks.text("robot_type", self.robot_type or "", checks.LONGEST_NAME)
         if not self.features:
             raise UsageError("features is empty; expected at least one column")
         for key, source in self.features.items():

@@ -25,13 +25,14 @@ from manip_il.errors import ManipError
 
 U8 = NDArray[np.uint8]
 
+_LAST_STAMP = 2**63 - 1  # [ns]
 _ROS2 = "mcap_ros2"  # module of the optional package mcap-ros2-support
 _CHANNELS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}  # encoding of raw pictures -> slice of channels to RGB
 
 
 def read_topics(path: Path) -> list[str]:
     """Return the topics in a file's summary; [] without a summary."""
-    with path.open("rb") as stream:
+    with checks.open_outside(path, "an MCAP file") as stream:
         summary = make_reader(stream).get_summary()
     return sorted({channel.topic for channel in summary.channels.values()} if summary else ())
 
@@ -45,10 +46,11 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, in
     if find_spec(_ROS2):
         factories.insert(0, importlib.import_module(f"{_ROS2}.decoder").DecoderFactory())
     try:
-        with path.open("rb") as stream:
+        with checks.open_outside(path, "an MCAP file") as stream:
             reader = make_reader(stream, validate_crcs=True, decoder_factories=factories)
             for _, channel, message, content in reader.iter_decoded_messages(topics):
-                yield channel.topic, message.log_time, content
+                stamp = checks.whole(f"the log time of {channel.topic}", message.log_time, 0, _LAST_STAMP)
+                yield channel.topic, stamp, content
     except MemoryError:
         raise
     except Exception as error:  # a damaged file can make a parser raise anything

@@ -14,6 +14,7 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
+_INCLUDE = re.compile(rb"<include\s[^>]*?file\s*=\s*[\"']([^\"']+)")
 KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
 
@@ -45,12 +46,12 @@ class ModelFiles:
             model = self._mended(checks.read_bytes(self.model, "an MJCF"))
             home = self.includes or self.model.parent
             name = str(home / f"mended {self.model.name}")
+            included = _included(model, home)  # read here first, because MuJoCo would wait for a pipe
             spec = mujoco.MjSpec.from_file(name, include={name: model})
             if self.meshes is not None:
                 # MuJoCo prefixes names in an included file with its folder
                 meshes = [mesh.file.removeprefix(spec.modelfiledir) for mesh in spec.meshes if mesh.file]
                 assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in sorted(meshes)}
-                included = {path: (home / path).read_bytes() for path in _included(model, home)}
                 spec = mujoco.MjSpec.from_string(model.decode(), include=included, assets=assets)
                 spec.meshdir = ""
         except (ManipError, ValueError) as error:
@@ -72,10 +73,16 @@ class ModelFiles:
         return text.encode()
 
 
-def _included(model: bytes, home: Path) -> set[str]:
-    """The files that a model includes, directly or not."""
-    found = {name.decode() for name in re.findall(rb"<include\s+file=\"([^\"]+)\"", model)}
-    return found.union(*(_included((home / name).read_bytes(), home) for name in found))
+def _included(model: bytes, home: Path) -> dict[str, bytes]:
+    """Return the files that a model includes, directly or not, by their paths in it."""
+    found: dict[str, bytes] = {}
+    waiting = [model]
+    while waiting:
+        for name in map(bytes.decode, _INCLUDE.findall(waiting.pop())):
+            if name not in found and (home / name).exists():  # MuJoCo names a missing one
+                found[name] = checks.read_bytes(home / name, "an MJCF")
+                waiting.append(found[name])
+    return found
 
 
 def read(what: str, kind: Any, value: Any) -> Any:

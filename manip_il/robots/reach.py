@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.checks import without_link
+from manip_il.checks import open_outside, without_link
 from manip_il.mdp import F64
 from manip_il.robots import HERE, ROBOTS
 from manip_il.robots.files import ModelFiles
@@ -125,7 +125,8 @@ class Reach:
 def reach_of(robot: Robot) -> Reach:
     """Return a robot's map: read from its file, else computed (some seconds) and stored if possible."""
     path = _place(robot)
-    with contextlib.suppress(Exception), np.load(path) as kept:  # a file that is no map raises many kinds of errors
+    with contextlib.suppress(Exception), open_outside(path, "a map") as file:  # other files raise many kinds of errors
+        kept = np.load(file)
         return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
     reach, partial = _solve(robot), path.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):

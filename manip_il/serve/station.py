@@ -11,6 +11,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from manip_il import checks
 from manip_il.collect.expert import Expert
 from manip_il.data.atomic import write_file
 from manip_il.errors import UsageError
@@ -87,7 +88,7 @@ class Station:
             low, high = (0, STEPS - 1) if joint == _FULL_TURN else encoder_steps(limits)
             kept[joint] = {"id": number, "homing_offset": 0, "range_min": low, "range_max": high}
         file = link.with_suffix(".json")
-        bus = Bus(json.loads(file.read_text()) if file.exists() else kept)
+        bus = Bus(checks.read_json(file, "a calibration") if file.exists() else kept)
         self._keep(name, bus)
         link.unlink(missing_ok=True)
         link.symlink_to(bus.path)

@@ -46,7 +46,7 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
     if dataset and dataset.cameras:
         made[PICTURE] = folder / "episodes.png"
         draw_picture(dataset, made[PICTURE])
-    if not (root / CARD).is_file() or any(mark in (root / CARD).read_bytes() for mark in _OURS):
+    if not (root / CARD).is_file() or any(mark in checks.read_bytes(root / CARD, "a card") for mark in _OURS):
         environment = jinja2.Environment(finalize=lambda value: redact(value) if isinstance(value, str) else value)
         environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")
         template = environment.from_string(Path(__file__).with_name("card.md.jinja").read_text(encoding="utf-8"))
@@ -106,7 +106,7 @@ def lerobot_words(robot: str | None, task: str) -> list[str]:
 def options(folder: Path) -> str:
     """Return the folder's `config.yaml` without paths, machine-specific options and secrets; "" if it is not ours."""
     path = folder / "config.yaml"
-    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    text = checks.read_bytes(path, "options").decode(errors="replace") if path.is_file() else ""
     shown = [line for line in text.splitlines() if not _NOT_SHOWN.search(line)]
     return "\n".join(shown) if text.startswith("# manip-il") else ""
 

@@ -46,7 +46,7 @@ class File:
     @classmethod
     def of(cls, path: Path) -> File:
         """Return a file's size and sha256."""
-        with path.open("rb") as file:
+        with checks.open_outside(path, "a file") as file:
             return cls(os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
 
     def fits(self, path: Path) -> bool:
@@ -54,7 +54,7 @@ class File:
         if path.is_symlink() or not path.is_file() or path.stat().st_size != self.size:
             return False
         digest = hashlib.sha256() if self.sha256 else hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
-        with path.open("rb") as file:
+        with checks.open_outside(path, "a file") as file:
             hashlib.file_digest(file, lambda: digest)
         return digest.hexdigest() == (self.sha256 or self.git_sha1)
 

@@ -99,3 +99,13 @@ def test_a_file_that_is_cut_or_does_not_fit_the_first_one_leaves_nothing(tmp_pat
     with pytest.raises(ManipError, match=why):
         list(import_files([first, second], tmp_path / "new", load(tmp_path, {"f": feature()})))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "m.yaml"]
+
+
+def test_a_stamp_that_numpy_cannot_hold_and_text_that_no_file_can_are_refused_in_a_line(tmp_path: Path) -> None:
+    mapping = load(tmp_path, {"f": feature()})
+    path = write(tmp_path / "a.mcap", {"/a": [(0, {"x": 1}), (2**63 // 10**6 + 1, {"x": 2})]})
+    with pytest.raises(ManipError, match=r"a\.mcap: the log time of /a is 9223372036855000000; expected"):
+        list(read_frames(path, mapping))
+    path = write(tmp_path / "b.mcap", {"/a": [(0, {"x": "\ud800"})]})
+    with pytest.raises(ManipError, match=r"b\.mcap.*in Unicode"):
+        list(read_frames(path, load(tmp_path, {"f": feature(dtype="string")})))

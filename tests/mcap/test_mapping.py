@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 from manip_il.mcap.mapping import Mapping, TopicSource, load_mapping
 from manip_il.mcap.path import values_at
 
@@ -45,3 +45,17 @@ def test_a_path_leads_to_values_or_says_where_it_ends() -> None:
     ):
         with pytest.raises(ManipError, match=why):
             values_at(path, joints)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("robot_type", "[1, 2]"), ("task", '"\\ud800"'), ("names", '["\\ud800"]'), ("names", "[2001-01-01]")],
+)
+def test_what_a_dataset_cannot_hold_is_refused_before_an_episode_is_read(key: str, value: str, tmp_path: Path) -> None:
+    column = "{topic: /a, field: x, dtype: float32, resample: nearest, tolerance: 1, names: NAMES}"
+    told = {"robot_type": "arm", "task": "t", "names": "null"} | {key: value}
+    text = f"fps: 10\nrobot_type: {told['robot_type']}\ntask: {told['task']}\nfeatures: {{action: {column}}}\n"
+    (tmp_path / "m.yaml").write_text(text.replace("NAMES", told["names"]))
+    with pytest.raises(UsageError, match=r"m\.yaml") as error:
+        load_mapping(tmp_path / "m.yaml")
+    assert "\n" not in str(error.value)
