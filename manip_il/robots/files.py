@@ -73,8 +73,8 @@ class ModelFiles:
 
 
 def _included(model: bytes, home: Path) -> set[str]:
-    """The files that a model includes, directly or not."""
-    found = {name.decode() for name in re.findall(rb"<include\s+file=\"([^\"]+)\"", model)}
+    """The files that a model includes or attaches, directly or not."""
+    found = {name.decode() for name in re.findall(rb"<(?:include|model)\s[^>]*?\bfile=\"([^\"]+)\"", model)}
     return found.union(*(_included((home / name).read_bytes(), home) for name in found))
 
 

@@ -35,25 +35,26 @@ def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
     robot: its name. Raises `UsageError` if MuJoCo cannot read the model.
     """
     spec = files.load(robot)
-    if spec.compiler.degree:
-        _to_radians(spec)
+    _to_radians(spec)
     for name in _OF_A_SCENE:
         setattr(spec.compiler, name, getattr(PLAIN.compiler, name))
     return spec
 
 
 def _to_radians(spec: mujoco.MjSpec) -> None:
-    """Convert every angle of a model from degrees."""
-    for joint in spec.joints:
+    """Convert every angle from degrees. Each element has the unit of its own file, as a model may attach others."""
+    kinds = ("joints", "bodies", "geoms", "sites", "cameras", "frames")
+    joints, *turned = ([one for one in getattr(spec, kind) if one.compiler.degree] for kind in kinds)
+    for joint in joints:
         if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
             joint.range = np.radians(joint.range)
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             joint.ref, joint.springref = math.radians(joint.ref), math.radians(joint.springref)
-    turned = [one.alt for kind in ("bodies", "geoms", "sites", "cameras", "frames") for one in getattr(spec, kind)]
-    for alt in (*turned, *(body.ialt for body in spec.bodies)):
+    for alt in (*(one.alt for kind in turned for one in kind), *(body.ialt for body in turned[0])):
         alt.euler = np.radians(alt.euler)
         alt.axisangle = [*alt.axisangle[:3], math.radians(alt.axisangle[3])]
-    spec.compiler.degree = False
+    for one in itertools.chain(joints, *turned):
+        one.compiler.degree = False
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:

@@ -63,3 +63,15 @@ def test_what_a_model_includes_is_found_where_the_yaml_says_and_what_lies_beside
         model=(tmp_path / "own.xml").read_text(),
     )
     assert arm_spec(get_robot(str(again))).compile().nmeshvert == 4
+
+
+def test_a_model_that_is_attached_is_found_beside_the_one_that_attaches_it(tmp_path: Path):
+    foot = '<asset><mesh name="foot" file="foot.obj"/></asset>'
+    body = '<worldbody><body name="shoe"><geom type="mesh" mesh="foot" contype="0"/></body></worldbody>'
+    (tmp_path / "shoe.xml").write_text(f"<mujoco>{foot}{body}</mujoco>")
+    attach = {
+        "</asset>": '<model name="shoe" file="shoe.xml"/></asset>',
+        '<body name="base">': '<body name="base"><attach model="shoe" body="shoe" prefix="own_"/>',
+    }
+    robot = shaped(tmp_path, "parts/foot.obj", "foot.obj", meshes="parts", text=attach)
+    assert arm_spec(robot).compile().nmeshvert == 8

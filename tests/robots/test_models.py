@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,23 @@ def in_unit(unit: str) -> str:
     return re.sub(r"A\((.*?)\)", lambda found: " ".join(repr(float(one) * scale) for one in found[1].split()), text)
 
 
+def attached(folder: Path, unit: str) -> str:
+    """Return the arm's MJCF, which attaches its hand from `folder`/hand.xml, written in the other unit."""
+    arm, hand = (ET.fromstring(in_unit(one)) for one in (unit, "degree" if unit == "radian" else "radian"))
+    wrist = arm.find(".//body[@name='wrist']")
+    wrist.remove(wrist.find("body"))
+    ET.SubElement(wrist, "attach", model="hand", body="hand", prefix="")
+    ET.SubElement(arm.find("asset"), "model", name="hand", file="hand.xml")
+    arm.remove(arm.find("equality"))
+    world, part = hand.find("worldbody"), hand.find(".//body[@name='hand']")
+    world.clear()
+    world.append(part)
+    for name in ("equality", "actuator", "sensor", "keyframe", "asset"):
+        hand.remove(hand.find(name))
+    (folder / "hand.xml").write_text(ET.tostring(hand, "unicode"))
+    return ET.tostring(arm, "unicode")
+
+
 def urdf() -> str:
     """An arm of five joints with two fingers; what a fixed joint carries is a link of its own."""
     links = [("base", "0 0 0.05", "0.1 0.1 0.1"), ("tower", "0 0 0.05", "0.06 0.06 0.05")]
@@ -83,20 +101,22 @@ def arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return {name: getattr(model, name) for name in names}
 
 
-def test_an_arm_in_degrees_is_the_arm_in_radians(tmp_path: Path):
+def test_an_arm_is_the_same_in_degrees_and_in_radians_and_if_its_hand_is_in_the_other_unit(tmp_path: Path):
     found, models, suggested = list[Robot](), [], []
-    for unit in ("radian", "degree"):
-        (tmp_path / unit).mkdir()
-        path = write(tmp_path / unit, tree=short("hinges"), model=in_unit(unit))
+    for place, unit in enumerate(("radian", "degree", "radian", "degree")):
+        folder = tmp_path / str(place)
+        folder.mkdir()
+        path = write(folder, tree=short("hinges"), model=in_unit(unit) if place < 2 else attached(folder, unit))
         found.append(get_robot(str(path)))
         models.append(arrays(arm_spec(found[-1]).compile()))
         suggested.append(suggest(path.with_name("own.xml")))
-    for name in ("home", "gains", "forces", "armature"):
-        np.testing.assert_allclose(getattr(found[1], name), getattr(found[0], name), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found[1].ee.position, found[0].ee.position, atol=1e-6)
-    for name, values in models[0].items():
-        np.testing.assert_allclose(models[1][name], values, atol=1e-6, err_msg=name)
-    assert suggested[0] == suggested[1]
+    for robot, model, draft in zip(found[1:], models[1:], suggested[1:], strict=True):
+        for name in ("home", "gains", "forces", "armature"):
+            np.testing.assert_allclose(getattr(robot, name), getattr(found[0], name), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(robot.ee.position, found[0].ee.position, atol=1e-6)
+        for name, values in models[0].items():
+            np.testing.assert_allclose(model[name], values, atol=1e-6, err_msg=name)
+        assert draft == suggested[0]
 
 
 @pytest.mark.parametrize(("joint", "value"), [("turn", -0.5), ("elbow", 0.7)])
