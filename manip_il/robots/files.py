@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import multiprocessing
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -41,6 +44,7 @@ class ModelFiles:
 
         robot: its name.
         """
+        mujoco.set_mju_user_warning(_warn)
         try:
             model = self._mended(checks.read_bytes(self.model, "an MJCF"))
             home = self.includes or self.model.parent
@@ -57,7 +61,7 @@ class ModelFiles:
             why = " ".join(str(error).split())
             named = "" if str(self.model) in why else f"cannot read {self.model}: "
             raise UsageError(f"robot {robot}: {named}{why}") from None
-        return spec
+        return spec.copy()  # which does not repeat the warnings at every compilation
 
     def _mended(self, model: bytes) -> bytes:
         if not self.mend:
@@ -70,6 +74,13 @@ class ModelFiles:
                 )
             text = text.replace(old, new)
         return text.encode()
+
+
+@cache
+def _warn(text: str) -> None:
+    """Print a warning of MuJoCo's, once: a model is read many times, and by every worker."""
+    if multiprocessing.parent_process() is None or not text.startswith("Attach conflict"):
+        print(f"WARNING: {text}", file=sys.stderr)
 
 
 def _included(model: bytes, home: Path) -> set[str]:
