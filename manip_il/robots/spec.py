@@ -194,6 +194,15 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
     require(robot.name, "joint", tuple(robot.fixed), [joint for joint in loose if joint.type in _SCALAR])
     if robot.fixed:
         _place_bodies(spec, robot.fixed)
+    for equality in list(spec.equalities):
+        coupled = _coupled(spec, equality)
+        if equality.active and not coupled.isdisjoint(robot.joints):
+            raise UsageError(
+                f"robot {robot.name}: equality {equality.name or '(unnamed)'} couples {', '.join(sorted(coupled))}; expected arm "
+                "joints that move independently (those left out of joints are fixed)"
+            )
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT and not coupled <= kept:
+            spec.delete(equality)
     for joint in loose:
         spec.delete(joint)
     if robot.base is not None:
@@ -201,6 +210,22 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
         while root.parent.name != "world":
             root = root.parent
         root.pos = np.array(robot.base)
+
+
+def _coupled(spec: mujoco.MjSpec, equality: mujoco._specs.MjsEquality) -> set[str]:
+    """The names of the joints that an equality of joints names, or that move one of its bodies against the other."""
+    ends = equality.name1, equality.name2
+    if equality.type == mujoco.mjtEq.mjEQ_JOINT:
+        return set(filter(None, ends))
+    one, other = (_joints_below(spec.body(name)) for name in ends)
+    return one ^ other
+
+
+def _joints_below(body: Any) -> set[str]:
+    """The names of the joints between the world and a body."""
+    if body is None or body.name == "world":
+        return set()
+    return {joint.name for joint in body.joints} | _joints_below(body.parent)
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il.errors import UsageError
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.suggest import suggest
@@ -196,3 +197,37 @@ def test_of_a_scene_around_a_robot_only_the_robot_is_taken(tmp_path: Path):
     assert inside.ngeom == alone.ngeom
     assert inside.npair == 0
     assert suggest(tmp_path / "around" / "own.xml") == suggest(tmp_path / "own.xml")
+
+
+def with_equality(folder: Path, equality: str) -> mujoco.MjModel:
+    """Compile an arm with a rod beside its fore, whose joint is not the arm's, and an equality."""
+    rod = '<body name="rod" pos="0.05 0 0"><joint name="bar"/><geom size="0.01"/></body><body name="fore"'
+    model = model_of().replace("<equality>", f"<equality>{equality}").replace('<body name="fore"', rod)
+    return arm_spec(get_robot(str(write(folder, model=model)))).compile()
+
+
+@pytest.mark.parametrize(
+    ("equality", "coupled"),
+    [
+        ('<joint name="belt" joint1="wrist" joint2="elbow"/>', "elbow, wrist"),
+        ('<joint name="belt" joint1="bar" joint2="elbow"/>', "bar, elbow"),
+        ('<connect name="belt" body1="rod" body2="fore" anchor="0 0 0"/>', "bar, elbow"),
+        ('<weld name="belt" body1="upper" body2="wrist"/>', "elbow, wrist"),
+    ],
+)
+def test_an_arm_whose_joints_are_coupled_is_refused(equality: str, coupled: str, tmp_path: Path):
+    with pytest.raises(UsageError, match=f"own: equality belt couples {coupled};"):
+        with_equality(tmp_path, equality)
+
+
+@pytest.mark.parametrize(
+    ("equality", "kept"),
+    [
+        ('<joint joint1="left" joint2="right"/>', 1),
+        ('<weld body1="left" body2="right" active="false"/>', 1),
+        ('<joint joint1="elbow" joint2="wrist" active="false"/>', 1),
+        ('<joint joint1="bar"/>', 0),  # of a joint that is fixed
+    ],
+)
+def test_fingers_may_be_coupled_and_so_may_joints_that_do_not_move(equality: str, kept: int, tmp_path: Path):
+    assert with_equality(tmp_path, equality).neq == kept
