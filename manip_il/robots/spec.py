@@ -36,6 +36,7 @@ def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
     """
     spec = files.load(robot)
     _to_radians(spec)
+    _turn_inertias(spec)
     for name in _OF_A_SCENE:
         setattr(spec.compiler, name, getattr(PLAIN.compiler, name))
     return spec
@@ -55,6 +56,20 @@ def _to_radians(spec: mujoco.MjSpec) -> None:
         alt.axisangle = [*alt.axisangle[:3], math.radians(alt.axisangle[3])]
     for one in itertools.chain(joints, *turned):
         one.compiler.degree = False
+
+
+def _turn_inertias(spec: mujoco.MjSpec) -> None:
+    """Replace inertia tensors of a URDF by principal moments, as MuJoCo does but without their origin's rotation.
+
+    Its reader gives `iquat`, the axes with that rotation, which its compiler replaces by the tensor's own axes.
+    """
+    for body in spec.bodies:
+        xx, yy, zz, xy, xz, yz = tensor = body.fullinertia
+        if np.isnan(tensor).any() or tuple(body.iquat) == (1, 0, 0, 0):  # no tensor, or one of an MJCF
+            continue
+        moments = np.zeros(3)
+        mujoco.mju_eig3(moments, np.zeros(9), np.zeros(4), np.array([xx, xy, xz, xy, yy, yz, xz, yz, zz]))
+        body.inertia, body.fullinertia = moments, np.full(6, np.nan)
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
@@ -198,8 +213,8 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
         coupled = _coupled(spec, equality)
         if equality.active and not coupled.isdisjoint(robot.joints):
             raise UsageError(
-                f"robot {robot.name}: equality {equality.name or '(unnamed)'} couples {', '.join(sorted(coupled))}; expected arm "
-                "joints that move independently (those left out of joints are fixed)"
+                f"robot {robot.name}: equality {equality.name or '(unnamed)'} couples {', '.join(sorted(coupled))};"
+                " expected arm joints that move independently (those left out of joints are fixed)"
             )
         if equality.type == mujoco.mjtEq.mjEQ_JOINT and not coupled <= kept:
             spec.delete(equality)

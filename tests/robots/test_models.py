@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UsageError
+from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import Robot
-from manip_il.robots.spec import arm_model, arm_spec
+from manip_il.robots.rotations import rotation_matrix
+from manip_il.robots.spec import arm_model, arm_spec, load
 from manip_il.robots.suggest import suggest
 from manip_il.robots.table import get_robot
 
@@ -172,6 +174,24 @@ def test_what_is_bolted_on_keeps_its_name(kind: str, tmp_path: Path):
     assert bodies[0] == 1
     assert arm_model(robot).body("hand").id > bodies[0]
     assert float(arm_model(robot).body_mass.sum()) < 10
+
+
+@pytest.mark.parametrize("tensor", [(1.0, 2.0, 2.5, 0.0, 0.0, 0.0), (1.0, 2.0, 2.5, 0.2, 0.1, -0.3)])
+def test_an_inertia_of_a_urdf_is_turned_with_its_origin(tensor: tuple[float, ...], tmp_path: Path):
+    xx, yy, zz, xy, xz, yz = tensor
+    roll, pitch, yaw = 0.3, 0.4, 0.5
+    rotation = rotation_matrix(np.array([0, 0, yaw])) @ rotation_matrix(np.array([0, pitch, 0]))
+    rotation = rotation @ rotation_matrix(np.array([roll, 0, 0]))
+    values = " ".join(f'i{axes}="{value}"' for axes, value in zip(["xx", "yy", "zz", "xy", "xz", "yz"], tensor, strict=True))
+    turned = f'<inertial><origin rpy="{roll} {pitch} {yaw}"/><mass value="1"/><inertia {values}/></inertial>'
+    path = tmp_path / "arm.urdf"
+    path.write_text(re.sub(r'(?s)(?<=<link name="fore">)<inertial>.*?</inertial>', turned, urdf()))
+    body = load(ModelFiles(path), "arm").compile().body("fore")
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, body.iquat)
+    axes = axes.reshape(3, 3)
+    expected = rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T
+    np.testing.assert_allclose(axes @ np.diag(body.inertia) @ axes.T, expected, atol=1e-12)
 
 
 def suggest_joints(kind: str) -> list[str]:
