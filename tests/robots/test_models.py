@@ -182,7 +182,8 @@ def test_an_inertia_of_a_urdf_is_turned_with_its_origin(tensor: tuple[float, ...
     roll, pitch, yaw = 0.3, 0.4, 0.5
     rotation = rotation_matrix(np.array([0, 0, yaw])) @ rotation_matrix(np.array([0, pitch, 0]))
     rotation = rotation @ rotation_matrix(np.array([roll, 0, 0]))
-    values = " ".join(f'i{axes}="{value}"' for axes, value in zip(["xx", "yy", "zz", "xy", "xz", "yz"], tensor, strict=True))
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    values = " ".join(f'{name}="{value}"' for name, value in zip(names, tensor, strict=True))
     turned = f'<inertial><origin rpy="{roll} {pitch} {yaw}"/><mass value="1"/><inertia {values}/></inertial>'
     path = tmp_path / "arm.urdf"
     path.write_text(re.sub(r'(?s)(?<=<link name="fore">)<inertial>.*?</inertial>', turned, urdf()))
