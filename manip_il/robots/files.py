@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import multiprocessing
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +17,7 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
-_INCLUDE = re.compile(rb"<include\s[^>]*?file\s*=\s*[\"']([^\"']+)")
+_INCLUDE = re.compile(rb"<(?:include|model)\s[^>]*?\bfile=\"([^\"]+)\"")
 KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
 
@@ -42,6 +45,7 @@ class ModelFiles:
 
         robot: its name.
         """
+        mujoco.set_mju_user_warning(_warn)
         try:
             model = self._mended(checks.read_bytes(self.model, "an MJCF"))
             home = self.includes or self.model.parent
@@ -58,7 +62,7 @@ class ModelFiles:
             why = " ".join(str(error).split())
             named = "" if str(self.model) in why else f"cannot read {self.model}: "
             raise UsageError(f"robot {robot}: {named}{why}") from None
-        return spec
+        return spec.copy()  # which does not repeat the warnings at every compilation
 
     def _mended(self, model: bytes) -> bytes:
         if not self.mend:
@@ -74,7 +78,7 @@ class ModelFiles:
 
 
 def _included(model: bytes, home: Path) -> dict[str, bytes]:
-    """Return the files that a model includes, directly or not, by their paths in it."""
+    """Return the files that a model includes or attaches, directly or not, by their paths in it."""
     found: dict[str, bytes] = {}
     waiting = [model]
     while waiting:
@@ -83,6 +87,13 @@ def _included(model: bytes, home: Path) -> dict[str, bytes]:
                 found[name] = checks.read_bytes(home / name, "an MJCF")
                 waiting.append(found[name])
     return found
+
+
+@cache
+def _warn(text: str) -> None:
+    """Print a warning of MuJoCo's, once: a model is read many times, and by every worker."""
+    if multiprocessing.parent_process() is None or not text.startswith("Attach conflict"):
+        print(f"WARNING: {text}", file=sys.stderr)
 
 
 def read(what: str, kind: Any, value: Any) -> Any:

@@ -35,25 +35,41 @@ def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
     robot: its name. Raises `UsageError` if MuJoCo cannot read the model.
     """
     spec = files.load(robot)
-    if spec.compiler.degree:
-        _to_radians(spec)
+    _to_radians(spec)
+    _turn_inertias(spec)
     for name in _OF_A_SCENE:
         setattr(spec.compiler, name, getattr(PLAIN.compiler, name))
     return spec
 
 
 def _to_radians(spec: mujoco.MjSpec) -> None:
-    """Convert every angle of a model from degrees."""
-    for joint in spec.joints:
+    """Convert every angle from degrees. Each element has the unit of its own file, as a model may attach others."""
+    kinds = ("joints", "bodies", "geoms", "sites", "cameras", "frames")
+    joints, *turned = ([one for one in getattr(spec, kind) if one.compiler.degree] for kind in kinds)
+    for joint in joints:
         if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
             joint.range = np.radians(joint.range)
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             joint.ref, joint.springref = math.radians(joint.ref), math.radians(joint.springref)
-    turned = [one.alt for kind in ("bodies", "geoms", "sites", "cameras", "frames") for one in getattr(spec, kind)]
-    for alt in (*turned, *(body.ialt for body in spec.bodies)):
+    for alt in (*(one.alt for kind in turned for one in kind), *(body.ialt for body in turned[0])):
         alt.euler = np.radians(alt.euler)
         alt.axisangle = [*alt.axisangle[:3], math.radians(alt.axisangle[3])]
-    spec.compiler.degree = False
+    for one in itertools.chain(joints, *turned):
+        one.compiler.degree = False
+
+
+def _turn_inertias(spec: mujoco.MjSpec) -> None:
+    """Replace inertia tensors of a URDF by principal moments, as MuJoCo does but without their origin's rotation.
+
+    Its reader gives `iquat`, the axes with that rotation, which its compiler replaces by the tensor's own axes.
+    """
+    for body in spec.bodies:
+        xx, yy, zz, xy, xz, yz = tensor = body.fullinertia
+        if np.isnan(tensor).any() or tuple(body.iquat) == (1, 0, 0, 0):  # no tensor, or one of an MJCF
+            continue
+        moments = np.zeros(3)
+        mujoco.mju_eig3(moments, np.zeros(9), np.zeros(4), np.array([xx, xy, xz, xy, yy, yz, xz, yz, zz]))
+        body.inertia, body.fullinertia = moments, np.full(6, np.nan)
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
@@ -193,6 +209,15 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
     require(robot.name, "joint", tuple(robot.fixed), [joint for joint in loose if joint.type in _SCALAR])
     if robot.fixed:
         _place_bodies(spec, robot.fixed)
+    for equality in list(spec.equalities):
+        coupled = _coupled(spec, equality)
+        if equality.active and not coupled.isdisjoint(robot.joints):
+            raise UsageError(
+                f"robot {robot.name}: equality {equality.name or '(unnamed)'} couples {', '.join(sorted(coupled))};"
+                " expected arm joints that move independently (those left out of joints are fixed)"
+            )
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT and not coupled <= kept:
+            spec.delete(equality)
     for joint in loose:
         spec.delete(joint)
     if robot.base is not None:
@@ -200,6 +225,22 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
         while root.parent.name != "world":
             root = root.parent
         root.pos = np.array(robot.base)
+
+
+def _coupled(spec: mujoco.MjSpec, equality: mujoco._specs.MjsEquality) -> set[str]:
+    """The names of the joints that an equality of joints names, or that move one of its bodies against the other."""
+    ends = equality.name1, equality.name2
+    if equality.type == mujoco.mjtEq.mjEQ_JOINT:
+        return set(filter(None, ends))
+    one, other = (_joints_below(spec.body(name)) for name in ends)
+    return one ^ other
+
+
+def _joints_below(body: Any) -> set[str]:
+    """The names of the joints between the world and a body."""
+    if body is None or body.name == "world":
+        return set()
+    return {joint.name for joint in body.joints} | _joints_below(body.parent)
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from manip_il.robots.files import _warn
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 from manip_il.robots.table import get_robot
@@ -63,3 +64,32 @@ def test_what_a_model_includes_is_found_where_the_yaml_says_and_what_lies_beside
         model=(tmp_path / "own.xml").read_text(),
     )
     assert arm_spec(get_robot(str(again))).compile().nmeshvert == 4
+
+
+def with_shoe(folder: Path) -> Robot:
+    """An arm whose model attaches another, with a mesh and with physics options of its own."""
+    foot = '<asset><mesh name="foot" file="foot.obj"/></asset>'
+    body = '<worldbody><body name="shoe"><geom type="mesh" mesh="foot" contype="0"/></body></worldbody>'
+    (folder / "shoe.xml").write_text(f'<mujoco model="shoe"><option timestep="0.001"/>{foot}{body}</mujoco>')
+    attach = {
+        "</asset>": '<model name="shoe" file="shoe.xml"/></asset>',
+        '<body name="base">': '<body name="base"><attach model="shoe" body="shoe" prefix="own_"/>',
+    }
+    return shaped(folder, "parts/foot.obj", "foot.obj", meshes="parts", text=attach)
+
+
+def test_a_model_that_is_attached_is_found_beside_the_one_that_attaches_it(tmp_path: Path):
+    assert arm_spec(with_shoe(tmp_path)).compile().nmeshvert == 8
+
+
+def test_a_conflict_of_attached_models_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
+):
+    monkeypatch.chdir(tmp_path)
+    _warn.cache_clear()
+    robot = with_shoe(tmp_path)
+    for _ in range(3):
+        arm_spec(robot).compile()
+    assert capfd.readouterr().err.count("'shoe'") == 1
+    assert not recwarn.list
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il.errors import UsageError
+from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import Robot
-from manip_il.robots.spec import arm_model, arm_spec
+from manip_il.robots.rotations import rotation_matrix
+from manip_il.robots.spec import arm_model, arm_spec, load
 from manip_il.robots.suggest import suggest
 from manip_il.robots.table import get_robot
 
@@ -47,6 +51,23 @@ def in_unit(unit: str) -> str:
     scale = math.degrees(1) if unit == "degree" else 1.0
     text = ENDS.sub(r'\1"A(\2)"', TURNED).replace("UNIT", f'angle="{unit}"')
     return re.sub(r"A\((.*?)\)", lambda found: " ".join(repr(float(one) * scale) for one in found[1].split()), text)
+
+
+def attached(folder: Path, unit: str) -> str:
+    """Return the arm's MJCF, which attaches its hand from `folder`/hand.xml, written in the other unit."""
+    arm, hand = (ET.fromstring(in_unit(one)) for one in (unit, "degree" if unit == "radian" else "radian"))
+    wrist = arm.find(".//body[@name='wrist']")
+    wrist.remove(wrist.find("body"))
+    ET.SubElement(wrist, "attach", model="hand", body="hand", prefix="")
+    ET.SubElement(arm.find("asset"), "model", name="hand", file="hand.xml")
+    arm.remove(arm.find("equality"))
+    world, part = hand.find("worldbody"), hand.find(".//body[@name='hand']")
+    world.clear()
+    world.append(part)
+    for name in ("equality", "actuator", "sensor", "keyframe", "asset"):
+        hand.remove(hand.find(name))
+    (folder / "hand.xml").write_text(ET.tostring(hand, "unicode"))
+    return ET.tostring(arm, "unicode")
 
 
 def urdf() -> str:
@@ -83,20 +104,22 @@ def arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return {name: getattr(model, name) for name in names}
 
 
-def test_an_arm_in_degrees_is_the_arm_in_radians(tmp_path: Path):
+def test_an_arm_is_the_same_in_degrees_and_in_radians_and_if_its_hand_is_in_the_other_unit(tmp_path: Path):
     found, models, suggested = list[Robot](), [], []
-    for unit in ("radian", "degree"):
-        (tmp_path / unit).mkdir()
-        path = write(tmp_path / unit, tree=short("hinges"), model=in_unit(unit))
+    for place, unit in enumerate(("radian", "degree", "radian", "degree")):
+        folder = tmp_path / str(place)
+        folder.mkdir()
+        path = write(folder, tree=short("hinges"), model=in_unit(unit) if place < 2 else attached(folder, unit))
         found.append(get_robot(str(path)))
         models.append(arrays(arm_spec(found[-1]).compile()))
         suggested.append(suggest(path.with_name("own.xml")))
-    for name in ("home", "gains", "forces", "armature"):
-        np.testing.assert_allclose(getattr(found[1], name), getattr(found[0], name), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found[1].ee.position, found[0].ee.position, atol=1e-6)
-    for name, values in models[0].items():
-        np.testing.assert_allclose(models[1][name], values, atol=1e-6, err_msg=name)
-    assert suggested[0] == suggested[1]
+    for robot, model, draft in zip(found[1:], models[1:], suggested[1:], strict=True):
+        for name in ("home", "gains", "forces", "armature"):
+            np.testing.assert_allclose(getattr(robot, name), getattr(found[0], name), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(robot.ee.position, found[0].ee.position, atol=1e-6)
+        for name, values in models[0].items():
+            np.testing.assert_allclose(model[name], values, atol=1e-6, err_msg=name)
+        assert draft == suggested[0]
 
 
 @pytest.mark.parametrize(("joint", "value"), [("turn", -0.5), ("elbow", 0.7)])
@@ -153,6 +176,25 @@ def test_what_is_bolted_on_keeps_its_name(kind: str, tmp_path: Path):
     assert float(arm_model(robot).body_mass.sum()) < 10
 
 
+@pytest.mark.parametrize("tensor", [(1.0, 2.0, 2.5, 0.0, 0.0, 0.0), (1.0, 2.0, 2.5, 0.2, 0.1, -0.3)])
+def test_an_inertia_of_a_urdf_is_turned_with_its_origin(tensor: tuple[float, ...], tmp_path: Path):
+    xx, yy, zz, xy, xz, yz = tensor
+    roll, pitch, yaw = 0.3, 0.4, 0.5
+    rotation = rotation_matrix(np.array([0, 0, yaw])) @ rotation_matrix(np.array([0, pitch, 0]))
+    rotation = rotation @ rotation_matrix(np.array([roll, 0, 0]))
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    values = " ".join(f'{name}="{value}"' for name, value in zip(names, tensor, strict=True))
+    turned = f'<inertial><origin rpy="{roll} {pitch} {yaw}"/><mass value="1"/><inertia {values}/></inertial>'
+    path = tmp_path / "arm.urdf"
+    path.write_text(re.sub(r'(?s)(?<=<link name="fore">)<inertial>.*?</inertial>', turned, urdf()))
+    body = load(ModelFiles(path), "arm").compile().body("fore")
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, body.iquat)
+    axes = axes.reshape(3, 3)
+    expected = rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T
+    np.testing.assert_allclose(axes @ np.diag(body.inertia) @ axes.T, expected, atol=1e-12)
+
+
 def suggest_joints(kind: str) -> list[str]:
     return ["turn", "shoulder", "elbow", "bend" if kind == "urdf" else "wrist", "roll"]
 
@@ -176,3 +218,37 @@ def test_of_a_scene_around_a_robot_only_the_robot_is_taken(tmp_path: Path):
     assert inside.ngeom == alone.ngeom
     assert inside.npair == 0
     assert suggest(tmp_path / "around" / "own.xml") == suggest(tmp_path / "own.xml")
+
+
+def with_equality(folder: Path, equality: str) -> mujoco.MjModel:
+    """Compile an arm with a rod beside its fore, whose joint is not the arm's, and an equality."""
+    rod = '<body name="rod" pos="0.05 0 0"><joint name="bar"/><geom size="0.01"/></body><body name="fore"'
+    model = model_of().replace("<equality>", f"<equality>{equality}").replace('<body name="fore"', rod)
+    return arm_spec(get_robot(str(write(folder, model=model)))).compile()
+
+
+@pytest.mark.parametrize(
+    ("equality", "coupled"),
+    [
+        ('<joint name="belt" joint1="wrist" joint2="elbow"/>', "elbow, wrist"),
+        ('<joint name="belt" joint1="bar" joint2="elbow"/>', "bar, elbow"),
+        ('<connect name="belt" body1="rod" body2="fore" anchor="0 0 0"/>', "bar, elbow"),
+        ('<weld name="belt" body1="upper" body2="wrist"/>', "elbow, wrist"),
+    ],
+)
+def test_an_arm_whose_joints_are_coupled_is_refused(equality: str, coupled: str, tmp_path: Path):
+    with pytest.raises(UsageError, match=f"own: equality belt couples {coupled};"):
+        with_equality(tmp_path, equality)
+
+
+@pytest.mark.parametrize(
+    ("equality", "kept"),
+    [
+        ('<joint joint1="left" joint2="right"/>', 1),
+        ('<weld body1="left" body2="right" active="false"/>', 1),
+        ('<joint joint1="elbow" joint2="wrist" active="false"/>', 1),
+        ('<joint joint1="bar"/>', 0),  # of a joint that is fixed
+    ],
+)
+def test_fingers_may_be_coupled_and_so_may_joints_that_do_not_move(equality: str, kept: int, tmp_path: Path):
+    assert with_equality(tmp_path, equality).neq == kept
