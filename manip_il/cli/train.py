@@ -58,7 +58,10 @@ class TrainOptions(Seeded, Trusting):
     def run(self) -> None:
         """Read the datasets, fit, and print the checkpoint's path."""
         from manip_il.cli.inputs import open_datasets
+        from manip_il.learn.lerobot_config import lerobot_options
+        from manip_il.learn.samples import rabc_weights
         from manip_il.learn.sources import input_columns
+        from manip_il.learn.train import Trainer
 
         writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
         if not writes:
@@ -66,16 +69,11 @@ class TrainOptions(Seeded, Trusting):
         config, folder, weights = self.config(), self.output.output_dir, None
         language = config.kind not in PLAIN
         datasets = open_datasets(self.dataset.root, pictures=config.takes_images, language=language)
+        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         for one in datasets:
             input_columns(config, one.root, one.info)  # raises if the dataset lacks an input
         if writes:
             self.output.check(self)
-        # Imported after the datasets are checked: these take seconds.
-        from manip_il.learn.lerobot_config import lerobot_options
-        from manip_il.learn.samples import rabc_weights
-        from manip_il.learn.train import Trainer
-
-        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         if self.weights is not None:
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
