@@ -74,4 +74,3 @@ def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition 
         return None if condition.ranges else condition
     task = get_task(env.task, env.object)
     return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes)
-
