@@ -78,7 +78,7 @@ class TrainOptions(Seeded, Trusting):
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
             weights = rabc_weights(
-                self.weights, episodes, getattr(options.policy, "chunk_size", None) or int(first.fps)
+                self.weights, episodes, getattr(options.policy, "chunk_size", None) or round(first.fps)
             )
         with self.output.open(self) if writes else contextlib.nullcontext():
             pictures = sum(len(one) * len(one.cameras) for one in datasets) if config.takes_images else 0

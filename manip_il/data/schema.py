@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from fractions import Fraction
 from itertools import zip_longest
 from typing import Any
 
@@ -52,7 +53,7 @@ class RobotTaskSpec:
 
     robot: str
     task: str
-    fps: int  # control rate [Hz]
+    fps: float  # control rate [Hz], an int if it is whole
     joint_names: tuple[str, ...]  # n: arm joints, then the gripper
     environment_state_names: tuple[str, ...]  # k
     sim_state_size: int  # m
@@ -71,6 +72,7 @@ class RobotTaskSpec:
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
+        object.__setattr__(self, "fps", plain_rate(checks.number("fps", self.fps, 1)))
         for camera in self.cameras:
             checks.name("a camera", camera)
 
@@ -100,6 +102,16 @@ class RobotTaskSpec:
     def keypoint_keys(self) -> dict[str, str]:
         """Columns of keypoints: column -> camera; {} if there are no keypoints."""
         return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
+
+
+def plain_rate(fps: float) -> float:
+    """Return a rate as `info.json` has it: an int if it is whole."""
+    return int(fps) if float(fps).is_integer() else fps
+
+
+def exact_rate(fps: float) -> Fraction:
+    """Return the fraction that a rate stands for, 2997/125 for 23.976; it fits the 32 bits of a video's time base."""
+    return Fraction(str(fps)).limit_denominator(100_000)
 
 
 def robot_of(robot_type: str) -> dict[str, str]:

@@ -51,7 +51,8 @@ def mend(root: Path, finding: Finding, *, repaired: bool = False) -> str:
     possible = journals_of(root).is_dir()
     if not finding.is_error or finding.place.startswith((INFO, STATS)):
         with suppress(ManipError):
-            possible |= Dataset.open(root) is not None
+            Dataset.open(root)
+            possible = True
     if possible and not repaired:
         return f"repair it: manip-il data repair {root}"
     if possible or (root / INFO).exists():

@@ -45,7 +45,7 @@ class Origin:
 
     robot: str
     task: str
-    fps: int
+    fps: float  # as in `RobotTaskSpec`
     joint_names: tuple[str, ...]
     environment_state_names: tuple[str, ...]
     action_meaning: str
