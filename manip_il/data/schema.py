@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -41,6 +42,7 @@ LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, 
 VERSION = 2  # version of the columns and their meaning: 2 has progress, complete states and named phases
 MOST_FPS = 10_000  # highest control rate [Hz]
 MUST_AGREE = ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")  # in the name of a robot
 _OPTIONAL = ("object", "robot_type", "video", "keypoints")  # keys of a spec's JSON that may be missing
 
 
@@ -115,9 +117,9 @@ def exact_rate(fps: float) -> Fraction:
 
 
 def robot_of(robot_type: str) -> dict[str, str]:
-    """Return the fields of `RobotTaskSpec` that LeRobot's `robot_type` determines."""
+    """Return the fields of `RobotTaskSpec` that LeRobot's `robot_type`, any text, determines."""
     if robot_type not in LEROBOT_TYPES:
-        return {"robot": robot_type}
+        return {"robot": _UNSAFE.sub("_", robot_type), "robot_type": robot_type if _UNSAFE.search(robot_type) else ""}
     return {"robot": LEROBOT_TYPES[robot_type], "robot_type": robot_type, "action_meaning": SERVOS}
 
 

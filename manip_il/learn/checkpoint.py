@@ -22,9 +22,10 @@ from manip_il.sim.config import CameraConfig, Look
 
 CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
 MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that convert actions
+JOINTS_ALONE = "manip_il_joints_alone"  # step of a policy that observes nothing else
 _STEPS = (  # registry names of LeRobot's default steps, and ours: they load nothing
     *("rename_observations_processor", "to_batch_processor", "device_processor"),
-    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
+    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER, JOINTS_ALONE),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
@@ -150,7 +151,11 @@ class Checkpoint:
         return cls(
             path,
             config,
-            numbers={key: math.prod(shape) for key, (kind, shape) in inputs.items() if kind in ("STATE", "ENV")},
+            numbers={
+                key: math.prod(shape)
+                for key, (kind, shape) in inputs.items()
+                if kind in ("STATE", "ENV") and all(shape)  # not the environment state of `JointsAloneStep`
+            },
             pictures={name: size for name, size in sizes.items() if not name.startswith(_PLACEHOLDER)},
             action=action,
             space=space,
