@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -41,6 +42,16 @@ def test_what_the_settings_of_the_tests_name_is_there():
     ours = [name for name in IMPORTED_ONCE if name.startswith("manip_il.")]
     assert [name for name in ours if find_spec(name) is None] == []
     assert [name for name in LONG if not (ROOT / "tests" / name).is_file()] == []
+
+
+def test_every_file_that_the_package_reads_is_installed_in_it():
+    """Not beside it, where it is missing after `pip install --target` or `--user`."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    folders = {ROOT.joinpath(*name.split(".")): globs for name, globs in settings["package-data"].items()}
+    installed = {path for folder, globs in folders.items() for one in globs for path in folder.glob(one)}
+    read = {path for path in tracked() if path.is_relative_to(ROOT / "manip_il") and path.suffix != ".py"}
+    assert "data-files" not in settings
+    assert read - installed == set()
 
 
 def test_the_image_and_make_bring_the_packages_that_errors_name():

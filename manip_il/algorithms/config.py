@@ -109,7 +109,7 @@ class RunConfig(Seeded):
     )
     fit: FitConfig = field(default_factory=FitConfig)
     validation_episodes: int = option(200, "unseen episodes by which the best round is chosen", at_least=1)
-    hold: int = option(10, "control steps of a rollout after success")
+    hold: int = option(10, "control steps of a rollout after success", at_least=0)
     patience: int = option(
         100, "control steps without progress after which a rollout ends, if every state gets a label", at_least=1
     )

@@ -35,11 +35,11 @@ class CheckOptions(OfDataset):
         """Check the dataset and print every finding and the verdict; raises `NotWhole` if there are errors."""
         self._conclude(self._examine())
 
-    def _examine(self) -> list[Finding]:
+    def _examine(self, *, repaired: bool = False) -> list[Finding]:
         """Check the dataset and print every finding."""
         from manip_il.doctor.examine import examine_folder
 
-        findings = examine_folder(self.dataset.absolute(), [check_robot])
+        findings = examine_folder(self.dataset.absolute(), [check_robot], repaired=repaired)
         say(*map(str, findings))
         return findings
 
@@ -69,7 +69,7 @@ class RepairOptions(CheckOptions):
 
         if findings := self._examine():
             say(*(f"repair   {line}" for line in repair(self.dataset.absolute(), findings)))
-            findings = self._examine()
+            findings = self._examine(repaired=True)
         self._conclude(findings)
 
 

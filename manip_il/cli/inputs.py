@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from manip_il import checks
 from manip_il.algorithms.config import RunConfig
-from manip_il.cli.common_options import env_config, start_policy
+from manip_il.cli.common_options import OF_POLICY, env_config, start_policy
 from manip_il.cli.options import Given, Open
 from manip_il.cli.progress import warn
 from manip_il.collect.drivers import Driver, PolicyDriver, driver_of
@@ -105,6 +106,16 @@ def open_driver(
     checkpoint = Checkpoint.open(path := find_policy(policy))
     config = env_config(env, checkpoint.origin) if isinstance(env, dict) else env
     return config, PolicyDriver((path,), trust=trust, device=device), check_policy(checkpoint, config, trust=trust)
+
+
+def why_not_simulated(checkpoint: Checkpoint) -> str:
+    """Return why no environment of this program fits a policy of another program's data; "" if one does."""
+    try:
+        env = env_config(OF_POLICY, checkpoint.origin)
+        checkpoint.check_fits(env_spec(env, checkpoint.cameras))
+    except ManipError as error:
+        return checks.one_line(error)
+    return ""
 
 
 def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False) -> CameraConfig | None:

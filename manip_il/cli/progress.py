@@ -39,9 +39,9 @@ def say(*lines: str) -> None:
         _print(printable(line), sys.stdout)
 
 
-def say_next(*words: object, what: str = "next") -> None:
-    """Print a command of this program to copy, quoted for a shell. what: what it is for."""
-    say(f"{what}: {shlex.join(['manip-il', *map(str, words)])}")
+def say_next(*words: object, what: str = "next", program: str = "manip-il") -> None:
+    """Print a command to copy, quoted for a shell. what: what it is for. program: whose command."""
+    say(f"{what}: {shlex.join([program, *map(str, words)])}")
 
 
 def warn(*lines: str) -> None:

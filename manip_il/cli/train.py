@@ -7,7 +7,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.common_options import DatasetRoots, Trusting, own_files, start_policy
 from manip_il.cli.options import Given, given, group
@@ -18,6 +18,9 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import PLAIN
 from manip_il.option import Seeded, option
 from manip_il.seeding import stream_base
+
+if TYPE_CHECKING:
+    from manip_il.data.dataset import Dataset
 
 RANK = "RANK"  # environment variable with the process's index in distributed training
 
@@ -58,7 +61,10 @@ class TrainOptions(Seeded, Trusting):
     def run(self) -> None:
         """Read the datasets, fit, and print the checkpoint's path."""
         from manip_il.cli.inputs import open_datasets
+        from manip_il.learn.lerobot_config import lerobot_options
+        from manip_il.learn.samples import rabc_weights
         from manip_il.learn.sources import input_columns
+        from manip_il.learn.train import Trainer
 
         writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
         if not writes:
@@ -66,21 +72,16 @@ class TrainOptions(Seeded, Trusting):
         config, folder, weights = self.config(), self.output.output_dir, None
         language = config.kind not in PLAIN
         datasets = open_datasets(self.dataset.root, pictures=config.takes_images, language=language)
+        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         for one in datasets:
             input_columns(config, one.root, one.info)  # raises if the dataset lacks an input
         if writes:
             self.output.check(self)
-        # Imported after the datasets are checked: these take seconds.
-        from manip_il.learn.lerobot_config import lerobot_options
-        from manip_il.learn.samples import rabc_weights
-        from manip_il.learn.train import Trainer
-
-        options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         if self.weights is not None:
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
             weights = rabc_weights(
-                self.weights, episodes, getattr(options.policy, "chunk_size", None) or int(first.fps)
+                self.weights, episodes, getattr(options.policy, "chunk_size", None) or round(first.fps)
             )
         with self.output.open(self) if writes else contextlib.nullcontext():
             pictures = sum(len(one) * len(one.cameras) for one in datasets) if config.takes_images else 0
@@ -99,8 +100,20 @@ class TrainOptions(Seeded, Trusting):
                 path = trainer.fit(stages.log)
         if writes:
             say(f"checkpoint: {path}")
-            own = own_files(datasets[0].spec.robot, datasets[0].spec.task)
-            say_next("eval", f"--policy.path={path}", *own, f"--output_dir={folder}/eval")
+            self._say_next(path, datasets[0])
+
+    def _say_next(self, path: Path, first: Dataset) -> None:
+        """Print how to evaluate the policy: in simulation if an environment fits it, else on its own robot."""
+        from manip_il.cli.inputs import why_not_simulated
+        from manip_il.learn.checkpoint import Checkpoint
+
+        spec, policy = first.spec, f"--policy.path={path}"
+        if first.own is None and (reason := why_not_simulated(Checkpoint.open(path))):
+            say(f"no simulator of this program fits the policy: {reason}")
+            words = "--policy.discover_packages_path=manip_il.lerobot_plugin", f"--fps={spec.fps}", "--robot.type=TYPE"
+            say_next("--strategy.type=base", policy, *words, what="next, on its robot", program="lerobot-rollout")
+        else:
+            say_next("eval", policy, *own_files(spec.robot, spec.task), f"--output_dir={self.output.output_dir}/eval")
 
     def config(self) -> FitConfig:
         """Return the trainer's configuration; `UsageError` if options contradict each other."""

@@ -123,7 +123,7 @@ class Dataset:
         return s.RobotTaskSpec(
             **robot,
             task=UNKNOWN_TASK,
-            fps=round(self.fps),
+            fps=self.fps,
             joint_names=features[s.ACTION].labels,
             environment_state_names=around.labels if around else (),
             sim_state_size=features[s.SIM_STATE].size if s.SIM_STATE in features else 0,

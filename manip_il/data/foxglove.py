@@ -48,7 +48,7 @@ SCALARS: dict[str, Any] = {
 }
 
 
-def frame_times(count: int, rate: int | Fraction) -> list[int]:
+def frame_times(count: int, rate: Fraction) -> list[int]:
     """Return the times of an episode's frames [ns], from 0, at a rate [frames/s]."""
     return [frame * NANOSECONDS * rate.denominator // rate.numerator for frame in range(count)]
 

@@ -24,7 +24,7 @@ from manip_il import checks
 from manip_il.data import foxglove
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
+from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec, exact_rate
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -52,7 +52,7 @@ class Journal:
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=_RECORD)
         writer.add_metadata(_RECORD, _to_texts(self, episode))
-        times = foxglove.frame_times(len(episode), self.spec.fps)
+        times = foxglove.frame_times(len(episode), exact_rate(self.spec.fps))
         channels = foxglove.episode_channels(episode, times, self.spec.joint_names)
         foxglove.add_channels(writer, channels, times)
         for key, column in episode.columns.items():

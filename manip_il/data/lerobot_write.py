@@ -94,7 +94,7 @@ class TableWriter:
         self._rows: list[dict[str, Any]] = []
         self._row_schema: pa.Schema | None = None  # schema of the first rows written
         films = [key for key, feature in features.items() if feature["dtype"] == "video"]
-        self.films = {key: CameraFiles(folder, key, video, int(fps)) for key in films}
+        self.films = {key: CameraFiles(folder, key, video, fps) for key in films}
         self._pooled: Statistics = {}
         self._tasks: dict[str, int] = {}  # text -> index, in order of first appearance
         self.episodes = self.frames = 0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from fractions import Fraction
 from itertools import zip_longest
 from typing import Any
 
@@ -40,6 +42,7 @@ LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, 
 VERSION = 2  # version of the columns and their meaning: 2 has progress, complete states and named phases
 MOST_FPS = 10_000  # highest control rate [Hz]
 MUST_AGREE = ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")  # in the name of a robot
 _OPTIONAL = ("object", "robot_type", "video", "keypoints")  # keys of a spec's JSON that may be missing
 
 
@@ -52,7 +55,7 @@ class RobotTaskSpec:
 
     robot: str
     task: str
-    fps: int  # control rate [Hz]
+    fps: float  # control rate [Hz], an int if it is whole
     joint_names: tuple[str, ...]  # n: arm joints, then the gripper
     environment_state_names: tuple[str, ...]  # k
     sim_state_size: int  # m
@@ -71,6 +74,7 @@ class RobotTaskSpec:
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
+        object.__setattr__(self, "fps", plain_rate(checks.number("fps", self.fps, 1)))
         for camera in self.cameras:
             checks.name("a camera", camera)
 
@@ -102,10 +106,20 @@ class RobotTaskSpec:
         return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
 
 
+def plain_rate(fps: float) -> float:
+    """Return a rate as `info.json` has it: an int if it is whole."""
+    return int(fps) if float(fps).is_integer() else fps
+
+
+def exact_rate(fps: float) -> Fraction:
+    """Return the fraction that a rate stands for, 2997/125 for 23.976; it fits the 32 bits of a video's time base."""
+    return Fraction(str(fps)).limit_denominator(100_000)
+
+
 def robot_of(robot_type: str) -> dict[str, str]:
-    """Return the fields of `RobotTaskSpec` that LeRobot's `robot_type` determines."""
+    """Return the fields of `RobotTaskSpec` that LeRobot's `robot_type`, any text, determines."""
     if robot_type not in LEROBOT_TYPES:
-        return {"robot": robot_type}
+        return {"robot": _UNSAFE.sub("_", robot_type), "robot_type": robot_type if _UNSAFE.search(robot_type) else ""}
     return {"robot": LEROBOT_TYPES[robot_type], "robot_type": robot_type, "action_meaning": SERVOS}
 
 

@@ -27,6 +27,7 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.camera import Pictures, open_video
 from manip_il.data.dataset import Dataset
+from manip_il.data.schema import exact_rate, plain_rate
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
 
@@ -44,8 +45,8 @@ class VideoSpan:
 class CameraFiles:
     """Writes one camera's numbered video files, one at a time; the same episodes give the same bytes."""
 
-    def __init__(self, folder: Path, key: str, config: VideoConfig, fps: int):
-        self._folder, self._key, self._config, self._fps = folder, key, config, fps
+    def __init__(self, folder: Path, key: str, config: VideoConfig, fps: float):
+        self._folder, self._key, self._config, self._fps = folder, key, config, exact_rate(fps)
         self._limit = layout.VIDEO_FILES_SIZE_IN_MB * 2**20
         self._number = self._frames = self._bytes = 0
         self._container: OutputContainer | None = None
@@ -99,7 +100,7 @@ class CameraFiles:
                 "video.width": stream.width,
                 "video.codec": stream.codec.canonical_name,
                 "video.pix_fmt": stream.pix_fmt,
-                "video.fps": int(stream.base_rate or 0),
+                "video.fps": plain_rate(float(stream.base_rate or 0)),
                 "video.channels": len(stream.format.components),
                 "has_audio": False,
             }
@@ -137,27 +138,27 @@ def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Pac
     return packets
 
 
-def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoCodecContext:
+def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: Fraction) -> VideoCodecContext:
     encoder = cast(VideoCodecContext, av.CodecContext.create(config.vcodec, "w"))
     encoder.options = config.options()
     _set_up(encoder, config, size, fps)
     return encoder
 
 
-def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: int) -> None:
+def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: Fraction) -> None:
     os.environ.setdefault("SVT_LOG", "1")  # errors only; otherwise it prints its version for every encoder
     encoder.height, encoder.width = size
     encoder.pix_fmt = config.pix_fmt
-    encoder.framerate, encoder.time_base = Fraction(fps), Fraction(1, fps)
+    encoder.framerate, encoder.time_base = fps, 1 / fps
 
 
-def _video_frame(picture: NDArray[np.uint8], number: int, fps: int) -> av.VideoFrame:
+def _video_frame(picture: NDArray[np.uint8], number: int, fps: Fraction) -> av.VideoFrame:
     frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-    frame.pts, frame.time_base = number, Fraction(1, fps)
+    frame.pts, frame.time_base = number, 1 / fps
     return frame
 
 
-def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
+def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
     """Encode one picture of this height and width; raises `UsageError` with the encoder's reason if it fails."""
     level = av.logging.get_level()
     av.logging.set_level(av.logging.ERROR)  # otherwise the reason is not logged
@@ -165,8 +166,9 @@ def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
         try:
             if len(av.VideoFormat(config.pix_fmt).components) < 3:
                 raise ValueError(f"pixel format {config.pix_fmt} has no colour")
-            encoder = _new_encoder(config, size, fps)
-            _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
+            rate = exact_rate(fps)
+            encoder = _new_encoder(config, size, rate)
+            _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, rate))
             _encode(encoder, None)
         except (av.FFmpegError, ValueError) as error:
             reason = log[0][2].strip() if log else str(error)

@@ -31,11 +31,11 @@ _FILE = re.compile(r"(?:meta|data|videos)/[\w.\-/]*\w")
 _PICTURES = 100  # pictures per camera from which statistics are computed
 
 
-def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
+def examine_folder(root: Path, more: Sequence[Check] = (), *, repaired: bool = False) -> list[Finding]:
     """Return all findings about a folder, [] for a sound dataset. Never raises.
 
     Every file is first opened in a child process; if that needs too much memory or time, or the folder is not a
-    dataset, this is the only finding. more: additional checks.
+    dataset, this is the only finding. more: additional checks. repaired: whether it has just been repaired.
     """
     try:
         check_arrived(root, strict=False)
@@ -45,7 +45,7 @@ def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
     else:
         found = [finding for check in (*CHECKS, *more) for finding in _run(check, dataset)]
     # several checks may report the same file
-    return list(dict.fromkeys(replace(one, remedy=one.remedy or mend(root, one)) for one in found))
+    return list(dict.fromkeys(replace(one, remedy=one.remedy or mend(root, one, repaired=repaired)) for one in found))
 
 
 def _run(check: Check, dataset: Dataset) -> Iterator[Finding]:

@@ -21,7 +21,9 @@ from manip_il.data.parquet_files import column_names, read_file
 from manip_il.doctor.finding import Finding, journals_of, list_first, of_episodes, warning
 
 _AXES = (["height", "width", "channels"], ["height", "width", "channel"], ["channels", "height", "width"])
-_TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # relative, because LeRobot computes in float32
+_TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # shares of the largest value
+_OF_SPREAD = 0.05  # tolerance as a share of the standard deviation, which LeRobot computes in float32
+_NOISE = 1e-5  # a spread of less than this share of the largest value is lost in float32, so it is not compared
 _TEMPORARY = re.compile(r"\..*\.tmp|.*\.(partial|incomplete|ffconcat)|tmp[a-z0-9_]{8}|images|\.cache")
 _LATE = 1e-4  # largest difference in time between a video frame and its row that LeRobot's reader accepts [s]
 
@@ -119,8 +121,10 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:
     """Return how stored statistics differ from those of `values` (N, n), or along a matrix's last axis; "" if equal."""
     flat = values if stored["mean"].size == values.shape[1] else values.reshape(-1, feature.shape[-1])
+    largest, spread = np.abs(flat).max(axis=0), flat.std(axis=0)
+    most = np.where(spread > _NOISE * largest, _OF_SPREAD * spread, np.inf)
     for name, share in _TOLERANCES.items():
-        tolerance = share * np.abs(flat).max(axis=0) + 1e-9
+        tolerance = np.minimum(share * largest, most) + 1e-9
         if text := _differ(stored[name].reshape(-1), getattr(np, name)(flat, axis=0), tolerance):
             return f"{name} is {text}"
     return "" if stored["count"][0] == len(values) else f"count is {stored['count'][0]}; expected {len(values)}"

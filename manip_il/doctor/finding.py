@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO, STATS
 from manip_il.errors import ManipError
 
@@ -41,11 +43,21 @@ def journals_of(root: Path) -> Path:
     return root.absolute().with_name(f"{root.absolute().name}.journals")
 
 
-def mend(root: Path, finding: Finding) -> str:
-    """Return what to do about a finding: repair the dataset if that is possible, else pull or record it again."""
-    if journals_of(root).is_dir() or not finding.is_error or finding.place.startswith((INFO, STATS)):
+def mend(root: Path, finding: Finding, *, repaired: bool = False) -> str:
+    """Return what to do about a finding: repair the dataset if that is possible, else pull or record it again.
+
+    repaired: whether it has just been repaired, so that this is what repair cannot do.
+    """
+    possible = journals_of(root).is_dir()
+    if not finding.is_error or finding.place.startswith((INFO, STATS)):
+        with suppress(ManipError):
+            Dataset.open(root)
+            possible = True
+    if possible and not repaired:
         return f"repair it: manip-il data repair {root}"
-    return "there are no journals to repair it from: pull or record it again"
+    if possible or (root / INFO).exists():
+        return "it cannot be repaired from what is here: pull or record it again"
+    return f"give the folder of a dataset, in which {INFO} is"
 
 
 def of_episodes(root: Path, place: str, text: str, episodes: Collection[int]) -> Finding:

@@ -27,12 +27,13 @@ _IDLE, _CLIPPED = 0.1, 0.05  # tolerated shares of the frames
 _LEAD = 0.4  # tolerated lead of actions over the joints that follow them [s]
 _LEAST = 10  # least number of episodes for comparisons between them
 _EPISODES, _PICTURES, _SIDE = 100, 6, 16  # checked episodes, pictures of each, thumbnail size [pixels]
+_HALF_TURNS = (180.0, np.pi)  # [deg], [rad]
 _SAME, _DARK = 1.5, 10.0  # pixel values, 0 to 255: largest change in an unchanged thumbnail, mean of a black picture
 _AGAIN = "correct the recorder, and record again"
 
 
 def check_motions(dataset: Dataset) -> Iterator[Finding]:
-    """Check for idle time, lagging actions, changed joint zeros, unreached commands, and texts that fit two motions."""
+    """Check for idle time, wrapping joints, lagging actions, changed zeros, unreached commands, ambiguous texts."""
     features = [dataset.features.get(key) for key in (s.STATE, s.ACTION)]
     if not all(one and one.dtype in NUMBERS and len(one.shape) == 1 and one.size for one in features):
         return
@@ -44,6 +45,7 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
     if not rows or not np.isfinite(state).all() or not np.isfinite(action).all():
         return  # reported by another check
     yield from _check_idle(dataset, rows, np.hstack([state, action]))
+    yield from _check_wraps(dataset, rows, {s.STATE: state, s.ACTION: action})
     yield from _check_texts(dataset, rows, state)
     if action.shape == state.shape:  # both list the same joints, as for LeRobot's robots
         names = np.array(dataset.features[s.ACTION].labels)
@@ -65,6 +67,22 @@ def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
     if (share := sum(idle.values()) * second / len(both)) > _IDLE:
         text = f"nothing moves for seconds, in {share:.0%} of the frames: a policy learns to stand still"
         yield of_episodes(dataset.root, s.ACTION, text, [episode for episode, seconds in idle.items() if seconds])
+
+
+def _check_wraps(dataset: Dataset, rows: Rows, columns: dict[str, F64]) -> Iterator[Finding]:
+    """Find joints whose angle jumps between two frames from one end of a turn, such as 180 degrees, to the other."""
+    for key, values in columns.items():
+        steps, largest = np.abs(np.diff(values, axis=0)), np.abs(values).max(axis=0)
+        for half in _HALF_TURNS:
+            wraps = (steps > 1.8 * half) & (largest < 1.01 * half)
+            found = {episode: wraps[span.start : span.stop - 1].any(axis=0) for episode, span in rows.items()}
+            episodes = [episode for episode, joints in found.items() if joints.any()]
+            if episodes:
+                joints = np.array(dataset.features[key].labels)[np.any([*found.values()], axis=0)]
+                what = f"{list_first(joints)} jump by a turn at +-{half:.4g} (episodes {list_first(episodes)})"
+                follows = "relative actions are a turn too long there, and a policy's mean of both ends points away"
+                remedy = f"unwrap the angles, or move the joint's zero: {_AGAIN}"
+                yield warning(key, f"{what}: {follows}", remedy)
 
 
 def _check_lag(dataset: Dataset, rows: Rows, told: F64, found: F64) -> Iterator[Finding]:

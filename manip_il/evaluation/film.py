@@ -6,7 +6,6 @@ import io
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from fractions import Fraction
 
 import av
 import numpy as np
@@ -84,14 +83,14 @@ def film_outcomes(
     return collect_films(made, progress)
 
 
-def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: int) -> bytes:
+def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
     """Return an MP4 that browsers play: H.264, 4:2:0.
 
     frames: at least one, uint8 (height, width, 3); height and width must be even for 4:2:0.
     """
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": "24", "preset": "medium"})
+        stream = container.add_stream("libx264", rate=schema.exact_rate(fps), options={"crf": "24", "preset": "medium"})
         stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
         for picture in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import manip_il
 from manip_il import checks
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.conditions import Condition, merged
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.table import ROBOTS as STOCK
@@ -21,6 +19,7 @@ SUITES = {
 }
 CONDITIONS = (*SUITES["all"], "random_actions")
 _YAML = (".yaml", ".yml")
+_OWN = Path(__file__).with_name("conditions")  # the YAML files of `CONDITIONS`
 
 
 def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
@@ -60,7 +59,7 @@ def read_condition(name: str) -> Condition:
     """
     if not name.endswith(_YAML) and name not in CONDITIONS:
         raise UnknownName("suite", name, [*SUITES, *CONDITIONS[1:]])
-    path = Path(name) if name.endswith(_YAML) else _suites_folder() / f"{name}.yaml"
+    path = Path(name) if name.endswith(_YAML) else _OWN / f"{name}.yaml"
     tree = checks.read_yaml(path, "a YAML file of ranges")
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
@@ -75,12 +74,3 @@ def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition 
         return None if condition.ranges else condition
     task = get_task(env.task, env.object)
     return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes)
-
-
-def _suites_folder() -> Path:
-    """Return the folder of suites: beside the package in a checkout, else in the installation's data folder."""
-    places = (Path(manip_il.__file__).parents[1] / "configs", Path(sys.prefix) / "share" / "manip_il")
-    for place in places:
-        if (place / "suites" / "nominal.yaml").is_file():
-            return place / "suites"
-    raise ManipError(f"the suites' YAML files are missing; looked in {' and '.join(map(str, places))}; install again")

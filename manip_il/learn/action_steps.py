@@ -1,8 +1,8 @@
-"""LeRobot processor steps that convert actions: see `action_spaces`.
+"""Our LeRobot processor steps: two convert actions, see `action_spaces`, one is for policies that see only joints.
 
 `MeasuredJointsStep`, in the preprocessor, stores the measured joints of an observation; `JointTargetsStep`, at the end
 of the postprocessor, uses them to convert the policy's output to joint targets. A checkpoint with both works wherever
-LeRobot calls each once per step, as lerobot-eval does. Both are subclasses of steps in LeRobot, which convert a
+LeRobot calls each once per step, as lerobot-eval does. These two are subclasses of steps in LeRobot, which convert a
 whole plan relative to the joints at its start, so LeRobot connects the two when it loads them.
 """
 
@@ -15,15 +15,16 @@ import torch
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import (
     AbsoluteActionsProcessorStep,
+    ObservationProcessorStep,
     PolicyProcessorPipeline,
     ProcessorStepRegistry,
     RelativeActionsProcessorStep,
 )
 
-from manip_il.data.schema import STATE
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.action_spaces import LAST, Conversion
-from manip_il.learn.checkpoint import DECODER, MEASURED
+from manip_il.learn.checkpoint import DECODER, JOINTS_ALONE, MEASURED
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET, OWN_SPACE
 
 Pipeline = PolicyProcessorPipeline[Any, Any]
@@ -82,6 +83,19 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
     def get_config(self) -> dict[str, Any]:
         """Return the options that are saved in a checkpoint."""
         return {"action_space": self.action_space, "robot": self.robot, "grippers": list(self.grippers)}
+
+
+@ProcessorStepRegistry.register(JOINTS_ALONE)
+class JointsAloneStep(ObservationProcessorStep):
+    """Adds an environment state of no numbers: without pictures, LeRobot's policies do not act without any."""
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation with an environment state (..., 0)."""
+        return {**observation, ENVIRONMENT_STATE: observation[STATE][..., :0]}
+
+    def transform_features(self, features: Any) -> Any:
+        """Return the features of a policy's inputs as they are."""
+        return features
 
 
 def is_in_processors(kind: str, found: Conversion) -> bool:

@@ -22,9 +22,10 @@ from manip_il.sim.config import CameraConfig, Look
 
 CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
 MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that convert actions
+JOINTS_ALONE = "manip_il_joints_alone"  # step of a policy that observes nothing else
 _STEPS = (  # registry names of LeRobot's default steps, and ours: they load nothing
     *("rename_observations_processor", "to_batch_processor", "device_processor"),
-    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER),
+    *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER, JOINTS_ALONE),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
@@ -46,7 +47,7 @@ class Origin:
 
     robot: str
     task: str
-    fps: int
+    fps: float  # as in `RobotTaskSpec`
     joint_names: tuple[str, ...]
     environment_state_names: tuple[str, ...]
     action_meaning: str
@@ -155,7 +156,11 @@ class Checkpoint:
         return cls(
             path,
             config,
-            numbers={key: _size(key, shape) for key, (kind, shape) in inputs.items() if kind in ("STATE", "ENV")},
+            numbers={
+                key: _size(key, shape)
+                for key, (kind, shape) in inputs.items()
+                if kind in ("STATE", "ENV") and all(shape)  # not the environment state of `JointsAloneStep`
+            },
             pictures={name: size for name, size in sizes.items() if not name.startswith(_PLACEHOLDER)},
             action=action,
             space=space,

@@ -14,17 +14,17 @@ from typing import Any
 import draccus
 import torch
 from draccus.utils import DecodingError, ParsingError
-from lerobot.configs import NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from manip_il.data.schema import ACTION, JOINT_TARGETS, OPENINGS
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, JOINT_TARGETS, OPENINGS, STATE
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.checkpoint import require_trust
 from manip_il.learn.fit_config import FitConfig, check_convertible
-from manip_il.learn.names import JOINT_TARGET
+from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
 # Options of LeRobot's policies that concern its Hub, its commands or one machine: not accepted here.
@@ -132,9 +132,12 @@ def set_features(
     """Set a policy's inputs and outputs from a dataset's features.
 
     By default LeRobot's state-based policies leave `observation.environment_state` in its raw units; here it is
-    normalised like the joint state. Raises `ManipError` for features that the policy refuses.
+    normalised like the joint state. They refuse the joints alone, which get an environment state of no numbers, see
+    `JointsAloneStep`. Raises `ManipError` for features that the policy refuses.
     """
     policy.input_features, policy.output_features = policy_features(features, inputs)
+    if list(inputs) == [STATE] and policy.type not in OWN_SPACE:
+        policy.input_features[ENVIRONMENT_STATE] = PolicyFeature(FeatureType.ENV, (0,))
     modes: dict[str, NormalizationMode] = getattr(policy, "normalization_mapping", {})
     if "STATE" in modes:
         modes.setdefault("ENV", modes["STATE"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 
 from manip_il.data.schema import IMAGES
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.action_steps import add_steps  # importing it registers our steps for loading
+from manip_il.learn.action_steps import JointsAloneStep, add_steps  # importing it registers our steps for loading
 from manip_il.learn.checkpoint import MEASURED, PROCESSORS, Checkpoint, in_one_line
 from manip_il.learn.lerobot_config import policy_class
 from manip_il.learn.names import CNN, MLP
@@ -62,6 +63,8 @@ def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion
     before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
     if conversion is not None:
         add_steps(before, after, conversion)
+    if config.env_state_feature is not None and not all(config.env_state_feature.shape):
+        before.steps = [JointsAloneStep(), *before.steps]
     return before, after
 
 
@@ -119,5 +122,6 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
 @contextlib.contextmanager
 def _lerobot(what: str) -> Iterator[None]:
     """Like `in_one_line`; also drops what LeRobot prints, as standard output belongs to the caller."""
-    with in_one_line(what), contextlib.redirect_stdout(io.StringIO()):
+    with in_one_line(what), contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Initializing zero-element tensors")  # of policies that see only joints
         yield

@@ -132,7 +132,7 @@ def load_data(
     (N, n) to targets; None if the targets are the datasets' actions. on_frames: called with the number of newly
     decoded frames. Raises `NotFiniteError` and what `Windows.usable` raises.
     """
-    features = [*(policy.input_features or {}), ACTION]
+    features = [key for key in (*(policy.input_features or {}), ACTION) if key in meta.features]
     cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
     table = joined_columns(meta.roots, [*numbers, *_ALWAYS])

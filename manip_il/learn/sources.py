@@ -18,6 +18,7 @@ from manip_il.data.info import Info
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.names import MLP
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 
@@ -51,10 +52,13 @@ def check_same_sources(
 def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
     """Return the columns of a dataset that a policy observes, by LeRobot's names.
 
+    Without `observation.environment_state` the joints are enough for an mlp, and where there are no pictures either.
     Raises `ManipError`, with a remedy, for a column that the dataset lacks.
     """
-    cameras = [key for key, feature in info.features.items() if feature.is_rgb] if config.takes_images else []
-    numbers = [STATE] if config.observes == "images" else [STATE, ENVIRONMENT_STATE]
+    pictured = [key for key, feature in info.features.items() if feature.is_rgb]
+    cameras = pictured if config.takes_images else []
+    joints_alone = ENVIRONMENT_STATE not in info.features and (config.kind == MLP or not pictured)
+    numbers = [STATE] if config.observes == "images" or joints_alone else [STATE, ENVIRONMENT_STATE]
     lacking = [name for name in (ACTION, *numbers) if name not in info.features]
     if config.takes_images and not cameras:
         lacking.append("pictures")

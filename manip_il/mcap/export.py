@@ -7,7 +7,6 @@ text `foxglove.Log`. With `mapping.yaml`, next to the files, an import recreates
 from __future__ import annotations
 
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +54,7 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
     if missing := set(table[layout.TASK_INDEX].tolist()) - set(texts):
         raise ManipError(f"{dataset.root}: rows have task_index {min(missing)}, which {layout.TASKS} lacks")
     cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
-    episodes, rate = dataset.episodes, Fraction(str(dataset.fps))
+    episodes, rate = dataset.episodes, s.exact_rate(dataset.fps)
     for place, episode in enumerate(episodes.index.tolist()):
         start, stop = int(episodes.start[place]), int(episodes.stop[place])
         times = foxglove.frame_times(stop - start, rate)

@@ -19,6 +19,7 @@ from manip_il import checks
 from manip_il.data.atomic import new_folder
 from manip_il.data.foxglove import NANOSECONDS, frame_times
 from manip_il.data.lerobot_write import TableWriter
+from manip_il.data.schema import exact_rate, plain_rate
 from manip_il.errors import ManipError, MismatchError, nearest
 from manip_il.mcap.mapping import TASK, TEXT, Mapping, TopicSource
 from manip_il.mcap.path import values_at
@@ -43,9 +44,9 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
     not empty, `MismatchError` if shapes differ between files, and what `checks.in_child` and `read_frames` raise.
     """
     checks.in_child(str(paths[0]), _read_all, paths, mapping)
-    fps: Any = mapping.fps if mapping.fps % 1 else int(mapping.fps)
     features = _features(next(read_frames(paths[0], mapping)), mapping)
-    with new_folder(root) as folder, closing(TableWriter(folder, features, fps, mapping.robot_type)) as writer:
+    about = features, plain_rate(mapping.fps), mapping.robot_type
+    with new_folder(root) as folder, closing(TableWriter(folder, *about)) as writer:
         for path in paths:
             frames = list(read_frames(path, mapping))
             columns = {key: np.stack([frame[key] for frame in frames]) for key in features}
@@ -75,7 +76,7 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
             topics = read_topics(path)
             known = f"{nearest(source.topic, topics)}; its topics: {', '.join(topics)}"
             raise ManipError(f"{path} has no messages of {source.topic}{known}")
-    times = _times(path, stamps, Fraction(str(mapping.fps)))
+    times = _times(path, stamps, exact_rate(mapping.fps))
     rows: dict[str, Any] = {TASK: [mapping.task] * len(times)}
     for key, source in mapping.sources.items():
         where = f"{path}, topic {source.topic}, {key}"

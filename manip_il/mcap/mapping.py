@@ -86,12 +86,10 @@ class Mapping:
         checks.text("robot_type", self.robot_type or "", checks.LONGEST_NAME)
         if not self.features:
             raise UsageError("features is empty; expected at least one column")
-        for key, source in self.features.items():
+        for key in self.features:
             checks.name("a column's name", key)  # LeRobot names folders and files after it
             if key in (*INDEX_FEATURES, TASK):
                 raise UsageError(f"LeRobot fills in {key} itself; leave it out")
-            if source.video and self.fps % 1:
-                raise UsageError(f"LeRobot's videos need a whole fps, not {self.fps}; set video: false for {key}")
 
     @property
     def sources(self) -> dict[str, TopicSource]:

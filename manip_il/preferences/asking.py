@@ -71,7 +71,7 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
     )
 
 
-def _film(source: EditSource, states: NDArray[np.float64], fps: int) -> bytes:
+def _film(source: EditSource, states: NDArray[np.float64], fps: float) -> bytes:
     camera = next(iter(STOCK[source.env.robot].cameras if source.env.robot in STOCK else ()), _CAMERA)
     pictures = render_states(source.env, CameraConfig((camera,), SIDE, SIDE, FILM), states)
     return encode_mp4(list(pictures[schema.IMAGES + camera]), fps)

@@ -56,7 +56,7 @@ class Pairs:
 
     robot: str
     task: str
-    control_hz: int
+    control_hz: float
     clip: int
     seed: int = 0
     chosen: str = "evenly"

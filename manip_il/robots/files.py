@@ -17,7 +17,7 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
-_INCLUDE = re.compile(rb"<(?:include|model)\s[^>]*?\bfile=\"([^\"]+)\"")
+_INCLUDE = re.compile(rb"<(?:include|model)\s[^>]*?\bfile\s*=\s*[\"']([^\"']+)")
 KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
 

@@ -44,12 +44,16 @@ class EnvConfig(Episodes):
 
 
 def make_config(
-    robot: str = EnvConfig.robot, task: str = EnvConfig.task, control_hz: int = 0, **settings: Any
+    robot: str = EnvConfig.robot, task: str = EnvConfig.task, control_hz: float = 0, **settings: Any
 ) -> EnvConfig:
     """Return the settings of an environment; what is not given comes from its robot and task.
 
-    settings: other `EnvConfig` fields. Raises `UnknownName` (robot or task) or `UsageError` (a wrong value).
+    control_hz: whole, 0 for the robot's own [Hz]. settings: other `EnvConfig` fields. Raises `UnknownName` (robot or
+    task) or `UsageError` (a wrong value).
     """
+    if isinstance(control_hz, float) and control_hz % 1:
+        raise UsageError(f"control_hz is {control_hz}; expected a whole number, as environments are simulated at one")
+    control_hz = int(control_hz) if isinstance(control_hz, float) else control_hz
     named = {"robot": robot, "task": task, "control_hz": control_hz}
     return complete(make_options(EnvConfig, **named, **settings))
 

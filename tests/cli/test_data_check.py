@@ -64,7 +64,26 @@ def test_repair_builds_again_and_exits_0_or_1_if_something_stays_wrong(root, cap
     root.with_name("d.before-repair").rename(root.with_name("kept"))
     (root / layout.TASKS).unlink()
     assert main(["data", "repair", str(root)]) == 1
-    assert "there are no journals to repair it from: pull or record it again" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert out.count("cannot be repaired from what is here: pull or record it again") == 2
+    assert "data repair" not in out
+
+
+def test_what_repair_cannot_do_is_not_told_to_be_repaired(root, tmp_path, capsys):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes/today.txt").write_text("no dataset")
+    other = shutil.copytree(root, tmp_path / "other")
+    edit_json(other / layout.INFO, lambda info: info.update(codebase_version="v2.0"))
+    for folder in (tmp_path / "notes", other):
+        for command in ("check", "repair"):
+            assert main(["data", command, str(folder)]) == 1
+            assert "data repair" not in capsys.readouterr().out
+    (root / layout.INFO).write_text("{")
+    for journal in root.with_name("d.journals").glob("*"):
+        journal.unlink()
+    assert main(["data", "repair", str(root)]) == 1
+    before, after = capsys.readouterr().out.split("not rebuilt: ")
+    assert ("data repair" in before, "data repair" in after) == (True, False)
 
 
 def test_the_robots_joints_are_compared(root, capsys):

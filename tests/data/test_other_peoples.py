@@ -14,14 +14,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from manip_il.cli.main import main
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.dataset import Dataset
 from manip_il.doctor.examine import examine_folder
+from manip_il.learn.policy import LearnedPolicy
 
 from ..damage import DATA, EPISODES, edit_json, edit_table
-from ..learn.tiny_policies import ACT
+from ..learn.tiny_policies import ACT, DIFFUSION
 
 pytestmark = pytest.mark.slow
 TOP, SIDE, DEPTH = "observation.images.top", "observation.image", "observation.images.depth"
@@ -168,3 +171,43 @@ def test_depth_is_left_out(tmp_path):
     check(root, tmp_path / "run")
     config = json.loads((tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text())
     assert set(config["input_features"]) == {"observation.state", TOP}
+
+
+@pytest.mark.parametrize("settings", [{"type": "mlp"}, ACT, DIFFUSION], ids=lambda settings: settings["type"])
+def test_joints_alone_of_any_robot_train_a_policy_that_lerobot_loads(tmp_path, settings, capsys):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    names = {"dtype": "float32", "shape": (3,), "names": MOTORS}
+    columns = {"observation.state": names, "action": names}
+    dataset: Any = LeRobotDataset.create("a/b", 30, columns, root=tmp_path / "joints", robot_type="my arm/v2.yaml")
+    for state in np.random.default_rng(0).normal(size=(3, 12, 3)).astype(np.float32):
+        for row in state:
+            dataset.add_frame({"observation.state": row, "action": 0.9 * row, "task": "fold"})
+        dataset.save_episode()
+    dataset.finalize()
+    policy = [f"--policy.{name}={json.dumps(value).strip(chr(34))}" for name, value in settings.items()]
+    words = [f"--dataset.root={tmp_path / 'joints'}", "--steps=2", "--batch_size=4", f"--output_dir={tmp_path / 'run'}"]
+    assert main(["train", *policy, *words]) == 0
+    assert Dataset.open(tmp_path / "joints").info.robot == "my arm/v2.yaml"
+    folder = tmp_path / "run/checkpoints/last/pretrained_model"
+    advice = capsys.readouterr().out.partition("no simulator of this program fits the policy: ")[2]
+    assert f"lerobot-rollout --strategy.type=base --policy.path={folder} " in advice
+    assert "manip-il eval" not in advice
+    ours = LearnedPolicy.load(folder)
+    assert ours.checkpoint.numbers == {"observation.state": 3}
+    assert ours.checkpoint.origin.robot == "my_arm_v2_yaml"
+    state = np.ones((1, 3), np.float32)
+    theirs: Any = get_policy_class(settings["type"]).from_pretrained(folder)
+    before, after = make_pre_post_processors(theirs.config, str(folder))
+    torch.manual_seed(0)
+    action = after(theirs.select_action(before({"observation.state": torch.from_numpy(state)})))
+    acted = ours.act(state, np.empty((1, 0), np.float32))
+    assert acted.shape == action.shape == (1, 3)
+    assert settings is DIFFUSION or acted == pytest.approx(action.numpy(), abs=1e-5)  # which draws
+
+
+def test_an_mlp_reads_what_is_there_beside_pictures(root, tmp_path):
+    assert main(["train", f"--dataset.root={root}", "--steps=2", f"--output_dir={tmp_path / 'run'}"]) == 0
+    assert LearnedPolicy.load(tmp_path / "run/checkpoints/last/pretrained_model").checkpoint.numbers == {
+        "observation.state": 3
+    }

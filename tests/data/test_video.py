@@ -8,10 +8,12 @@ import os
 from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
@@ -21,6 +23,7 @@ from manip_il.data.video import try_encoder
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import UnknownName
+from manip_il.learn.checkpoint import Origin
 from manip_il.mdp import Episode
 
 from ..damage import digests
@@ -68,6 +71,18 @@ def test_timestamps_are_exact(root, two):
         times = [packet.pts * packet.time_base for packet in container.demux(stream) if packet.pts is not None]
         assert stream.average_rate == two.fps  # by which torchcodec finds a frame
     assert times == [Fraction(number, two.fps) for number in range(21)]
+
+
+@pytest.mark.parametrize("fps", [12.5, 23.976, 29.97002997])
+def test_a_rate_that_is_not_whole_is_that_of_rows_videos_and_policies(filmed, two, tmp_path, fps):
+    root = write(filmed, tmp_path / "lift", dataclasses.replace(two, fps=fps))
+    assert json.loads((root / layout.INFO).read_text())["fps"] == fps
+    theirs: Any = LeRobotDataset("local/lift", root=root)  # refuses a frame that is off by a tenth of a millisecond
+    pictures = np.stack([255 * theirs[row][FRONT].numpy().transpose(1, 2, 0) for row in range(21)])
+    assert numbers_of(pictures) == list(range(21))
+    assert not has_errors(examine_folder(root))
+    (root / layout.OURS).unlink()
+    assert Origin.of(Dataset.open(root).spec).fps == fps
 
 
 def test_the_same_episodes_give_the_same_bytes(root, tmp_path, filmed, two):

@@ -1,4 +1,4 @@
-"""Fifteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found, and nothing else."""
+"""Sixteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found, and nothing else."""
 
 from __future__ import annotations
 
@@ -198,9 +198,21 @@ def commands(root: Path, rng: Rng) -> str:
     return f"(action|task): .*{what}"
 
 
+def wraps(root: Path, rng: Rng) -> str:
+    """A joint in degrees or radians that passes the end of its turn."""
+    place, half = int(rng.integers(4)), float(rng.choice([180.0, np.pi]))
+
+    def change(*both: np.ndarray) -> None:
+        for values in both:
+            values[:, place] = (half * np.linspace(1.9, 2.1, len(values))) % (2 * half) - half
+
+    move(root, change, chosen := some(rng))
+    return rf"observation.state: .* jump by a turn at .* \(episodes {', '.join(map(str, chosen))}\): relative actions"
+
+
 PLANTS: tuple[Plant, ...] = (
     *(counts, rows, names, frames, finite, times, statistics, died, tasks, own),
-    *(idle, lag, cameras, joint, commands),
+    *(idle, lag, cameras, joint, commands, wraps),
 )
 
 

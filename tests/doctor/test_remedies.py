@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lerobot.datasets.compute_stats import compute_episode_stats
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
 from manip_il.doctor.examine import examine_folder, repair
 from manip_il.errors import ManipError
@@ -78,6 +80,38 @@ def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     np.testing.assert_allclose(stats[FRONT]["mean"], whole[FRONT]["mean"], atol=0.05)
     kept = theirs.with_name("theirs.before-repair")
     assert sorted(path.name for path in kept.iterdir()) == ["images", "info.json", "stats.json"]
+
+
+def shift(root: Path, mean: float) -> dict[str, list[float]]:
+    """Move the actions to a mean, with a deviation of 0.3; return LeRobot's statistics of them."""
+    values = np.random.default_rng(0).normal(mean, 0.3, (Dataset.open(root).info.frames, 5)).astype(np.float32)
+    edit_table(root / DATA, lambda table: table.update({s.ACTION: values.tolist()}))
+    found = compute_episode_stats({s.ACTION: values}, {s.ACTION: {"dtype": "float32"}})[s.ACTION]
+    return {name: one.tolist() for name, one in found.items()}
+
+
+def wrong_statistics(root: Path) -> list[str]:
+    return [str(one) for one in examine_folder(root) if one.place.startswith(layout.STATS)]
+
+
+@pytest.mark.usefixtures("no_child")
+@pytest.mark.parametrize("mean", [2048, 10_000])
+def test_a_deviation_that_float32_lost_beside_a_large_mean_is_found_and_computed_again(theirs, mean):
+    stats = shift(theirs, mean)
+    for std in (stats["std"], [0.0] * 5, [0.6] * 5):
+        edit_json(theirs / layout.STATS, lambda table, std=std: table.update({s.ACTION: stats | {"std": std}}))
+        assert [line for line in wrong_statistics(theirs) if f"{s.ACTION}: std is" in line], std
+    mend(theirs)
+    assert wrong_statistics(theirs) == []
+    assert json.loads((theirs / layout.STATS).read_text())[s.ACTION]["std"] == pytest.approx([0.3] * 5, rel=0.1)
+
+
+@pytest.mark.usefixtures("no_child")
+@pytest.mark.parametrize("mean", [0, 1.5, 90])
+def test_statistics_that_lerobot_computed_closely_enough_are_right(theirs, mean):
+    stats = shift(theirs, mean)
+    edit_json(theirs / layout.STATS, lambda table: table.update({s.ACTION: stats}))
+    assert wrong_statistics(theirs) == []
 
 
 def test_what_a_link_leads_to_is_not_changed(theirs):

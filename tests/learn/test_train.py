@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import torch
 
 from manip_il.cli.main import main
 from manip_il.data.json_lines import read_lines
+from manip_il.data.lerobot_layout import OURS
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
@@ -323,6 +325,13 @@ def somebodys(root: Path) -> Path:
     return root
 
 
+def test_where_an_environment_fits_a_policy_the_next_command_evaluates_it(tmp_path, capsys):
+    sample = shutil.copytree(Path(__file__).parents[2] / "datasets/sample", tmp_path / "sample")
+    (sample / OURS).unlink()  # as LeRobot's tools do
+    assert main(["train", f"--dataset.root={sample}", "--steps=1", f"--output_dir={tmp_path / 'run'}"]) == 0
+    assert "next: manip-il eval --policy.path=" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerobot, tmp_path, capsys):
     root, run = somebodys(tmp_path / "theirs"), tmp_path / "run"
@@ -331,6 +340,7 @@ def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerob
     assert main(words) == 1
     assert "no observation.environment_state, which --observation=state needs" in capsys.readouterr().err
     assert main([*words, "--observation=images"]) == 0
+    assert "no simulator of this program fits the policy: joint_names differs" in capsys.readouterr().out
     policy = LearnedPolicy.load(run / "checkpoints/last/pretrained_model", task="put the cube into the box")
     assert policy.checkpoint.origin.robot == "so101"
     pictures = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in ("front", "wrist")}
