@@ -84,7 +84,7 @@ def _is_of(value: Any, kind: Any) -> bool:
         return isinstance(value, numbers_of) and not isinstance(value, bool)
     if not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
         return True
-    return isinstance(value, origin)
+    return isinstance(value, (tuple, list) if origin is tuple else origin)  # JSON has lists
 
 
 def make_options[T](cls: type[T], **options: Any) -> T:
