@@ -183,7 +183,7 @@ def _check_same(path: Path, config: RunConfig) -> None:
         raise FolderExistsError(path.parent)
     before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
     for key in now:
-        if key in before and before[key] != now[key]:  # earlier versions did not store the fit
+        if before.get(key) != now[key]:
             raise MismatchError(key, str(path.parent), before[key], "this call", now[key])
     write_json(path, now)
 

@@ -19,7 +19,7 @@ from manip_il import __version__
 from manip_il.cli import progress
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import check_paths, parse
-from manip_il.errors import ManipError, UnknownName, UsageError, printable, silence_ffmpeg_warning, told
+from manip_il.errors import ManipError, UnknownName, printable, silence_ffmpeg_warning, told
 
 PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
@@ -73,21 +73,6 @@ GROUPS = {
     "rl": "reinforcement learning: GAIL, AIRL, PPO",
     "reward": "learn rewards from demonstrations or preferences",
 }
-RENAMED = {
-    "quickstart": "demo",
-    "replay": "eval EVALUATION --replay=SEED",
-    "merge": "eval EVALUATION EVALUATION ...",
-    "health": "eval --check",
-    "study": "compare STUDY.yaml",
-    "certify": "robot certify",
-    "irl": "reward irl",
-    "preferences": "reward",
-    "doctor": "data check, or manip-il data repair instead of --repair",
-    "mcap": "data to-mcap, and manip-il data from-mcap",
-    **{name: f"rl {name}" for name in ("gail", "airl", "ppo")},
-    **{name: f"data {name}" for name in ("render", "redraw", "relabel", "build", "score")},
-}
-
 HELP = ("--help", "-h", "--help=all")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
@@ -126,8 +111,6 @@ def _dispatch(own: list[str], others: list[str]) -> None:
         print(f"{PROGRAM} {__version__}")
     elif own[0] in GROUPS and (not own[1:] or own[1] in HELP):
         print(_group_help(own[0]))
-    elif own[0] in RENAMED:
-        raise UsageError(f"{own[0]!r} was renamed: {PROGRAM} {RENAMED[own[0]]}")
     elif {*HELP} & {*words}:
         print(_command_help(name, load(name), words))
     else:

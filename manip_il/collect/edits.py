@@ -32,7 +32,6 @@ from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.variation import OLDER
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
@@ -74,17 +73,12 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
         )
     env = make_config(robot or spec.robot, task or spec.task, spec.fps, object=shape or spec.object)
     given = env_spec(env)
-    for what in ("robot", "task", "object"):
+    for what in ("robot", "task", "object", "sim_state_size"):
         if getattr(given, what) != getattr(spec, what):
             raise MismatchError(what, str(root), getattr(spec, what), f"the given {what}", getattr(given, what))
-    lacks = given.sim_state_size - spec.sim_state_size  # number of values that states of older versions lack
-    if lacks not in (0, *OLDER):
-        raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", given.sim_state_size)
     here, there = env_fingerprint(env), dataset.fingerprint
     left, right = ({key: one.get(key, "nothing") for key in _COMPARED} for one in (there, here))
     warnings = compare_fingerprints(str(root), left, "this machine", right)
-    if lacks:
-        warnings.append(f"{root} was recorded before states held looks: its randomised looks are not restored")
     return EditSource(dataset, env, tuple(warnings))
 
 

@@ -22,7 +22,7 @@ from manip_il.sim.conditions import MEASURED, PICTURED, Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import TakesArgument
-from manip_il.sim.variation import completed, with_drawn
+from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
@@ -110,8 +110,9 @@ class SceneDrawer:
             return state
         conditions, shape = self._scenes.conditions, self._shape
         drawn = draw(conditions, number, shape) if conditions else {}
-        variation = completed(state.variation, self._env.scene.nominal)
-        return replace(state, variation=with_drawn(variation, {key: drawn[key] for key in PICTURED if key in drawn}))
+        return replace(
+            state, variation=with_drawn(state.variation, {key: drawn[key] for key in PICTURED if key in drawn})
+        )
 
     def _frame(self, state: State, label: Label, seed: int) -> Transition:
         env, action = self._env, label.action

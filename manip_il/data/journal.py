@@ -32,7 +32,6 @@ _FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
 _NPY = ".npy"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
-_FINAL = "final/"  # prefix of the final observation in older journals
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
         if isinstance(record, Metadata) and record.name == _RECORD:
             texts = record.metadata
-        elif isinstance(record, Attachment) and not record.name.startswith(_FINAL):
+        elif isinstance(record, Attachment):
             columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
         elif isinstance(record, Chunk):
             chunks.append(record)

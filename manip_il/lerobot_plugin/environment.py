@@ -60,7 +60,6 @@ class ManipILEnv(EnvConfig):
     tolerance: float = option_of(SimConfig, "tolerance")
     success_steps: int = option_of(SimConfig, "success_steps")
     object: str = option_of(SimConfig, "object")
-    reward: str = ""  # option of older versions, refused with a hint
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -72,8 +71,6 @@ class ManipILEnv(EnvConfig):
         ):
             if name not in known:
                 raise UnknownName(kind, name, known)
-        if self.reward:
-            raise UsageError(f"--env.reward was replaced by --env.task={self.task}:{self.reward}")
         self.fps = self._simulation().control_hz
         self.features = self._features()
         self.features_map = {key: _RENAMED.get(key, key) for key in self.features}

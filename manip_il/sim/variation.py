@@ -48,8 +48,6 @@ _STARTS = np.cumsum([0, *map(len, _WORLD.values())]).tolist()
 _PLACES = {name: slice(*ends) for name, *ends in zip(_WORLD, _STARTS[:-1], _STARTS[1:], strict=True)}
 NOTHING_DRAWN = np.concatenate(list(_WORLD.values()))  # the world's numbers, (w,)
 WORLD_SIZE = len(NOTHING_DRAWN)
-# How many numbers older states lack: those from before the side camera, and those from when only objects were drawn.
-OLDER = (WORLD_SIZE - _PLACES["camera_shift.side"].start, WORLD_SIZE)
 _NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # numbers for how the episode began and how it looks
 
 
@@ -81,17 +79,10 @@ def part(variation: F64, name: str) -> F64:
     return variation[len(variation) - WORLD_SIZE :][_PLACES[name]]
 
 
-def completed(variation: F64, like: F64) -> F64:
-    """Return a variation (v,) in the current format. like: the scene's own, (v,).
-
-    States of older versions lack numbers at the end, which get their nominal values here; if other values were drawn
-    then, only the dataset's provenance has them. Raises `MismatchError` for a variation of any other length.
-    """
-    if (lacks := len(like) - len(variation)) in OLDER:
-        return np.concatenate([variation, NOTHING_DRAWN[-lacks:]])
+def check_size(variation: F64, like: F64) -> None:
+    """Raise `MismatchError` unless a variation (v,) is as long as the scene's own, `like` (v,)."""
     if variation.shape != like.shape:
         raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
-    return variation
 
 
 def same_physics(variation: F64, other: F64) -> bool:

@@ -125,7 +125,7 @@ class World:
 
     def vary(self, variation: F64) -> None:
         """Apply the physics of `variation` (v,) to the model. Raises `MismatchError` for one of another length."""
-        variation = variations.completed(variation, self.scene.nominal)
+        variations.check_size(variation, self.scene.nominal)
         if variation.tobytes() == self.variation.tobytes():
             return
         self._cache.clear()

@@ -62,7 +62,6 @@ def test_a_mistyped_command_or_option_imports_nothing_heavy(tmp_path):
 TRAIN, EXPERT = "train --dataset.root=SAMPLE", "eval --policy.type=expert"
 MISTAKES = {
     "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: ",
-    "doctor x --repair": "'doctor' was renamed: manip-il data check, or manip-il data repair",
     "train": "--dataset.root is missing",
     "train --dataset.root=missing": "missing does not exist; expected a LeRobot v3.0 dataset",
     f"train --dataset.root={ROOT / 'docs'}": "is not a LeRobot dataset: meta/info.json is missing",

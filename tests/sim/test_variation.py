@@ -10,15 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.errors import MismatchError
 from manip_il.sim.shape import KINDS
 from manip_il.sim.variation import (
     NOTHING_DRAWN,
-    OLDER,
     PER_OBJECT,
     Object,
     apply,
-    completed,
     with_drawn,
 )
 from manip_il.sim.world import World
@@ -108,14 +105,3 @@ def test_every_geom_of_an_object_touches_the_table_whatever_is_drawn():
     data = mujoco.MjData(changed)
     mujoco.mj_step(changed, data, 500)
     assert data.qpos[2] == pytest.approx(0.04, abs=1e-3)
-
-
-@pytest.mark.parametrize("lacks", OLDER)
-def test_an_older_state_lacks_numbers_at_the_end_of_which_nothing_was_drawn(lacks: int):
-    like = np.array([*CUBE, *NOTHING_DRAWN])
-    older = with_drawn(like, {"size": 0.04})[:-lacks]
-    whole = completed(older, like)
-    np.testing.assert_array_equal(whole[:-lacks], older)
-    np.testing.assert_array_equal(whole[-lacks:], NOTHING_DRAWN[-lacks:])
-    with pytest.raises(MismatchError, match="size of the variation"):
-        completed(older[:-1], like)
