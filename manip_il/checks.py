@@ -19,8 +19,10 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from io import BufferedReader
+from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from manip_il.errors import ManipError, UsageError, shorten
 
@@ -140,13 +142,12 @@ def _expanded_size(node: Any, sizes: dict[int, int]) -> int:
 
     sizes: those of the nodes that were counted before, by id. Raises `UnicodeEncodeError` for lone surrogates.
     """
+    if isinstance(node.value, str):
+        node.value.encode()
+        return 1
     if id(node) not in sizes:
         sizes[id(node)] = MOST_NODES + 1  # found again inside itself, a node has no end
-        if isinstance(node.value, str):
-            node.value.encode()
-            parts: list[Any] = []
-        else:
-            parts = [part for entry in node.value for part in (entry if isinstance(entry, tuple) else [entry])]
+        parts = chain(*node.value) if node.id == "mapping" else node.value
         sizes[id(node)] = 1 + sum(_expanded_size(part, sizes) for part in parts)
     return sizes[id(node)]
 
@@ -159,7 +160,7 @@ def read_yaml(path: Path, what: str) -> Any:
         raise UsageError(f"{path} is not YAML: {error}") from error
 
 
-def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) -> BinaryIO:
+def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) -> BufferedReader:
     """Open a file from outside for reading; every file that this program did not just write is opened here.
 
     It never blocks, and it opens only regular files and links to them: no pipes, devices or sockets.

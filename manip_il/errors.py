@@ -100,8 +100,8 @@ def _first_values(value: object, places: Iterator[int]) -> object:
         return value[:_LONGEST_PRINTED]
     if type(value) is dict:
         return {key: _first_values(one, places) for _, (key, one) in zip(places, value.items(), strict=False)}
-    if type(value) in (list, tuple):
-        return type(value)(_first_values(one, places) for _, one in zip(places, value, strict=False))
+    if type(value) is list:
+        return [_first_values(one, places) for _, one in zip(places, value, strict=False)]
     return value
 
 

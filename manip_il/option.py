@@ -43,9 +43,9 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
     if value is None or not {"at_least", "at_most"} & metadata.keys():
         return
     low, high = metadata.get("at_least", -math.inf), metadata.get("at_most", math.inf)
-    if not isinstance(value, int | float) or not low <= value <= high:
+    if not low <= value <= high:
         wanted = f"at least {low}" if high == math.inf else f"{low} to {high:,}"
-        raise UsageError(f"{name} is {shorten(value)}; expected {wanted}")
+        raise UsageError(f"{name} is {value}; expected {wanted}")
 
 
 def check_bounds(options: Any, prefix: str = "") -> None:

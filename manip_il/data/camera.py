@@ -35,6 +35,7 @@ from manip_il.errors import ManipError, UnknownName
 I64 = NDArray[np.int64]
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
+FORMATS = ("PNG", "JPEG")  # of pictures that are decoded
 _PIECE_BYTES = 32 * 1024 * 1024  # size of the pictures that a thread decodes at once
 _PIECE = 32  # least number of pictures decoded at once, because each piece is decoded from the key frame before it
 _OPTIONS = {
@@ -146,25 +147,36 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
     return decoded
 
 
-def check_size(found: tuple[int, int], size: tuple[int, int]) -> None:
-    """Raise `ValueError` unless a picture's height and width are those in `info.json`."""
-    if found != size:
+def check_size(found: tuple[int, ...], size: tuple[int, int] | None) -> None:
+    """Raise `ValueError` unless a picture's height and width are those in `info.json`, if these are given."""
+    if size is not None and found != size:
         raise ValueError(f"its pictures are {found[0]} x {found[1]}; expected {size[0]} x {size[1]}, as in info.json")
+
+
+def open_picture(
+    content: bytes | None, size: tuple[int, int] | None = None, formats: tuple[str, ...] = FORMATS
+) -> Image.Image:
+    """Open a picture file's content without decoding it.
+
+    Args:
+        content: The file's content.
+        size: The expected height and width [pixels].
+        formats: Pillow's names of the allowed formats.
+
+    Raises:
+        ValueError, OSError: The content is None or has another format or size.
+    """
+    picture = Image.open(BytesIO(content or b""), formats=formats)
+    check_size((picture.height, picture.width), size)
+    return picture
 
 
 def decode_picture(content: bytes | None, size: tuple[int, int] | None = None) -> Pictures:
     """Decode a PNG or JPEG file's content to a picture (height, width, 3).
 
-    Args:
-        content: The file's content.
-        size: The expected height and width [pixels], checked before decoding.
-
-    Raises:
-        ValueError, OSError: The content is None or has another format, size or colour mode.
+    Raises what `open_picture` raises, and `ValueError` for another colour mode.
     """
-    with Image.open(BytesIO(content or b""), formats=("PNG", "JPEG")) as picture:
-        if size is not None:
-            check_size((picture.height, picture.width), size)
+    with open_picture(content, size) as picture:
         if picture.mode != "RGB":
             raise ValueError(f"the picture has colour mode {picture.mode}; expected RGB")
         return np.asarray(picture)
@@ -180,16 +192,14 @@ def open_video(path: Path, size: tuple[int, int] | None = None) -> InputContaine
     Raises:
         ManipError: It is not a regular file.
         av.FFmpegError: It is not an MP4 file.
-        ValueError: It has no pictures, or they have another size.
+        ValueError: Its pictures have another size.
     """
     with checks.native_path(path, "an MP4 file") as opened:
         container = av.open(f"file:{opened}", format="mp4", options=_OPTIONS)
-    if size is not None:
-        if not container.streams.video:
-            raise ValueError("it has no pictures")
-        stream = container.streams.video[0]
+    for stream in container.streams.video:
         check_size((stream.height, stream.width), size)
-        most = math.prod(side + _BLOCK for side in size)  # sizes may also change within the stream
+        # sizes may also change within the stream
+        most = (stream.height + _BLOCK) * (stream.width + _BLOCK)
         stream.codec_context.options = {"max_pixels": str(most)}
     return container
 

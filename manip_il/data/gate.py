@@ -8,9 +8,8 @@ in data files, in the columns that `info.json` calls images, and plain values an
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,12 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from manip_il import checks
-from manip_il.data.camera import check_size, open_video
+from manip_il.data.camera import FORMATS, open_picture, open_video
 from manip_il.data.info import Feature, read_info
 from manip_il.errors import ManipError
 
-_PICTURES = ("PNG", "JPEG")
-_DEPTH = (*_PICTURES, "TIFF")  # this program does not decode TIFF
-_VALUES = ("Value", "ClassLabel", "Json", "Array2D", "Array3D", "Array4D", "Array5D")  # `_type` in the metadata
-_LISTS = ("List", "LargeList", "Sequence")
+_DEPTH = (*FORMATS, "TIFF")  # this program does not decode TIFF
+_PLAIN = ("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json", "Array2D", "Array3D", "Array4D", "Array5D")
 _ARRAY = re.compile(rb"datasets\.features\.features\.Array[2-5]DExtensionType")
 _DAMAGES = (ManipError, OSError, ValueError, pa.ArrowException, av.FFmpegError, Image.DecompressionBombError)
 _BATCH = 64  # rows in memory at once
@@ -107,8 +104,8 @@ def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collec
     about = checks.parse_json("its metadata", (schema.metadata or {}).get(b"huggingface", b"{}"))
     table = checks.mapping("info in its metadata", checks.mapping("its metadata", about).get("info", {}))
     for key, feature in checks.mapping("features in its metadata", table.get("features") or {}).items():
-        is_picture = key in pictures and isinstance(feature, dict) and feature.get("_type") == "Image"
-        if not is_picture and not _is_decoded_plainly(feature, key in structs):
+        allowed = (*_PLAIN, "Image") if key in pictures else _PLAIN
+        if not all(kind in allowed for kind in _decoders(feature)):
             raise ValueError(f"column {key!r} is decoded as {checks.shorten(feature)}; expected plain values")
 
 
@@ -117,24 +114,20 @@ def _is_plain(column: pa.Field, structs: bool) -> bool:
     kind, extension = column.type, (column.metadata or {}).get(b"ARROW:extension:name")
     if extension is not None and not _ARRAY.fullmatch(extension):
         return False
-    if (pa.types.is_struct(kind) and not structs) or pa.types.is_map(kind) or pa.types.is_union(kind):
+    if pa.types.is_struct(kind) and not structs:  # a map holds structs
         return False
     if isinstance(kind, pa.BaseExtensionType):
         return kind == pa.json_()
     return all(_is_plain(kind.field(place), structs) for place in range(kind.num_fields))
 
 
-def _is_decoded_plainly(feature: Any, structs: bool) -> bool:
-    """Return whether `datasets` decodes a feature in its JSON to plain values, lists and, if allowed, structs."""
-    if isinstance(feature, list):
-        return all(_is_decoded_plainly(one, structs) for one in feature)
-    if not isinstance(feature, dict):
-        return False
-    if "_type" not in feature:
-        return structs and all(_is_decoded_plainly(one, structs) for one in feature.values())
-    if feature["_type"] in _LISTS:
-        return _is_decoded_plainly(feature.get("feature"), structs)
-    return feature["_type"] in _VALUES
+def _decoders(feature: Any) -> Iterator[Any]:
+    """Yield every `_type` in the JSON from which `datasets` makes a feature."""
+    if isinstance(feature, dict) and "_type" in feature:
+        yield feature["_type"]
+    parts: Any = feature.values() if isinstance(feature, dict) else feature if isinstance(feature, list) else ()
+    for part in parts:
+        yield from _decoders(part)
 
 
 def _check_cells(camera: Feature, cells: pa.Array, first: int) -> None:
@@ -146,8 +139,7 @@ def _check_cells(camera: Feature, cells: pa.Array, first: int) -> None:
     contents: Any = pc.struct_field(cells, "bytes")  # pyright: ignore[reportAttributeAccessIssue]
     for row, content in enumerate(contents.to_pylist(), first):
         try:
-            with Image.open(BytesIO(content or b""), formats=_PICTURES if camera.is_rgb else _DEPTH) as picture:
-                check_size((picture.height, picture.width), camera.picture_size)
+            open_picture(content, camera.picture_size, FORMATS if camera.is_rgb else _DEPTH)
         except Image.UnidentifiedImageError:
             what = f"column {camera.key!r} has no PNG or JPEG in row {row:,}"
             raise ValueError(f"{what}; expected a picture file's bytes") from None

@@ -198,8 +198,9 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
     if not paths:
         raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
     with reading(root / "meta/episodes"):
-        names = [[name for name in column_names(path) if not name.startswith("stats/")] for path in paths]
-        tables = [read_file(path, wanted) for path, wanted in zip(paths, names, strict=True)]
+        tables = [
+            read_file(path, [name for name in column_names(path) if not name.startswith("stats/")]) for path in paths
+        ]
         table = pa.concat_tables(tables, promote_options="permissive")
 
         def numbers(name: str) -> I64:

@@ -49,10 +49,7 @@ class TopicSource:
             raise UsageError(f"tolerance is {self.tolerance}; expected seconds, 0 or more")
         for path in self.paths:
             check_path(path)
-        try:
-            json.dumps(self.names, ensure_ascii=False).encode()
-        except (TypeError, ValueError) as error:  # a UnicodeEncodeError is a ValueError
-            raise UsageError(f"names is {checks.shorten(self.names)}, which info.json cannot hold: {error}") from error
+        checks.text("names", json.dumps(self.names, ensure_ascii=False), checks.LARGEST_YAML)  # info.json holds them
 
     @property
     def is_camera(self) -> bool:

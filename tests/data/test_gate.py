@@ -138,7 +138,7 @@ def test_what_lerobot_and_datasets_write_passes(tmp_path: Path):
     check_arrived(tmp_path / "merged")
     call = {"role": "user", "content": "a", "style": "vqa", "camera": KEY, "tool_calls": [{"a": 1}]}
     features = datasets.Features({"language_events": language_events_column_feature()})
-    written = datasets.Dataset.from_dict({"language_events": [[call]] * 3}, features).with_format("arrow")[:]
+    written: Any = datasets.Dataset.from_dict({"language_events": [[call]] * 3}, features).with_format("arrow")[:]
     said = pq.read_table(tmp_path / "one" / DATA).append_column("language_events", written.column(0))
     write_table_one_row_group_per_episode(said, tmp_path / "one" / DATA)
     datasets.Dataset.from_parquet(str(tmp_path / "one" / DATA)).to_parquet(tmp_path / "one" / DATA)
