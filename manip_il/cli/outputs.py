@@ -64,11 +64,6 @@ class Output(Replacing):
             save_options(folder, options)
             yield folder
 
-    def check(self, options: Any) -> None:
-        """Raise what `open` raises for the folder of a run that is not resumed; for use before slow imports."""
-        if not getattr(self, "resume", False):
-            require_replaceable(self.output_dir, self.overwrite, _inputs(options))
-
 
 def _inputs(options: Any) -> list[Path]:
     """Return the paths in a command's options, except its output folder."""

@@ -75,14 +75,11 @@ class TrainOptions(Seeded, Trusting):
         options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written
         for one in datasets:
             input_columns(config, one.root, one.info)  # raises if the dataset lacks an input
-        if writes:
-            self.output.check(self)
         if self.weights is not None:
             first = datasets[0]
             episodes = first.columns(["episode_index"])["episode_index"].astype("int64")
-            weights = rabc_weights(
-                self.weights, episodes, getattr(options.policy, "chunk_size", None) or round(first.fps)
-            )
+            ahead = getattr(options.policy, "chunk_size", None) or round(first.fps)
+            weights = rabc_weights(self.weights, episodes, ahead)
         with self.output.open(self) if writes else contextlib.nullcontext():
             pictures = sum(len(one) * len(one.cameras) for one in datasets) if config.takes_images else 0
             with progress(pictures, "decode pictures, once") as bar:

@@ -45,7 +45,7 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
     if not rows or not np.isfinite(state).all() or not np.isfinite(action).all():
         return  # reported by another check
     yield from _check_idle(dataset, rows, np.hstack([state, action]))
-    yield from _check_wraps(dataset, rows, {s.STATE: state, s.ACTION: action})
+    yield from _check_wraps(dataset, rows, np.hstack([state, action]))
     yield from _check_texts(dataset, rows, state)
     if action.shape == state.shape:  # both list the same joints, as for LeRobot's robots
         names = np.array(dataset.features[s.ACTION].labels)
@@ -69,20 +69,17 @@ def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
         yield of_episodes(dataset.root, s.ACTION, text, [episode for episode, seconds in idle.items() if seconds])
 
 
-def _check_wraps(dataset: Dataset, rows: Rows, columns: dict[str, F64]) -> Iterator[Finding]:
+def _check_wraps(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
     """Find joints whose angle jumps between two frames from one end of a turn, such as 180 degrees, to the other."""
-    for key, values in columns.items():
-        steps, largest = np.abs(np.diff(values, axis=0)), np.abs(values).max(axis=0)
-        for half in _HALF_TURNS:
-            wraps = (steps > 1.8 * half) & (largest < 1.01 * half)
-            found = {episode: wraps[span.start : span.stop - 1].any(axis=0) for episode, span in rows.items()}
-            episodes = [episode for episode, joints in found.items() if joints.any()]
-            if episodes:
-                joints = np.array(dataset.features[key].labels)[np.any([*found.values()], axis=0)]
-                what = f"{list_first(joints)} jump by a turn at +-{half:.4g} (episodes {list_first(episodes)})"
-                follows = "relative actions are a turn too long there, and a policy's mean of both ends points away"
-                remedy = f"unwrap the angles, or move the joint's zero: {_AGAIN}"
-                yield warning(key, f"{what}: {follows}", remedy)
+    labels = np.array([*dataset.features[s.STATE].labels, *dataset.features[s.ACTION].labels])
+    for half in _HALF_TURNS:
+        wraps = (np.abs(np.diff(both, axis=0)) > 1.8 * half) & (np.abs(both).max(axis=0) < 1.01 * half)
+        where, joints = np.nonzero([wraps[span.start : span.stop - 1].any(axis=0) for span in rows.values()])
+        if len(where):
+            names, episodes = np.unique(labels[joints]), np.array([*rows])[np.unique(where)]
+            what = f"{list_first(names)} jump by a turn at +-{half:.4g} (episodes {list_first(episodes)})"
+            follows = "relative actions are a turn too long there, and a policy's mean of both ends points away"
+            yield warning(s.STATE, f"{what}: {follows}", f"unwrap the angles, or move the joint's zero: {_AGAIN}")
 
 
 def _check_lag(dataset: Dataset, rows: Rows, told: F64, found: F64) -> Iterator[Finding]:
