@@ -24,7 +24,8 @@ from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_json
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
-from manip_il.errors import FolderExistsError, MismatchError, UsageError
+from manip_il.data.ownership import output_of, require_ours, require_replaceable
+from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import HOLD, episode_hold
@@ -55,14 +56,14 @@ def record(
     beta: share of the steps that the expert drives instead of the policy. query: when the expert is queried, as for
     `manip-il dagger --query`. options: other fields of `RolloutJob`, such as `label` and `cameras`; `round` is by
     default 1 with a policy, else 0.
-    Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder exists.
+    Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder holds files.
     """
     root = Path(root).expanduser()
     driver = RolloutJob.driver if policy is None else PolicyDriver((_folder(policy),), beta)
     chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)} | options
     job, journals = RolloutJob(env, driver, **chosen), root.with_name(f"{root.name}.journals")
-    if found := next((one for one in (root, journals) if one.exists()), None):
-        raise FolderExistsError(found)
+    for folder in (root, journals):
+        require_replaceable(folder)
     recording = Recording("local/recorded", provenance=provenance(job), only_labelled=not job.labels_all)
     with Engine(workers) as engine:
         if policy is None:
@@ -87,11 +88,12 @@ def train(
     """Fit a policy to the labels of one or more datasets; return its checkpoint.
 
     options: fields of `FitConfig`, such as `policy={"type": "mlp", "width": 128}`, `steps` and `batch_size`. on_log:
-    called after every step with its metrics, or {} if there are none. Raises `FolderExistsError` if `output_dir` has a
-    checkpoint, `ManipError` for data that do not fit the policy.
+    called after every step with its metrics, or {} if there are none. Raises `UsageError` if `output_dir` has a
+    checkpoint or holds other files, `ManipError` for data that do not fit the policy.
     """
     from manip_il.learn.train import Trainer  # LeRobot's trainer takes seconds to import
 
+    require_ours(Path(output_dir).expanduser(), output_of("Train"))
     opened = (datasets,) if isinstance(datasets, Dataset) else tuple(datasets)
     config = FitConfig(seed=stream_base("training", seed), **options)
     return Checkpoint.open(Trainer(opened, config, Path(output_dir).expanduser()).fit(on_log))
@@ -161,9 +163,8 @@ def _check_same(path: Path, config: RunConfig) -> None:
     """
     now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
     now["fit"] = {one.name: now["fit"][one.name] for one in fields(FitConfig) if not one.metadata.get("free")}
+    require_ours(path.parent, output_of("Dagger"))
     has_begun = any(path.parent.glob("round_*"))
-    if not has_begun and not path.is_file() and any(path.parent.glob("[!.]*")):
-        raise FolderExistsError(path.parent)
     before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
     for key in now:
         if key in before and before[key] != now[key]:  # earlier versions did not store the fit

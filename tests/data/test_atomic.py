@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from manip_il.data.atomic import exclusive, new_folder, write_file
-from manip_il.errors import FolderExistsError, ManipError
+from manip_il.data.ownership import CHECKPOINT, DATASET
+from manip_il.errors import FolderExistsError, ManipError, UsageError
 
 
 def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
@@ -28,14 +29,18 @@ def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
 
 def test_what_is_there_is_not_written_over_unless_asked_and_stays_until_the_new_one_is_whole(tmp_path):
     root = tmp_path / "root"
-    root.mkdir()
+    (root / "meta").mkdir(parents=True)
     (root / "old").touch()
-    with pytest.raises(FolderExistsError), new_folder(root):
+    for kind, refusal in (("", FolderExistsError), (DATASET, UsageError)):
+        with pytest.raises(refusal), new_folder(root, replaces=kind):
+            pass
+    (root / "meta" / "manip_il.json").write_text('{"fingerprint": {}}')
+    with pytest.raises(UsageError), new_folder(root, replaces=CHECKPOINT):
         pass
-    with pytest.raises(ZeroDivisionError), new_folder(root, replace=True):
+    with pytest.raises(ZeroDivisionError), new_folder(root, replaces=DATASET):
         _ = 1 / 0
     assert (root / "old").exists()
-    with new_folder(root, replace=True) as folder:
+    with new_folder(root, replaces=DATASET) as folder:
         (folder / "new").touch()
         assert (root / "old").exists()
     assert [path.name for path in root.iterdir()] == ["new"]
@@ -63,6 +68,15 @@ def test_a_link_in_the_place_of_a_new_folder_is_replaced_and_not_followed(tmp_pa
         (folder / "x").touch()
     assert [path.name for path in victim.iterdir()] == ["thesis.tex"]
     assert (tmp_path / "root" / "x").exists()
+
+
+def test_somebodys_folder_in_the_place_of_a_new_one_is_spared(tmp_path):
+    somebodys = tmp_path / ".root.partial"
+    somebodys.mkdir()
+    (somebodys / "thesis.tex").touch()
+    with pytest.raises(UsageError, match=r"\.root\.partial"), new_folder(tmp_path / "root"):
+        pass
+    assert [path.name for path in somebodys.iterdir()] == ["thesis.tex"]
 
 
 def test_a_second_writer_is_refused_until_the_first_ends(tmp_path):
