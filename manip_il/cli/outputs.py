@@ -63,7 +63,7 @@ class Output(Replacing):
         """Raise what `open` raises for the folder of a run that is not resumed; for use before slow imports."""
         if not getattr(self, "resume", False):
             kind, sources = kind_of_output(options), _inputs(options)
-            require_writable(self.output_dir, kind, overwrite=self.overwrite, sources=sources)
+            require_writable(self.output_dir, kind, self.overwrite, sources)
 
 
 def kind_of_output(options: Any) -> str:
@@ -124,11 +124,11 @@ def prepare_output(
             if left.is_file():
                 left.unlink()
     elif folder.exists():
-        require_writable(folder, kind, overwrite=overwrite, sources=sources)
+        require_writable(folder, kind, overwrite, sources)
         clear(folder)
 
 
-def require_writable(folder: Path, kind: str, *, overwrite: bool, sources: Sequence[Path] = ()) -> None:
+def require_writable(folder: Path, kind: str, overwrite: bool, sources: Sequence[Path] = ()) -> None:
     """Raise `UsageError` unless `folder` is absent or empty, or `overwrite` is set and it is a folder of this kind.
 
     Args:

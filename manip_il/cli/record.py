@@ -67,7 +67,7 @@ class RecordOptions(Varied, Seeded, Resumable):
         kinds = {root: DATASET, journals: EPISODES}
         with exclusive(root):
             for folder, kind in () if self.resume else kinds.items():  # both, before either is emptied
-                require_writable(folder, kind, overwrite=self.overwrite)
+                require_writable(folder, kind, self.overwrite)
             if self.resume:
                 if any(root.glob("*")) and not any(journals.glob("*")):
                     raise UsageError(f"{root} cannot be continued without {journals}; choose another --dataset.root")

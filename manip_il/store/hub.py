@@ -13,15 +13,14 @@ import tempfile
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import islice
 from pathlib import Path
-from typing import Any, override
+from typing import Any
 
 import httpx
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoFile, constants, set_client_factory
 from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError, RevisionNotFoundError
 from huggingface_hub.utils import disable_progress_bars
-from huggingface_hub.utils._http import hf_request_event_hook
+from huggingface_hub.utils._http import default_client_factory
 from tqdm import tqdm
 
 from manip_il import checks
@@ -35,38 +34,26 @@ _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
-_MOST_FILES = 100_000  # of a repository
 _AT_ONCE = 8  # concurrent files
 
 
-class _Client(httpx.Client):
-    """The connections to a Hub: no answer is larger than `LARGEST_READ`, and the token goes to no other server."""
-
-    @override
-    def send(self, request: httpx.Request, *, stream: bool = False, **options: Any) -> httpx.Response:
-        """Send a request; with `stream`, the caller bounds the answer."""
-        response = super().send(request, stream=True, **options)
-        if not stream:
-            arrival, content = Arrival(checks.LARGEST_READ), bytearray()
-            for chunk in response.iter_bytes():
-                arrival.update(len(chunk))
-                content += chunk
-            response._content = bytes(content)
-        return response
-
-
 def _guard_token(request: httpx.Request) -> None:
+    """Remember the token, and remove it if another server is asked, as a page of a listing may name one."""
     SENT.add(request.headers.get("authorization", "").removeprefix("Bearer "))
-    hub = httpx.URL(constants.ENDPOINT)
-    if (request.url.scheme, request.url.netloc) != (hub.scheme, hub.netloc):
+    if not str(request.url).startswith(f"{constants.ENDPOINT}/"):
         request.headers.pop("authorization", None)
 
 
 @cache
 def _use_client() -> None:
-    """Have huggingface_hub use our client."""
-    hooks = {"request": [hf_request_event_hook, _guard_token]}
-    set_client_factory(lambda: _Client(event_hooks=hooks, follow_redirects=True, timeout=None))
+    """Have huggingface_hub guard the token from now on."""
+    set_client_factory(_client)
+
+
+def _client() -> httpx.Client:
+    client = default_client_factory()
+    client.event_hooks = {"request": [*client.event_hooks["request"], _guard_token]}
+    return client
 
 
 class Hub:
@@ -98,7 +85,7 @@ class Hub:
             if not _COMMIT.fullmatch(head):  # becomes part of paths
                 found = f"the commit {checks.shorten(head)}, not 40 hexadecimal digits"
                 raise RemoteError(f"{self.name} has {found}; is HF_ENDPOINT a Hub?")
-            tree = islice(self._api.list_repo_tree(**self._repo, revision=head, recursive=True), _MOST_FILES)
+            tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
             listed = {one.path: one for one in tree if isinstance(one, RepoFile)}
             missing = sorted({one.rfilename for one in about.siblings or ()} - listed.keys())
             if missing:
@@ -169,12 +156,10 @@ class Hub:
 
     def fetch(self, manifest: Manifest, folder: Path) -> None:
         """Download a version's files into `folder`, without checking hashes."""
-        bar = tqdm(desc="pull", unit=" files", total=len(manifest.files), disable=True if self._quiet else None)
-        with explained(f"pull from {self.name}"), bar, ThreadPoolExecutor(_AT_ONCE) as pool:
-            for _ in pool.map(
-                lambda path: self._download(path, manifest.version, folder, manifest.files[path].size), manifest.files
-            ):
-                bar.update()
+        files, version = manifest.files, manifest.version
+        with explained(f"pull from {self.name}"), ThreadPoolExecutor(_AT_ONCE) as pool:
+            arrived = pool.map(lambda path: self._download(path, version, folder, files[path].size), files)
+            list(tqdm(arrived, "pull", len(files), unit=" files", disable=True if self._quiet else None))
         shutil.rmtree(folder / ".cache")  # the library's records of the download
 
     def _download(self, path: str, version: str, folder: Path, most: int) -> Path:

@@ -49,8 +49,6 @@ _CHUNK = 2**20  # [bytes]
 class Local(LocalFileSystem):
     """This machine's files, of which a pull reads only regular ones."""
 
-    cachable = False
-
     @override
     def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
         """Copy a file and count its bytes."""
@@ -140,10 +138,9 @@ class Objects:
                 info = self._fs.info(self._manifest)
             except (FileNotFoundError, NotADirectoryError):
                 return None
-            with tempfile.TemporaryDirectory(prefix="manip_il_manifest_") as folder:
-                arrived = Path(folder) / MANIFEST_FILE
-                self._fs.get_file(self._manifest, str(arrived), callback=Arrival(checks.LARGEST_READ))
-                data = arrived.read_bytes()
+            with tempfile.NamedTemporaryFile() as arrived:
+                self._fs.get_file(self._manifest, arrived.name, callback=Arrival(checks.LARGEST_READ))
+                data = arrived.read()
             return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
 
     def pushed(self, before: Manifest) -> Mapping[str, File]:
