@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from manip_il.data.atomic import exclusive, new_folder, write_file
 from manip_il.data.ownership import CHECKPOINT, DATASET
@@ -104,6 +107,17 @@ def test_a_file_is_replaced_whole_and_holds_what_it_held_where_writing_fails(tmp
         write_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_full_disk_names_the_path_whichever_library_writes(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, limits[1]))
+    try:
+        with pytest.raises(ManipError, match=f"cannot write {tmp_path}/new: File"), new_folder(tmp_path / "new") as new:
+            save_file({"weights": np.zeros(1_000)}, new / "model.safetensors")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
 
 
 def start(what: str, root: Path) -> subprocess.Popen[str]:

@@ -122,7 +122,7 @@ def test_a_file_that_is_larger_than_the_list_says_is_not_taken(scheme, endless, 
     monkeypatch.setattr(Arrival, "call", lambda self, call=Arrival.call: arrived.append(self.value) or call(self))
     with pytest.raises(ManipError):
         pull(open_remote(url, quiet=True), tmp_path / "got")
-    assert max(arrived, default=0) < 2 * most
+    assert scheme == "file" or 0 < max(arrived) < 2 * most
     assert not list(tmp_path.glob("*got*"))
 
 
