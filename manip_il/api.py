@@ -25,7 +25,8 @@ from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_json
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
-from manip_il.errors import FolderExistsError, MismatchError, UsageError
+from manip_il.data.ownership import output_of, require_ours, require_replaceable
+from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import HOLD, episode_hold
@@ -60,7 +61,7 @@ def record(
     beta: share of the steps that the expert drives instead of the policy. query: when the expert is queried, as for
     `manip-il dagger --query`. options: other fields of `RolloutJob`, such as `label` and `cameras`; `round` is by
     default 1 with a policy, else 0.
-    Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder exists.
+    Each frame holds the executed action and the expert's label. Raises `UsageError` if the folder holds files.
     """
     root = _path(root)
     driver = RolloutJob.driver if policy is None else PolicyDriver((_folder(policy),), beta)
@@ -68,8 +69,8 @@ def record(
     job = make_options(RolloutJob, env=_env(env), driver=driver, **chosen)
     episodes = checks.whole("episodes", episodes, 1, _MOST_EPISODES)
     journals = root.with_name(f"{root.name}.journals")
-    if found := next((one for one in (root, journals) if one.exists()), None):
-        raise FolderExistsError(found)
+    for folder in (root, journals):
+        require_replaceable(folder)
     recording = Recording("local/recorded", provenance=provenance(job), only_labelled=not job.labels_all)
     with Engine(workers) as engine:
         if policy is None:
@@ -95,15 +96,17 @@ def train(
     """Fit a policy to the labels of one or more datasets; return its checkpoint.
 
     options: fields of `FitConfig`, such as `policy={"type": "mlp", "width": 128}`, `steps` and `batch_size`. on_log:
-    called after every step with its metrics, or {} if there are none. Raises `FolderExistsError` if `output_dir` has a
-    checkpoint, `ManipError` for data that do not fit the policy.
+    called after every step with its metrics, or {} if there are none. Raises `UsageError` if `output_dir` has a
+    checkpoint or holds other files, `ManipError` for data that do not fit the policy.
     """
     from manip_il.learn.train import Trainer  # LeRobot's trainer takes seconds to import
 
+    output_dir = _path(output_dir)
+    require_ours(output_dir, output_of("Train"))
     given = (datasets,) if isinstance(datasets, Data) else datasets
     opened = tuple(one if isinstance(one, Dataset) else Dataset.open(_path(one)) for one in given)
     config = make_options(FitConfig, seed=stream_base("training", seed), **options)
-    return Checkpoint.open(Trainer(opened, config, _path(output_dir)).fit(on_log))
+    return Checkpoint.open(Trainer(opened, config, output_dir).fit(on_log))
 
 
 @takes(RunConfig, "query_rule")
@@ -178,9 +181,8 @@ def _check_same(path: Path, config: RunConfig) -> None:
     """
     now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
     now["fit"] = {one.name: now["fit"][one.name] for one in fields(FitConfig) if not one.metadata.get("free")}
+    require_ours(path.parent, output_of("Dagger"))
     has_begun = any(path.parent.glob("round_*"))
-    if not has_begun and not path.is_file() and any(path.parent.glob("[!.]*")):
-        raise FolderExistsError(path.parent)
     before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
     for key in now:
         if before.get(key) != now[key]:

@@ -71,11 +71,15 @@ def test_a_folder_holds_the_results_of_one_set_of_options(tmp_path: Path, monkey
 
 
 def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
-    with pytest.raises(UsageError, match="already exists"):
-        manip_il.record(str(tmp_path), manip_il.make_config("panda", "reach"), 1)
-    (tmp_path / "best").mkdir()
-    with pytest.raises(UsageError, match="already exists"):
-        manip_il.dagger(tmp_path, manip_il.make_config("panda", "reach"))
+    (tmp_path / "metrics.jsonl").write_text("mine\n")
+    env = manip_il.make_config("panda", "reach")
+    with pytest.raises(UsageError, match=str(tmp_path)):
+        manip_il.record(str(tmp_path), env, 1)
+    with pytest.raises(UsageError, match=str(tmp_path)):
+        manip_il.dagger(tmp_path, env)
+    with pytest.raises(UsageError, match=str(tmp_path)):
+        manip_il.train([], tmp_path)
+    assert (tmp_path / "metrics.jsonl").read_text() == "mine\n"
 
 
 def test_without_a_policy_the_environment_must_be_given():

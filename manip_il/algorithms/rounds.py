@@ -133,8 +133,7 @@ def merge_rounds(datasets: Sequence[Path], root: Path, repo_id: str, best: int) 
         return Dataset.open(dataset).info.episodes
 
     if datasets and not (root.is_dir() and episodes(root) == sum(map(episodes, datasets))):
-        shutil.rmtree(root, ignore_errors=True)
-        merge_datasets(datasets, root, repo_id=repo_id, provenance={"best_round": best})
+        merge_datasets(datasets, root, repo_id=repo_id, provenance={"best_round": best}, replace=True)
 
 
 def _count_labels(root: Path) -> int:

@@ -52,6 +52,7 @@ from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
 from manip_il.data.json_lines import append_line, read_lines
+from manip_il.data.ownership import CHECKPOINT, kind_of
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.evaluation.runner import HOLD, evaluate
@@ -231,7 +232,7 @@ class Run:
         folder = self.folder / CHECKPOINTS
         agent.save(folder / f"{agent.number:06d}")
         for other in folder.iterdir():
-            if not other.is_symlink() and other.name != f"{agent.number:06d}":
+            if not other.is_symlink() and other.name != f"{agent.number:06d}" and kind_of(other) == CHECKPOINT:
                 shutil.rmtree(other, ignore_errors=True)
         self._watch.on_step()
         return self._iteration(agent, folder / "last" / PRETRAINED_MODEL)
@@ -272,7 +273,7 @@ class Run:
 
     def _keep_best(self, policy: Path) -> None:
         """Copy the best policy's `pretrained_model` to `best`."""
-        with new_folder(self.folder / BEST, replace=True) as new:
+        with new_folder(self.folder / BEST, replaces=CHECKPOINT) as new:
             shutil.copytree(policy, new / PRETRAINED_MODEL)
 
     def _folder(self, round_: int) -> Path:

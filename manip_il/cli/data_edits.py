@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.common_options import SMALL, Pictured, Varied
 from manip_il.cli.options import Given, given
-from manip_il.cli.outputs import Replacing, require_replaceable
+from manip_il.cli.outputs import Replacing, require_writable
 from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import exclusive
+from manip_il.data.ownership import DATASET
 from manip_il.evaluation.suites import varied
 from manip_il.option import Seeded, option
 from manip_il.sim.config import CameraConfig, Look
@@ -38,7 +39,7 @@ class BuildOptions(Replacing):
         """Build the dataset."""
         from manip_il.data.build import build
 
-        require_replaceable(self.dataset, self.overwrite, [self.journals])
+        require_writable(self.dataset, DATASET, self.overwrite, [self.journals])
         with exclusive(self.dataset):
             info, failed = build(self.journals, self.dataset, replace=self.overwrite)
         say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")
@@ -61,7 +62,7 @@ class MergeOptions(Replacing):
         from manip_il.data.build import local_id, merge_datasets
 
         with exclusive(self.output):
-            require_replaceable(self.output, self.overwrite, self.datasets)
+            require_writable(self.output, DATASET, self.overwrite, self.datasets)
             repo_id = local_id(self.output.absolute().name)
             info = merge_datasets(self.datasets, self.output, repo_id=repo_id, replace=self.overwrite)
         say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.output}")
@@ -95,7 +96,7 @@ class Edit(Replacing):
 
         root = root or self.source
         folder = self.target or root.with_name(f"{root.absolute().name}_{what}")
-        require_replaceable(folder, self.overwrite, [root])
+        require_writable(folder, DATASET, self.overwrite, [root])
         source = open_source(root, self.robot, self.task, self.object)
         warn(*source.warnings)
         with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:

@@ -9,25 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.options import options_of
-from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
+from manip_il.cli.parsing import dump_yaml, from_yaml
 from manip_il.cli.progress import say
-from manip_il.data.atomic import PARTIAL, clear, exclusive, write_file, write_json
-from manip_il.errors import FolderExistsError, MismatchError, UsageError
+from manip_il.data.atomic import clear, exclusive, write_file, write_json
+from manip_il.data.ownership import CONFIG_FILE, PARTIAL, kind_of, output_of, require_replaceable
+from manip_il.errors import MismatchError, UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.evaluation.report import Report
     from manip_il.evaluation.tables import Table
 
-CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
-# File -> text in it that identifies this program's output: only our datasets have an `executed_action`.
-_MARKS = {
-    CONFIG_FILE: CONFIG_HEADER,
-    "meta/info.json": '"executed_action"',
-    "eval.json": '"fingerprint"',
-    "manip_il.json": '"action_meaning"',
-    "recording.json": '"only_successes"',
-}
+REPORT_FILE = "report.html"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,9 +53,16 @@ class Output(Replacing):
         with exclusive(folder):
             if resume:  # before anything is deleted
                 check_same_options(folder, options)
-            prepare_output(folder, resume=resume, overwrite=self.overwrite, sources=[*_inputs(options), *sources])
+            sources = (*_inputs(options), *sources)
+            kind = kind_of_output(options)
+            prepare_output(folder, kind, resume=resume, overwrite=self.overwrite, sources=sources)
             save_options(folder, options)
             yield folder
+
+
+def kind_of_output(options: Any) -> str:
+    """Return the kind of folder into which a command with these options writes."""
+    return output_of(type(options).__name__)
 
 
 def _inputs(options: Any) -> list[Path]:
@@ -98,11 +98,18 @@ class OutputFile(Replacing):
 
 
 def prepare_output(
-    folder: Path, *, resume: bool = False, overwrite: bool = False, sources: Sequence[Path] = ()
+    folder: Path, kind: str, *, resume: bool = False, overwrite: bool = False, sources: Sequence[Path] = ()
 ) -> None:
     """Prepare `folder` for writing: on return it is absent or empty, unless `resume`.
 
-    sources: input paths, which must not be replaced. Raises what `require_replaceable` raises.
+    Args:
+        folder: The output folder.
+        kind: Kind of folder that may be replaced, as `kind_of` names it.
+        resume: Whether to continue with what is there.
+        overwrite: Whether to delete what is there.
+        sources: Input paths, which must not be replaced.
+
+    Raises what `require_writable` raises.
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
@@ -111,26 +118,24 @@ def prepare_output(
             if left.is_file():
                 left.unlink()
     elif folder.exists():
-        require_replaceable(folder, overwrite, sources)
+        require_writable(folder, kind, overwrite, sources)
         clear(folder)
 
 
-def require_replaceable(folder: Path, overwrite: bool, sources: Sequence[Path] = ()) -> None:
-    """Raise `UsageError` unless `folder` is absent or empty, or `overwrite` is set and it is this program's output."""
-    if not folder.exists() or not any(folder.iterdir()):
-        return
-    if not overwrite:
-        raise FolderExistsError(folder)
-    if source := next((one for one in sources if one.resolve().is_relative_to(folder.resolve())), None):
-        raise UsageError(f"{folder} overlaps {source}; expected a separate folder")
-    if folder.is_symlink():
-        raise UsageError(f"{folder} is a link; --overwrite=true does not follow links, so give {folder.resolve()}")
-    files = {folder / name: mark.encode() for name, mark in _MARKS.items() if (folder / name).is_file()}
-    if not any(mark in path.read_bytes() for path, mark in files.items()):
-        raise UsageError(
-            f"{folder} holds files that manip-il did not make (it wrote no {' or '.join(_MARKS)} there); choose "
-            "another folder, or delete it by hand"
-        )
+def require_writable(folder: Path, kind: str, overwrite: bool, sources: Sequence[Path] = ()) -> None:
+    """Raise `UsageError` unless `folder` is absent or empty, or `overwrite` is set and it is a folder of this kind.
+
+    Args:
+        folder: The output folder.
+        kind: Kind of folder that may be replaced, as `kind_of` names it.
+        overwrite: Whether it may be replaced.
+        sources: Input paths, which must not be replaced.
+    """
+    if overwrite and kind_of(folder) != "":
+        overlapping = [source for source in sources if source.resolve().is_relative_to(folder.resolve())]
+        if overlapping:
+            raise UsageError(f"{folder} overlaps {overlapping[0]}; expected a separate folder")
+    require_replaceable(folder, kind if overwrite else "")
 
 
 def publish(

@@ -25,12 +25,12 @@ from manip_il.cli.options import (
     to_plain,
     without_none,
 )
+from manip_il.data.ownership import CONFIG_HEADER
 from manip_il.errors import ManipError, UsageError, nearest
 from manip_il.evaluation.policy_folder import hub_hint
 from manip_il.option import check_bound, type_of
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
-CONFIG_HEADER = "# manip-il"  # first line of every file from `dump_yaml`
 _MOST_OFFERED = 3  # names that an error suggests
 _FORMER = {  # former options, ignored in a file if they have these values
     "task.reward": "",

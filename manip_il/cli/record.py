@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, ClassVar
 from manip_il import checks
 from manip_il.cli.common_options import EngineOptions, Varied, env_config
 from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, require_replaceable, save_options
+from manip_il.cli.outputs import Resumable, check_same_options, prepare_output, require_writable, save_options
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.data.atomic import exclusive
+from manip_il.data.ownership import DATASET, EPISODES
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.suites import varied
@@ -63,15 +64,16 @@ class RecordOptions(Varied, Seeded, Resumable):
         repo_id = checks.repo_id("repo_id", self.dataset.repo_id or f"local/{env.name}")
         root = self.dataset.root or Path("datasets") / repo_id.rpartition("/")[2]
         journals = root.with_name(f"{root.name}.journals")
+        kinds = {root: DATASET, journals: EPISODES}
         with exclusive(root):
-            for folder in () if self.resume else (root, journals):  # both, before either is emptied
-                require_replaceable(folder, self.overwrite)
+            for folder, kind in () if self.resume else kinds.items():  # both, before either is emptied
+                require_writable(folder, kind, self.overwrite)
             if self.resume:
                 if any(root.glob("*")) and not any(journals.glob("*")):
                     raise UsageError(f"{root} cannot be continued without {journals}; choose another --dataset.root")
                 check_same_options(journals, self)
-            prepare_output(root, resume=self.resume, overwrite=self.overwrite)
-            prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
+            for folder, kind in kinds.items():
+                prepare_output(folder, kind, resume=self.resume, overwrite=self.overwrite)
             self._record(job, root, journals, repo_id)
         say_next("train", f"--dataset.root={root}", f"--output_dir=runs/{root.name}")
         say_next("view", f"--robot.type={env.robot}", f"--task.type={env.task}", what="to watch the expert")

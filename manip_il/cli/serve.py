@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
 from manip_il.cli.common_options import Trusting, Varied
 from manip_il.cli.options import Given, given
+from manip_il.cli.outputs import kind_of_output, save_options
 from manip_il.cli.progress import say
+from manip_il.data.ownership import require_ours
 from manip_il.errors import UnknownName, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.suites import varied
@@ -59,4 +61,6 @@ class ServeOptions(Varied, Trusting):
         conditions = varied([one for one in self.vary if one != SERVO], env, sees=cameras is not None)
         session = SessionConfig(**self.session, servos=self.servos, varies=SERVO in self.vary)
         with exclusive(session.output_dir):
+            require_ours(session.output_dir, kind_of_output(self))
+            save_options(session.output_dir, replace(self, command=[]))  # which may hold secrets
             serve(env, session, self.command, cameras, conditions, policy, say, trust=self.trust)

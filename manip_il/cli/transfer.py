@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from manip_il.cli.common_options import OfDataset
 from manip_il.cli.options import group
-from manip_il.cli.outputs import OutputFile, Replacing, prepare_output, require_replaceable, save_options
+from manip_il.cli.outputs import OutputFile, Replacing, kind_of_output, prepare_output, save_options
 from manip_il.cli.progress import has_bars, progress, say, say_next
 from manip_il.data.atomic import new_folder, write_file
 from manip_il.errors import ManipError
@@ -75,7 +75,6 @@ class PullOptions(Replacing):
 
         from manip_il.store.transfer import open_remote, pull
 
-        require_replaceable(self.target, self.overwrite)
         remote = open_remote(self.remote, revision=self.revision, quiet=not has_bars())
         manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
         if self.dry_run:
@@ -131,7 +130,7 @@ class McapExportOptions(OfDataset, Replacing):
         from manip_il.mcap.export import MAPPING, export_dataset, left_out
 
         dataset = Dataset.open(self.dataset)
-        prepare_output(self.out, overwrite=self.overwrite, sources=[self.dataset])
+        prepare_output(self.out, kind_of_output(self), overwrite=self.overwrite, sources=[self.dataset])
         with new_folder(self.out) as folder, progress(dataset.info.episodes, "export") as bar:
             for _ in export_dataset(dataset, folder):
                 bar.step()

@@ -18,9 +18,11 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from itertools import islice
 from multiprocessing import forkserver, resource_tracker
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
 
 from manip_il.collect.job import RolloutJob
+from manip_il.data.atomic import writing
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError, UsageError, told
 from manip_il.mdp import Episode
@@ -174,7 +176,8 @@ def map_in_order[T, R](function: Callable[[T], R], items: Iterable[T], workers: 
 def open_pool(workers: int, *, learned: bool = False) -> ProcessPoolExecutor:
     """Return a pool of processes, which start on demand. learned: as in `start_server`."""
     start_server(learned)
-    return ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=_end_with_parent)
+    with writing(Path("/dev/shm")):  # where the pool's locks are
+        return ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=_end_with_parent)
 
 
 def kill_pool(pool: ProcessPoolExecutor) -> None:

@@ -8,14 +8,15 @@ import errno
 import fcntl
 import json
 import os
+import re
 import shutil
 from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
 
-from manip_il.errors import FolderExistsError, ManipError
+from manip_il.data.ownership import PARTIAL, UNFINISHED, UNFINISHED_MARK, require_replaceable
+from manip_il.errors import ManipError
 
-PARTIAL = ".partial"  # suffix of unfinished files and folders
 _WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # never raised by reading
 
 
@@ -24,40 +25,52 @@ def writing(path: Path) -> Generator[None]:
     """Raise `ManipError` if the disk is full or read-only. It names the file that failed, or `path` if unknown."""
     try:
         yield
-    except OSError as error:  # errors of Arrow and FFmpeg are OSErrors, too
-        if error.errno not in _WRITE_ERRORS:
+    except (
+        Exception
+    ) as error:  # errors of Arrow and FFmpeg are OSErrors, too; those of safetensors only name the number
+        named = re.search(r"os error (\d+)", str(error))
+        number = getattr(error, "errno", None) or (int(named[1]) if named else None)
+        if number not in _WRITE_ERRORS:
             raise
-        raise ManipError(f"cannot write {error.filename or path}: {os.strerror(error.errno)}") from error
+        place = getattr(error, "filename", None) or path
+        raise ManipError(f"cannot write {place}: {os.strerror(number)}") from error
 
 
 @contextlib.contextmanager
-def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
-    """Yield an empty sibling of `root` to write into; at the end, sync it to disk and rename it to `root`.
+def new_folder(root: Path, *, replaces: str = "") -> Generator[Path]:
+    """Yield an empty folder beside `root` to write into; at the end, sync it to disk and rename it to `root`.
 
-    An exception removes the sibling; the next writer removes one left by a killed process. Raises `FolderExistsError`
-    if `root` is not empty (checked at the beginning and end), unless `replace`: then the new folder takes its place.
+    It is in `.NAME.partial`, which an exception removes, and which the next writer empties if a killed process left it.
     Raises `ManipError` if the disk is full or read-only, or if another process writes the same folder.
+
+    Args:
+        root: The new folder. It must not exist or be empty, at the beginning and at the end.
+        replaces: Kind of folder whose place it may take instead, as `kind_of` names it.
     """
     root = root.absolute()
-    if not (replace and root.is_dir()):
-        _require_empty(root)
+    require_replaceable(root, replaces)
     partial = root.with_name(f".{root.name}{PARTIAL}")
     if partial.is_symlink():  # a planted link: its target must not be cleared
         partial.unlink()
+    new, mark = partial / root.name, partial / UNFINISHED_MARK
     with writing(root), exclusive(partial) as handle:
-        clear(partial)
+        require_replaceable(partial, UNFINISHED)
+        mark.touch()
+        clear(partial, keep=mark)
+        new.mkdir()
         try:
-            yield partial
+            yield new
             _libc("syncfs", handle)  # one call for all files
-            if replace and root.exists():
+            require_replaceable(root, replaces)
+            if replaces and root.exists():
                 here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
-                _libc("renameat2", here, os.fsencode(partial), here, os.fsencode(root), exchange)
+                _libc("renameat2", here, os.fsencode(new), here, os.fsencode(root), exchange)
             else:
-                _require_empty(root)
-                partial.rename(root)
+                new.rename(root)
             sync(root.parent)
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(new, ignore_errors=True)
+            mark.unlink(missing_ok=True)  # last, so that a kill leaves nothing that is not marked
 
 
 @contextlib.contextmanager
@@ -83,10 +96,13 @@ def exclusive(folder: Path) -> Generator[int]:
         os.close(handle)
 
 
-def clear(folder: Path) -> None:
-    """Delete everything in a folder, but not the folder itself, which may be locked or a mount point."""
+def clear(folder: Path, keep: Path | None = None) -> None:
+    """Delete everything in a folder except `keep`, but not the folder itself, which may be locked or a mount point."""
     for path in folder.iterdir():
-        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path != keep:
+            path.unlink()
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -138,8 +154,3 @@ def _libc(name: str, *arguments: int | bytes) -> None:
     if getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments):
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
-
-
-def _require_empty(root: Path) -> None:
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise FolderExistsError(root)

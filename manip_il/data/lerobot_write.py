@@ -22,6 +22,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import PICTURES, Info, read_info
+from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
@@ -52,12 +53,13 @@ def write_dataset(
 
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
     give the same bytes, videos included. An episode with `Films` has no pictures: the video files are copied.
-    provenance: origin of the episodes, read after the last episode. replace: as in `new_folder`; otherwise, if `root`
+    provenance: origin of the episodes, read after the last episode. replace: replace a dataset; otherwise, if `root`
     is not empty, raises `FolderExistsError` before taking an episode. Also raises what `ordered_columns` raises, and
     `ManipError` if there are no episodes or the disk is full.
     """
     about = features(spec), spec.fps, spec.robot_type or spec.robot, video
-    with new_folder(root, replace=replace) as folder, closing(TableWriter(folder, *about)) as writer:
+    replaces = DATASET if replace else ""
+    with new_folder(root, replaces=replaces) as folder, closing(TableWriter(folder, *about)) as writer:
         for item in episodes:
             episode, films = (item, None) if isinstance(item, Episode) else item
             columns = ordered_columns(episode, spec, writer.films if films else ())

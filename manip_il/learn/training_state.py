@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 from manip_il import checks
 from manip_il.data.atomic import new_folder, write_file
 from manip_il.data.json_lines import Record, append_line, read_lines
+from manip_il.data.ownership import CHECKPOINT
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.learn.checkpoint import META_FILE, Origin
 
@@ -60,7 +61,7 @@ def new_checkpoint(final: Path) -> Generator[Path]:
 
     It is removed after an exception. Raises `ManipError` if the disk is full or read-only.
     """
-    with new_folder(final, replace=True) as new:  # replaces the folder of a run killed before it switched `last`
+    with new_folder(final, replaces=CHECKPOINT) as new:  # replaces the folder of a run killed before it switched `last`
         yield new
         for path in new.rglob("*.safetensors"):  # without this, other users, such as a container's, could not read them
             path.chmod(new.stat().st_mode & 0o666)

@@ -6,6 +6,7 @@ The checksum is the complement of the sum of all bytes from the id on. Present_P
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import logging
 import math
@@ -82,6 +83,7 @@ class Bus:
         self.on_read: Callable[[], None] = lambda: None
         self._waiting, self._was_read = b"", -math.inf
         self._master, self._slave = pty.openpty()  # keeping the other end open keeps the port alive between clients
+        os.set_blocking(self._master, False)
         tty.setraw(self._master)
         tty.setraw(self._slave)
         self.path = Path(os.ttyname(self._slave))
@@ -136,7 +138,8 @@ class Bus:
     def _run(self) -> None:
         while not self._closing.is_set():
             if select.select([self._master], [], [], 0.1)[0]:
-                os.write(self._master, self.feed(os.read(self._master, 4096)))
+                with contextlib.suppress(BlockingIOError):  # a client that reads no answers loses them
+                    os.write(self._master, self.feed(os.read(self._master, 4096)))
             fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # root may open it
 
     @property

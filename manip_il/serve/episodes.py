@@ -14,6 +14,8 @@ from manip_il.collect.expert import Expert
 from manip_il.data.build import Recording
 from manip_il.data.episodes import to_episode
 from manip_il.data.journal import Journal, list_seeds
+from manip_il.data.ownership import EPISODES, require_ours
+from manip_il.errors import MismatchError
 from manip_il.mdp import Actor, Transition
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.station import Mover, Read, Station
@@ -35,7 +37,11 @@ class ServedEpisodes:
         self._running = False
         self._journal = Journal(folder, env_spec(config), env_fingerprint(config)) if folder is not None else None
         if self._journal is not None:
+            require_ours(self._journal.folder, EPISODES)
             self._journal.prepare()
+            before = Recording.read(self._journal.folder).provenance.get("driver", SERVED)
+            if before != SERVED:
+                raise MismatchError("who drives", str(self._journal.folder), before, "this session", SERVED)
             Recording(f"local/{config.name}", provenance={"driver": SERVED}).write(self._journal.folder)
         there = set(list_seeds(folder)) if folder is not None else set[int]()
         self._seeds = (one for one in stream_seeds("demonstrations", BLOCK, seed) if one not in there)

@@ -7,6 +7,7 @@ dataset or policy claims neither our licence nor our authorship.
 from __future__ import annotations
 
 import re
+import shlex
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ PICTURE = "assets/episodes.png"
 _FRAMES = 6  # per camera
 _OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is ours and is replaced
 _NOT_SHOWN = re.compile(  # lines of options that are paths, concern one machine, or may be secrets
-    r"/|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
+    r"/|```|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
     r"image_cache_gb|log_freq|save_freq|tensorboard):|(?i:token|secret|passw|credential|api_?key)"
 )
 
@@ -47,7 +48,8 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
         made[PICTURE] = folder / "episodes.png"
         draw_picture(dataset, made[PICTURE])
     if not (root / CARD).is_file() or any(mark in checks.read_bytes(root / CARD, "a card") for mark in _OURS):
-        environment = jinja2.Environment(finalize=lambda value: redact(value) if isinstance(value, str) else value)
+        environment = jinja2.Environment(finalize=_shown)
+        environment.filters["word"] = lambda value: shlex.quote(_shown(str(value)))
         environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")
         template = environment.from_string(Path(__file__).with_name("card.md.jinja").read_text(encoding="utf-8"))
         facts = {"place": place, "version": version("manip_il"), "picture": PICTURE if made else None}
@@ -64,6 +66,11 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
             text = f"{type(error).__name__}: {checks.one_line(error)}"
             raise ManipError(f"{root}: a JSON file in it holds unexpected values ({text}); restore the file") from error
     return made
+
+
+def _shown(value: Any) -> Any:
+    """Return a value as a card shows it: text on one line, without secrets."""
+    return redact(" ".join(value.splitlines())) if isinstance(value, str) else value
 
 
 def policy_facts(root: Path) -> dict[str, Any]:

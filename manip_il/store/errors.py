@@ -12,6 +12,7 @@ from manip_il.checks import one_line
 from manip_il.errors import ManipError
 
 HIDDEN = "[hidden]"
+SENT = set[str]()  # secrets that this process has sent, wherever it had them from
 _SHORTEST, _LONGEST = 4, 400  # [characters]: shortest secret that is hidden, longest printed message
 _SECRET_VARIABLE = re.compile(r"TOKEN$|SECRET|PASSW|ACCESS_KEY|S3_KEY")
 _SECRETS = (
@@ -29,7 +30,7 @@ _REMEDIES = {  # by HTTP status, else by the name of the error's class or neares
     "NoCredentialsError": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile in ~/.aws",
     "EndpointConnectionError": "check AWS_ENDPOINT_URL and the network",
     "SSHException": "run `ssh HOST` once: its key must be in ~/.ssh/known_hosts, yours in the agent or ~/.ssh/config",
-    "FileNotFoundError": "check the name: a bucket must exist",
+    "FileNotFoundError": "check the name",
     "PermissionError": "check your credentials, or choose another address",
     "OSError": "check the address, the network and the free space there, and try again",
 }
@@ -58,8 +59,8 @@ def explained(what: str) -> Generator[None]:
 
 
 def redact(text: str, words: Iterable[str] = ()) -> str:
-    """Hide in `text` values of secret environment variables, passwords of addresses in `words`, and likely tokens."""
-    secrets = {value for name, value in os.environ.items() if _SECRET_VARIABLE.search(name)}
+    """Hide what was sent, values of secret environment variables, passwords in `words`, and likely tokens in a text."""
+    secrets = SENT | {value for name, value in os.environ.items() if _SECRET_VARIABLE.search(name)}
     for word in words:
         password = (word.partition("://")[2] or word).partition(":")[2].rpartition("@")[0]
         secrets |= {password, unquote(password), repr(password)[1:-1], *password.split("=")}

@@ -2,31 +2,58 @@
 
 Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that the folder was
 compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that commit. The Hub provides the size
-and hash of each file of a commit.
+and hash of each file of a commit; a manifest lists those that a push wrote, since a repository may hold others.
 """
 
 from __future__ import annotations
 
-import glob
 import re
 import shutil
+import tempfile
 from collections.abc import Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoFile
-from huggingface_hub.errors import RepositoryNotFoundError, RevisionNotFoundError
+import httpx
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoFile, constants, set_client_factory
+from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError, RevisionNotFoundError
 from huggingface_hub.utils import disable_progress_bars
+from huggingface_hub.utils._http import default_client_factory
+from tqdm import tqdm
 
 from manip_il import checks
 from manip_il.data.lerobot_layout import VERSION
 from manip_il.errors import UsageError
-from manip_il.store.errors import RemoteError, explained
+from manip_il.store.arrival import Arrival
+from manip_il.store.errors import SENT, RemoteError, explained
 from manip_il.store.manifest import CARD, CONFIG, MANIFEST_FILE, File, Kind, Manifest, PushPlan, policy_folder
 
 _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?")
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
+_OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
+_AT_ONCE = 8  # concurrent files
+
+
+def _guard_token(request: httpx.Request) -> None:
+    """Remember the token, and remove it if another server is asked, as a page of a listing may name one."""
+    SENT.add(request.headers.get("authorization", "").removeprefix("Bearer "))
+    if not str(request.url).startswith(f"{constants.ENDPOINT}/"):
+        request.headers.pop("authorization", None)
+
+
+@cache
+def _use_client() -> None:
+    """Have huggingface_hub guard the token from now on."""
+    set_client_factory(_client)
+
+
+def _client() -> httpx.Client:
+    client = default_client_factory()
+    client.event_hooks = {"request": [*client.event_hooks["request"], _guard_token]}
+    return client
 
 
 class Hub:
@@ -42,7 +69,8 @@ class Hub:
         self._place, self._revision, self._private = found[2], revision or found[3], private
         self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
         self.name = f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
-        self._api = HfApi(library_name="manip_il")
+        _use_client()
+        self._api, self._quiet = HfApi(library_name="manip_il"), quiet
         if quiet:
             disable_progress_bars()
 
@@ -50,53 +78,96 @@ class Hub:
         """Return the current version; None if the repository or the revision does not exist."""
         with explained(f"read {self.name}"):
             try:
-                head = self._api.repo_info(**self._repo, revision=self._revision).sha or ""
+                about = self._api.repo_info(**self._repo, revision=self._revision)
             except (RepositoryNotFoundError, RevisionNotFoundError):
                 return None
+            head = about.sha or ""
             if not _COMMIT.fullmatch(head):  # becomes part of paths
                 found = f"the commit {checks.shorten(head)}, not 40 hexadecimal digits"
                 raise RemoteError(f"{self.name} has {found}; is HF_ENDPOINT a Hub?")
             tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
+            listed = {one.path: one for one in tree if isinstance(one, RepoFile)}
+            missing = sorted({one.rfilename for one in about.siblings or ()} - listed.keys())
+            if missing:
+                text = f"its list of files lacks {checks.shorten(missing[0])}, which the commit has; try again"
+                raise RemoteError(f"{self.name}: {text}")
             files = {
-                one.path: File(one.lfs.size, one.lfs.sha256) if one.lfs else File(one.size, git_sha1=one.blob_id)
-                for one in tree
-                if isinstance(one, RepoFile) and not _HIDDEN.match(one.path) and one.path != MANIFEST_FILE
+                path: File(one.lfs.size, one.lfs.sha256) if one.lfs else File(one.size, git_sha1=one.blob_id)
+                for path, one in listed.items()
+                if not _HIDDEN.match(path) and path != MANIFEST_FILE
             }
             copies = root_copies(files) if self.kind == "policy" else {}
             are_equal = all(files.get(name) == files[path] for name, path in copies.items())
             return Manifest(self.kind, files, head, copies=frozenset(copies if are_equal else ()))
 
-    def additions(self, source: Path, local: Mapping[str, Path], folder: Path) -> dict[str, Path]:
-        """Write the card and its picture into `folder`; return both, and a run's policy files, by repository path."""
+    def pushed(self, before: Manifest) -> dict[str, File]:
+        """Return the files of a version that a push wrote, by its manifest in the repository, without an edited card.
+
+        Without a manifest these are the folders of a dataset.
+        """
+        with tempfile.TemporaryDirectory(prefix="manip_il_manifest_") as folder, explained(f"read {self.name}"):
+            try:
+                path = self._download(MANIFEST_FILE, before.version, Path(folder), checks.LARGEST_READ)
+            except RemoteEntryNotFoundError:
+                named = _OF_A_DATASET if self.kind == "dataset" else ()
+                return {path: file for path, file in before.files.items() if path.startswith(named)}
+            pushed = dict(Manifest.from_json(path.read_bytes(), before.version).files)
+            if (there := before.files.get(CARD)) and CARD in pushed:
+                card = self._download(CARD, before.version, Path(folder), there.size)
+                if not pushed[CARD].fits(card):
+                    del pushed[CARD]
+            return pushed
+
+    def with_card(self, source: Path, local: Mapping[str, Path], folder: Path, keeps: bool) -> dict[str, Path]:
+        """Return the files to push: `local`, a card with its picture, and a run's policy at the root.
+
+        Args:
+            source: The dataset, run or policy.
+            local: Its files by their paths in the repository.
+            folder: Where card and picture are written.
+            keeps: Whether the repository keeps its own card.
+        """
         from manip_il.store.cards import write_cards  # imported here because no other remote needs matplotlib
 
         added = write_cards(source, self.kind, self._place, folder)
+        if keeps and added.pop(CARD, None):
+            local = {path: file for path, file in local.items() if path != CARD}
         copies = root_copies(local) if self.kind == "policy" else {}
-        return added if copies.keys() & local.keys() else added | {name: local[path] for name, path in copies.items()}
+        if not copies.keys() & local.keys():
+            added |= {name: local[path] for name, path in copies.items()}
+        return {**local, **added}
 
     def write(self, plan: PushPlan) -> None:
         """Commit on top of `plan.before` (the Hub refuses if it is outdated), then move a dataset's tag."""
         with explained(f"push to {self.name}"):
-            before = plan.before or self._create()
-            gone = before.files.keys() - plan.manifest.files.keys()
+            before, gone = plan.before or self._create(), plan.remove
+            if plan.before is None:  # a new branch begins with the files of the main branch
+                gone = sorted(before.files.keys() & self.pushed(before).keys() - plan.manifest.files.keys())
             operations = [
                 *(CommitOperationAdd(path, str(plan.local[path])) for path in plan.upload),
-                *(CommitOperationDelete(path, is_folder=False) for path in sorted(gone)),
+                *(CommitOperationDelete(path, is_folder=False) for path in gone),
             ]
             on: Any = {"revision": self._revision, "parent_commit": before.version}
             if operations:
+                operations.append(CommitOperationAdd(MANIFEST_FILE, plan.manifest.to_json()))
                 self._api.create_commit(**self._repo, operations=operations, commit_message="manip-il push", **on)
             if self.kind == "dataset" and self._revision in (None, "main"):
                 self._move_tag()
 
     def fetch(self, manifest: Manifest, folder: Path) -> None:
-        """Download a commit's files into `folder`, without checking hashes."""
-        left_out = [".*", "*/.*", *(glob.escape(path) for path in (*manifest.copies, MANIFEST_FILE))]
-        with explained(f"pull from {self.name}"):
-            self._api.snapshot_download(
-                **self._repo, revision=manifest.version, local_dir=folder, ignore_patterns=left_out, force_download=True
-            )
+        """Download a version's files into `folder`, without checking hashes."""
+        files, version = manifest.files, manifest.version
+        with explained(f"pull from {self.name}"), ThreadPoolExecutor(_AT_ONCE) as pool:
+            arrived = pool.map(lambda path: self._download(path, version, folder, files[path].size), files)
+            list(tqdm(arrived, "pull", len(files), unit=" files", disable=True if self._quiet else None))
         shutil.rmtree(folder / ".cache")  # the library's records of the download
+
+    def _download(self, path: str, version: str, folder: Path, most: int) -> Path:
+        """Download a file of at most so many bytes to the same path in a folder; return where it is."""
+        where: Any = {**self._repo, "revision": version, "local_dir": folder}
+        bounded: Any = Arrival(most)
+        self._api.hf_hub_download(filename=path, force_download=True, tqdm_class=bounded, **where)
+        return folder / path
 
     def _create(self) -> Manifest:
         """Create the repository and the branch; return the branch's content: empty, or as on the main branch."""

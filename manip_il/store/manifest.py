@@ -22,8 +22,10 @@ CHECKPOINTS, LAST = "checkpoints", "last"  # the link `last` to the newest check
 CARD, CONFIG = "README.md", "config.json"  # the first once per repository, the second once per policy
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
-_PICKLE_OR_CODE = re.compile(
-    r".*\.(pkl|pickle|pt|pth|bin|ckpt|joblib|dill|py|pyc|pyd|so|dll|exe|sh|bash|bat|cmd|ps1|jar|whl|ipynb)", re.I
+_DATA = re.compile(  # names of files that hold data; all others could be code, or pickles, which can run code
+    r".*\.(json|jsonl|ya?ml|toml|txt|md|csv|tsv|log|html|pdf|png|jpe?g|gif|webp|svg|mp4|parquet|arrow|mcap|safetensors|"
+    r"npz|npy|onnx|wandb|xml|urdf|stl|obj|mtl|bib)|LICENSE|NOTICE|events\.out\.tfevents\.[\w.-]+\.\d+",
+    re.I,
 )
 
 Kind = Literal["dataset", "policy"]
@@ -63,13 +65,15 @@ class File:
 class Manifest:
     """Files by path. version: the version's id on the remote.
 
-    copies: paths at the root that repeat the files of a run's policy; they are not pulled.
+    copies: paths at the root that repeat the files of a run's policy; they are not pulled. replaced: hashes of objects
+    that only the version before names.
     """
 
     kind: Kind
     files: Mapping[str, File]
     version: str = ""
     copies: frozenset[str] = frozenset()
+    replaced: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         """Raise `RemoteError` as `check_path` does."""
@@ -79,7 +83,8 @@ class Manifest:
     def to_json(self) -> bytes:
         """Return the content of the manifest file."""
         files = [{"path": path, "size": one.size, "sha256": one.sha256} for path, one in sorted(self.files.items())]
-        return json.dumps({"version": 1, "kind": self.kind, "files": files}, indent=1).encode()
+        table = {"version": 1, "kind": self.kind, "files": files, "replaced": sorted(self.replaced)}
+        return json.dumps(table, indent=1).encode()
 
     @classmethod
     def from_json(cls, data: bytes, version: str) -> Manifest:
@@ -89,7 +94,8 @@ class Manifest:
             if table["version"] != 1 or table["kind"] not in ("dataset", "policy"):
                 raise RemoteError("the manifest was written by another version of manip-il; use a newer one")
             files = {one["path"]: File(one["size"], one["sha256"]) for one in table["files"]}
-            return cls(table["kind"], files, version)
+            replaced = frozenset(File(0, sha256).sha256 for sha256 in table.get("replaced", ()))
+            return cls(table["kind"], files, version, replaced=replaced)
         except (LookupError, TypeError, AttributeError) as error:
             raise RemoteError("the manifest is invalid; push again, to an empty folder") from error
 
@@ -106,12 +112,12 @@ class PushPlan:
 
 
 def check_path(path: object) -> None:
-    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is a pickle or code."""
+    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is not of a known kind of data."""
     parts = path.split("/") if isinstance(path, str) and path.isprintable() and "\\" not in path else [""]
-    text = "pickles and code are neither pushed nor pulled, because opening them can run code"
+    text = "only files of data are pushed and pulled (such as .json, .parquet, .safetensors), no pickles and no code"
     if not all(part and not part.startswith(".") for part in parts):
         text = "expected a relative path inside the folder, without hidden files"
-    elif not _PICKLE_OR_CODE.fullmatch(parts[-1]):
+    elif _DATA.fullmatch(parts[-1]):
         return
     raise RemoteError(f"the file {checks.shorten(path)} is refused; {text}")
 

@@ -3,8 +3,8 @@
     PLACE/manip_il_manifest.json       replaced last, atomically: readers see the old version or the new one
          /objects/3f/3f9a...           each file's bytes, never changed
 
-Objects of the previous version stay until the next push, so that its readers can finish; a push removes objects that
-neither version names.
+Objects of the previous version stay until the next push, so that its readers can finish: the manifest lists them, and
+nothing else is ever removed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,11 @@ import hashlib
 import logging
 import re
 import secrets
-from functools import cached_property
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, override
 from urllib.parse import unquote
@@ -21,11 +25,14 @@ from urllib.parse import unquote
 import fsspec
 import paramiko
 from fsspec.callbacks import TqdmCallback
+from fsspec.implementations.local import LocalFileSystem
 from fsspec.implementations.sftp import SFTPFileSystem
 
+from manip_il import checks
 from manip_il.errors import UnknownName, UsageError
+from manip_il.store.arrival import Arrival, Arrivals
 from manip_il.store.errors import RemoteError, explained
-from manip_il.store.manifest import MANIFEST_FILE, Kind, Manifest, PushPlan
+from manip_il.store.manifest import MANIFEST_FILE, File, Kind, Manifest, PushPlan
 
 TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
 _FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # for object stores: no stale listings
@@ -36,6 +43,17 @@ _SFTP = re.compile(
 )
 _AT_ONCE, _SMALL_AT_ONCE = 4, 10  # concurrent files; s3fs keeps parts of large ones in memory, and has ten connections
 _SMALL = 10_000_000  # limit of a small file [bytes]
+_CHUNK = 2**20  # [bytes]
+
+
+class Local(LocalFileSystem):
+    """This machine's files, of which a pull reads only regular ones."""
+
+    @override
+    def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
+        """Copy a file and count its bytes."""
+        with checks.open_outside(Path(rpath), "a file of a push", RemoteError) as source:
+            _copy(source, lpath, callback)
 
 
 class Sftp(SFTPFileSystem):
@@ -70,6 +88,20 @@ class Sftp(SFTPFileSystem):
         self.makedirs(self._parent(rpath), exist_ok=True)
         self.ftp.put(str(lpath), str(rpath))
 
+    @override
+    def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
+        """Download a file and count its bytes."""
+        with self.ftp.open(str(rpath)) as source:
+            source.prefetch(min(source.stat().st_size or 0, callback.most))
+            _copy(source, lpath, callback)
+
+
+def _copy(source: Any, target: str, arrival: Arrival) -> None:
+    with open(target, "wb") as file:
+        for chunk in iter(partial(source.read, _CHUNK), b""):
+            arrival.update(len(chunk))
+            file.write(chunk)
+
 
 class Objects:
     """A folder in any file system that fsspec supports. quiet: show no progress bars."""
@@ -81,7 +113,8 @@ class Objects:
         self._scheme, self._quiet = scheme, quiet
         self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
         try:
-            self._class: Any = Sftp if scheme == "sftp" else fsspec.get_filesystem_class(scheme)
+            own = {"file": Local, "sftp": Sftp}
+            self._class: Any = own.get(scheme) or fsspec.get_filesystem_class(scheme)
         except ImportError as error:
             raise UsageError(f"{scheme}:// needs another package: {error}") from None
         except ValueError:
@@ -102,42 +135,59 @@ class Objects:
         """Return the current version; None if there is none."""
         with explained(f"read {self.name}"):
             try:
-                info, data = self._fs.info(self._manifest), self._fs.cat_file(self._manifest)
+                info = self._fs.info(self._manifest)
             except (FileNotFoundError, NotADirectoryError):
                 return None
+            with tempfile.NamedTemporaryFile() as arrived:
+                self._fs.get_file(self._manifest, arrived.name, callback=Arrival(checks.LARGEST_READ))
+                data = arrived.read()
             return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
+
+    def pushed(self, before: Manifest) -> Mapping[str, File]:
+        """Return the files of a version that a push wrote: all of them."""
+        return before.files
 
     def write(self, plan: PushPlan) -> None:
         """Upload missing objects, then replace the manifest and remove unused objects."""
         with explained(f"push to {self.name}"):
             found = self._fs.find(f"{self._root}/objects", detail=True)
+            if links := [name for name, info in found.items() if info.get("islink") or info["type"] == "link"]:
+                raise RemoteError(f"{links[0]} is a link, and nothing is written through links; remove it there")
             there = {name.rpartition("/")[2]: info["size"] for name, info in found.items()}
             files, before = plan.manifest.files, plan.before.files if plan.before else {}
             missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
             sources = [str(plan.local[path]) for path in missing.values()]
-            how = self._transfer_options("push", max([files[path].size for path in missing.values()], default=0))
-            self._fs.put(sources, [self._object(key) for key in missing], **how)
+            at_once = self._at_once(max([files[path].size for path in missing.values()], default=0))
+            bar = TqdmCallback(self._bar("push"))
+            self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **at_once)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
                     raise RemoteError(f"{plan.local[path]} was modified during the push; push again")
             if files != before:
-                self._switch(plan.manifest, plan.before)
-                named = {one.sha256 for one in (*files.values(), *before.values())}
-                if unused := there.keys() - named:
-                    self._fs.rm([self._object(key) for key in unused])
+                old, new = ({one.sha256 for one in some.values()} for some in (before, files))
+                listed = plan.before.replaced if plan.before else set[str]()
+                unused = (listed & there.keys()) - old - new
+                self._switch(replace(plan.manifest, replaced=frozenset(old - new | unused)), plan.before)
+                with suppress(FileNotFoundError):  # another push removes them, too
+                    if unused:
+                        self._fs.rm([self._object(key) for key in unused])
 
     def fetch(self, manifest: Manifest, folder: Path) -> None:
         """Download objects to the paths of their files in a folder, without checking hashes."""
         with explained(f"pull from {self.name}"):
+            sizes = {self._object(file.sha256): file.size for file in manifest.files.values()}
             sources = [self._object(file.sha256) for file in manifest.files.values()]
-            how = self._transfer_options("pull", max(file.size for file in manifest.files.values()))
-            self._fs.get(sources, [str(folder / path) for path in manifest.files], **how)
+            targets = [str(folder / path) for path in manifest.files]
+            bar = Arrivals(sizes, self._bar("pull"))
+            self._fs.get(sources, targets, callback=bar, **self._at_once(max(sizes.values())))
 
-    def _transfer_options(self, what: str, largest: int) -> dict[str, Any]:
-        """Return options of a transfer: a progress bar, and the number of concurrent files."""
-        bar = TqdmCallback({"desc": what, "unit": " files", "disable": True if self._quiet else None})
+    def _bar(self, what: str) -> dict[str, Any]:
+        return {"desc": what, "unit": " files", "disable": True if self._quiet else None}
+
+    def _at_once(self, largest: int) -> dict[str, int]:
+        """Return the option of a transfer for the number of concurrent files."""
         at_once = _SMALL_AT_ONCE if largest <= _SMALL else _AT_ONCE
-        return {"callback": bar, **({"batch_size": at_once} if self._fs.async_impl else {})}
+        return {"batch_size": at_once} if self._fs.async_impl else {}
 
     def _switch(self, new: Manifest, before: Manifest | None) -> None:
         """Replace the manifest if it still equals `before`: on S3 atomically, elsewhere after reading it once more."""

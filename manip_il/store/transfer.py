@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,12 +13,14 @@ from manip_il import checks
 from manip_il.data import atomic
 from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_layout import INFO
+from manip_il.data.ownership import DATASET, EPISODES, POLICY, kind_of, output_of, require_replaceable
 from manip_il.doctor.examine import examine_folder
 from manip_il.doctor.finding import NotWhole, journals_of
-from manip_il.errors import FolderExistsError, UsageError
+from manip_il.errors import UsageError
 from manip_il.store.errors import RemoteError
 from manip_il.store.hub import Hub
 from manip_il.store.manifest import (
+    CARD,
     CHECKPOINTS,
     JOURNALS,
     LAST,
@@ -69,16 +72,19 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
             raise NotWhole(f"{text}; see all errors with manip-il data check, and try manip-il data repair {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         local = list_files(source.absolute(), kind, journals=journals)
-        if isinstance(remote, Hub):  # other remotes hold the folder unchanged
-            local |= remote.additions(source, local, Path(folder))
         before = remote.read()
         if before and before.kind != kind:
             raise UsageError(f"{remote.name} holds a {before.kind}, not a {kind}; choose another name")
+        old, pushed = (before.files, remote.pushed(before)) if before else ({}, {})
+        if isinstance(remote, Hub):  # other remotes hold the folder unchanged
+            local = remote.with_card(source, local, Path(folder), keeps=CARD in old.keys() - pushed.keys())
         with ThreadPoolExecutor() as pool:
             manifest = Manifest(kind, dict(zip(local, pool.map(File.of, local.values()), strict=True)))
-        old, new = before.files if before else {}, manifest.files
+        new = manifest.files
         same = {path for path in old.keys() & new.keys() if old[path] == new[path] or old[path].fits(local[path])}
-        plan = PushPlan(manifest, before, local, sorted(new.keys() - same), sorted(old.keys() - new.keys()))
+        plan = PushPlan(
+            manifest, before, local, sorted(new.keys() - same), sorted(old.keys() & pushed.keys() - new.keys())
+        )
         if not dry_run:
             remote.write(plan)
     return plan
@@ -99,19 +105,29 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
     if dry_run:
         return manifest
     beside, skip = journals_of(target), len(f"{JOURNALS}/")
-    journals = [path for path in files if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")]
-    if beside.exists() and not overwrite and not all(files[path].fits(beside / path[skip:]) for path in journals):
-        raise FolderExistsError(beside)  # journals equal to the remote's are allowed: a killed pull left them
-    with atomic.new_folder(target, replace=overwrite) as partial:
+    journals = {
+        beside / path[skip:]: file
+        for path, file in files.items()
+        if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")
+    }
+    there = {path for path in beside.rglob("*") if not path.is_dir()}
+    if there == journals.keys() and all(file.fits(path) for path, file in journals.items()):
+        journals = {}  # they are in place, as a killed pull leaves them
+    if journals:
+        require_replaceable(beside, EPISODES if overwrite else "")
+    kind = kind_of(target) or ""
+    kind = DATASET if manifest.kind == "dataset" else kind if kind.startswith(output_of("")) else POLICY
+    with atomic.new_folder(target, replaces=kind if overwrite else "") as partial:
         _fetch(partial, remote, manifest)
         for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:
             if (name := newest(checkpoints)) and not (checkpoints / LAST).exists():
                 (checkpoints / LAST).symlink_to(name)
         if journals:
-            with atomic.new_folder(beside, replace=True) as folder:
+            with atomic.new_folder(beside, replaces=EPISODES if overwrite else "") as folder:
                 for path in list((partial / JOURNALS).iterdir()):
                     path.rename(folder / path.name)
-            (partial / JOURNALS).rmdir()
+        if manifest.kind == "dataset":
+            shutil.rmtree(partial / JOURNALS, ignore_errors=True)
     return manifest
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,34 +15,41 @@ from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
 from manip_il.cli.train import SourceGroup, TrainOptions
 from manip_il.data.atomic import exclusive, write_file
+from manip_il.data.lerobot_layout import OURS
+from manip_il.data.ownership import DATASET, EPISODES, output_of
 from manip_il.errors import FolderExistsError, MismatchError, UsageError
+
+from .made_runs import files
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+EVALUATION = output_of("Eval")
 
 
 @pytest.fixture
 def ours(tmp_path):
     folder = tmp_path / "run"
-    write_file(folder / "config.yaml", f"{CONFIG_HEADER} 0: resolved\n".encode())
+    write_file(folder / "config.yaml", f"{CONFIG_HEADER} 0: resolved options (EvalOptions)\n".encode())
     return folder
 
 
-def overwrite(folder: Path) -> None:
-    prepare_output(folder, overwrite=True)
+def overwrite(folder: Path, kind: str = EVALUATION) -> None:
+    prepare_output(folder, kind, overwrite=True)
 
 
 def test_a_new_or_empty_folder_is_fine_and_a_full_one_is_refused_with_the_ways_on(ours, tmp_path):
-    prepare_output(tmp_path / "new")
-    prepare_output(tmp_path / "new", resume=True)
+    prepare_output(tmp_path / "new", EVALUATION)
+    prepare_output(tmp_path / "new", EVALUATION, resume=True)
     (tmp_path / "empty").mkdir()
-    prepare_output(tmp_path / "empty")
+    prepare_output(tmp_path / "empty", EVALUATION)
     with pytest.raises(FolderExistsError, match=r"--resume=true.*--overwrite=true"):
-        prepare_output(ours)
+        prepare_output(ours, EVALUATION)
     with pytest.raises(UsageError, match="contradict"):
-        prepare_output(ours, resume=True, overwrite=True)
+        prepare_output(ours, EVALUATION, resume=True, overwrite=True)
 
 
 def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
     (ours / ".fingerprint.json.x.partial").touch()
-    prepare_output(ours, resume=True)
+    prepare_output(ours, EVALUATION, resume=True)
     assert [path.name for path in ours.iterdir()] == ["config.yaml"]
 
 
@@ -55,26 +63,37 @@ def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(t
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "is_ours"),
+    ("name", "content", "kind"),
     [
-        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options\nseed: 0\n", True),
-        ("meta/info.json", json.dumps({"features": {"action": {}, "executed_action": {}, "sim_state": {}}}), True),
-        ("eval.json", json.dumps({"success_rate": 1.0, "fingerprint": {}}), True),
-        ("config.yaml", "seed: 0\n", False),
-        ("thesis.tex", "years of work", False),
+        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options (EvalOptions)\nseed: 0\n", EVALUATION),
+        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options (TrainOptions)\nseed: 0\n", output_of("Train")),
+        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options (RecordOptions)\nseed: 0\n", EPISODES),
+        ("recording.json", json.dumps({"only_successes": True}), EPISODES),
+        ("meta/info.json", json.dumps({"features": {"action": {}, "executed_action": {}, "sim_state": {}}}), DATASET),
+        (OURS, json.dumps({"spec": {}, "fingerprint": {}}), DATASET),
+        ("eval.json", json.dumps({"success_rate": 1.0, "fingerprint": {}}), EVALUATION),
+        ("config.yaml", "seed: 0\n", None),
+        ("thesis.tex", "years of work", None),
     ],
 )
-def test_overwrite_deletes_what_this_program_made_and_nothing_else(tmp_path, name, content, is_ours):
+def test_overwrite_deletes_the_same_kind_that_this_program_made_and_nothing_else(tmp_path, name, content, kind):
     write_file(tmp_path / "run" / name, content.encode())
-    if is_ours:
+    for other in {EVALUATION, DATASET, EPISODES, output_of("Train")} - {kind}:
+        with pytest.raises(UsageError, match=kind or "did not make"):
+            overwrite(tmp_path / "run", other)
+        assert (tmp_path / "run" / name).read_text() == content
+    if kind:
         inode = (tmp_path / "run").stat().st_ino
-        overwrite(tmp_path / "run")
+        overwrite(tmp_path / "run", kind)
         assert list((tmp_path / "run").iterdir()) == []
         assert (tmp_path / "run").stat().st_ino == inode, "it may be a mount point"
-    else:
-        with pytest.raises(UsageError, match="did not make"):
-            overwrite(tmp_path / "run")
-        assert (tmp_path / "run" / name).read_text() == content
+
+
+def test_an_evaluation_does_not_replace_a_dataset(tmp_path):
+    root = shutil.copytree(SAMPLE, tmp_path / "demos")
+    before = files(root)
+    assert main([*EVAL, f"--output_dir={root}", "--overwrite=true"]) == 2
+    assert files(root) == before
 
 
 def test_nothing_is_deleted_in_a_folder_that_cannot_be_resumed(tmp_path):
@@ -93,7 +112,7 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
         overwrite(tmp_path / "link")
     assert (ours / "config.yaml").is_file()
     with pytest.raises(UsageError, match="overlaps"):
-        prepare_output(ours, overwrite=True, sources=[ours / "inside"])
+        prepare_output(ours, EVALUATION, overwrite=True, sources=[ours / "inside"])
     (ours / "dagger").mkdir()
     assert main(["theory", str(ours / "dagger"), f"--output_dir={ours}", "--overwrite=true"]) == 2
     assert main(["data", "build", str(ours), str(ours), "--overwrite=true"]) == 2

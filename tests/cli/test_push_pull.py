@@ -64,7 +64,7 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
         assert main(["pull", url, str(target), f"--overwrite={asked}"]) == 2
         assert says in capsys.readouterr().err
     assert (target / "thesis.txt").read_text() == "mine"
-    (target / "config.yaml").write_text("# manip-il\n")
+    (target / "config.yaml").write_text("# manip-il 0.1.0: resolved options (TrainOptions)\n")
     assert main(["pull", url, str(target), "--overwrite=true"]) == 0
     assert not (target / "thesis.txt").exists()
 

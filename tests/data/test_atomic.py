@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from manip_il.data.atomic import exclusive, new_folder, write_file
-from manip_il.errors import FolderExistsError, ManipError
+from manip_il.data.ownership import CHECKPOINT, DATASET
+from manip_il.errors import FolderExistsError, ManipError, UsageError
 
 
 def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
@@ -28,14 +32,18 @@ def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
 
 def test_what_is_there_is_not_written_over_unless_asked_and_stays_until_the_new_one_is_whole(tmp_path):
     root = tmp_path / "root"
-    root.mkdir()
+    (root / "meta").mkdir(parents=True)
     (root / "old").touch()
-    with pytest.raises(FolderExistsError), new_folder(root):
+    for kind, refusal in (("", FolderExistsError), (DATASET, UsageError)):
+        with pytest.raises(refusal), new_folder(root, replaces=kind):
+            pass
+    (root / "meta" / "manip_il.json").write_text('{"fingerprint": {}}')
+    with pytest.raises(UsageError), new_folder(root, replaces=CHECKPOINT):
         pass
-    with pytest.raises(ZeroDivisionError), new_folder(root, replace=True):
+    with pytest.raises(ZeroDivisionError), new_folder(root, replaces=DATASET):
         _ = 1 / 0
     assert (root / "old").exists()
-    with new_folder(root, replace=True) as folder:
+    with new_folder(root, replaces=DATASET) as folder:
         (folder / "new").touch()
         assert (root / "old").exists()
     assert [path.name for path in root.iterdir()] == ["new"]
@@ -65,6 +73,15 @@ def test_a_link_in_the_place_of_a_new_folder_is_replaced_and_not_followed(tmp_pa
     assert (tmp_path / "root" / "x").exists()
 
 
+def test_somebodys_folder_in_the_place_of_a_new_one_is_spared(tmp_path):
+    somebodys = tmp_path / ".root.partial"
+    somebodys.mkdir()
+    (somebodys / "thesis.tex").touch()
+    with pytest.raises(UsageError, match=r"\.root\.partial"), new_folder(tmp_path / "root"):
+        pass
+    assert [path.name for path in somebodys.iterdir()] == ["thesis.tex"]
+
+
 def test_a_second_writer_is_refused_until_the_first_ends(tmp_path):
     writer = start("exclusive", tmp_path / "root")
     for _ in range(2):
@@ -90,6 +107,17 @@ def test_a_file_is_replaced_whole_and_holds_what_it_held_where_writing_fails(tmp
         write_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_full_disk_names_the_path_whichever_library_writes(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, limits[1]))
+    try:
+        with pytest.raises(ManipError, match=f"cannot write {tmp_path}/new: File"), new_folder(tmp_path / "new") as new:
+            save_file({"weights": np.zeros(1_000)}, new / "model.safetensors")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
 
 
 def start(what: str, root: Path) -> subprocess.Popen[str]:

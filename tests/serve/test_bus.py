@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 
@@ -80,6 +82,20 @@ def test_limits_and_offsets_are_kept_without_power_and_the_torque_is_not(bus: Bu
     assert again["Homing_Offset"].tolist() == [0, 7, 0, 0, 0, 0]
     assert not again["Torque_Enable"].any()
     again.close()
+
+
+def test_a_client_that_asks_without_reading_does_not_keep_the_port_open():
+    bus = Bus(KEPT)
+    client = os.open(bus.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    asked, deadline = packet(BROADCAST, SYNC_READ, 0, 70, 1, 2, 3, 4, 5, 6), time.monotonic() + 1
+    while time.monotonic() < deadline:
+        with contextlib.suppress(BlockingIOError):
+            os.write(client, asked * 50)
+    closing = threading.Thread(target=bus.close, daemon=True)
+    closing.start()
+    closing.join(20)
+    assert not closing.is_alive()
+    os.close(client)
 
 
 def test_garbage_is_not_answered_and_what_follows_is(bus: Bus):

@@ -15,6 +15,7 @@ import pytest
 from lerobot.robots.so_follower import SO101Follower, SOFollowerRobotConfig
 from lerobot.teleoperators.so_leader import SO101Leader, SOLeaderTeleopConfig
 
+from manip_il.cli.main import main
 from manip_il.errors import UsageError
 from manip_il.mdp import F64
 from manip_il.serve import operator, session
@@ -22,6 +23,8 @@ from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.serve.station import Station
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
+
+from ..cli.made_runs import files
 
 
 def station_of(folder: Path, servo: str = "sts3215", robot: str = "so101") -> Station:
@@ -47,6 +50,20 @@ def run(station: Station, seconds: float) -> None:
 def test_an_arm_without_feetech_servos_is_refused(tmp_path: Path):
     with pytest.raises(UsageError, match="panda has no Feetech servos"):
         station_of(tmp_path, robot="panda")
+
+
+@pytest.mark.parametrize("which", ["output_dir", "log"])
+def test_somebodys_folder_is_not_served_from(which: str, tmp_path: Path):
+    folder = tmp_path / "d"
+    folder.mkdir()
+    for name in ("follower", "recording.json"):
+        (folder / name).write_text("years of work")
+    (folder / "leader.json").write_text("[1, 2]")
+    before = files(folder)
+    free = {"output_dir": tmp_path / "out", which: folder}
+    words = [f"--{name}={path}" for name, path in free.items()]
+    assert main(["serve", "--task.type=lift", "--leader=none", *words, "--", "true"]) == 2
+    assert files(folder) == before
 
 
 def told(station: Station, joint: int, degrees: float) -> None:

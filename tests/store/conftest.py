@@ -65,6 +65,7 @@ def make_run(folder: Path, seed: int = 1, size: int = 20_000) -> Path:
     model.mkdir(parents=True)
     (folder / "checkpoints" / "last").symlink_to("000004")
     (folder / "README.md").write_text("# By hand\n")
+    (folder / "config.yaml").write_text("# manip-il 0.1.0: resolved options (TrainOptions)\n")
     for name, data in {"same.json": b"{}", "copy.json": b"{}", "empty.txt": b"", "new.txt": rng.bytes(99)}.items():
         (folder / name).write_bytes(data)
     (model / "config.json").write_text(f'{{"type": "act", "seed": {seed}}}')

@@ -54,11 +54,16 @@ class Repo:
 
 @dataclass
 class Hub:
-    """Repositories by name (`datasets/user/name`), and objects by sha256. change: of a body that goes out."""
+    """Repositories by name (`datasets/user/name`), and objects by sha256.
+
+    change: of a body that goes out. headers: further ones of an answer. tokens: with which it was asked.
+    """
 
     repos: dict[str, Repo] = field(default_factory=dict)
     objects: Files = field(default_factory=dict)
     change: Callable[[str, bytes], bytes] = lambda line, body: body
+    headers: Callable[[str], dict[str, str]] = lambda line: {}
+    tokens: list[str | None] = field(default_factory=list)
     url: str = ""
 
 
@@ -80,8 +85,9 @@ def hub_app(hub: Hub) -> Flask:
     @app.url_value_preprocessor
     def find_repo(endpoint: str | None, given: dict[str, Any] | None) -> None:
         token = request.headers.get("Authorization", "").removeprefix("Bearer ") or None
+        hub.tokens.append(token)
         if token not in (None, TOKEN):
-            refuse(401, "Invalid credentials in Authorization header")
+            refuse(401, f"Invalid credentials in Authorization header: {token}")
         if given and "user" in given:
             name = f"{given.pop('kind', 'models')}/{given.pop('user')}/{given.pop('name')}"
             given["repo"] = hub.repos.get(name)
@@ -90,7 +96,10 @@ def hub_app(hub: Hub) -> Flask:
 
     @app.after_request
     def change(response: Response) -> Response:
-        response.set_data(hub.change(f"{request.method} {request.full_path}", response.get_data()))
+        line = f"{request.method} {request.full_path}"
+        if body := response.get_data():
+            response.set_data(hub.change(line, body))
+        response.headers.update(hub.headers(line))
         return response
 
     @app.post("/api/repos/create")

@@ -82,6 +82,19 @@ def test_a_card_tells_no_place_and_no_secret(demos: Path, monkeypatch: pytest.Mo
         assert secret not in text
 
 
+def test_a_value_stays_on_its_line_of_a_command(tmp_path: Path):
+    meta, root = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "", {}, {}), tmp_path / "policy"
+    write_checkpoint(root, "act", Dataset.open(SAMPLE).spec, origin=meta)
+    fences = cards(root, "policy", "user/act")[CARD].count(b"\n```")
+    about, evil = json.loads((root / "manip_il.json").read_text()), "x\nrm -rf ~\n```\r$(rm -rf ~)"
+    values = {"object": evil, "task": f"pick_place:{evil}", "cameras": [evil], "image_size": [evil, 1], "fps": evil}
+    (root / "manip_il.json").write_text(json.dumps(about | values))
+    text = cards(root, "policy", "user/act")[CARD].decode()
+    assert not [line for line in text.splitlines() if line.lstrip().startswith(("rm -rf", "$"))]
+    assert text.count("\n```") == fences
+    assert "--env.object='x rm -rf ~ ``` $(rm -rf ~)'" in text
+
+
 def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path: Path):
     spec, run = Dataset.open(SAMPLE).spec, tmp_path / "run"
     meta = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -10,12 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.data.dataset import Dataset
 from manip_il.doctor.finding import NotWhole
-from manip_il.errors import FolderExistsError
+from manip_il.errors import FolderExistsError, UsageError
 from manip_il.store.errors import RemoteError
+from manip_il.store.manifest import MANIFEST_FILE
 from manip_il.store.objects import Objects
 from manip_il.store.transfer import open_remote, pull, push
 
+from ..learn.tiny_policies import write_checkpoint
 from .conftest import DATASET, POLICY, SAMPLE, content, make_run
 from .servers import Hub
 
@@ -79,6 +83,7 @@ def test_journals_go_along_when_asked_and_lie_beside_again(tmp_path: Path):
     root, url = shutil.copytree(SAMPLE, tmp_path / "d"), f"file://{tmp_path}/store"
     (tmp_path / "d.journals").mkdir()
     (tmp_path / "d.journals" / "seed_000000000001.mcap").write_bytes(b"of an episode")
+    (tmp_path / "d.journals" / "recording.json").write_text('{"only_successes": true}')
     for asked in (False, True):
         push(root, open_quietly(url), journals=asked)
         pull(open_quietly(url), tmp_path / "got", overwrite=True)
@@ -87,6 +92,13 @@ def test_journals_go_along_when_asked_and_lie_beside_again(tmp_path: Path):
     assert content(tmp_path / "got.journals") == content(tmp_path / "d.journals")
     shutil.rmtree(tmp_path / "got")  # as a kill between the two renames leaves it
     pull(open_quietly(url), tmp_path / "got")
+    (tmp_path / "got.journals" / "recording.json").unlink()  # so that nothing says that they are ours
+    (tmp_path / "got.journals" / "thesis.tex").touch()
+    before = content(tmp_path)
+    for overwrite in (False, True):
+        with pytest.raises(UsageError):
+            pull(open_quietly(url), tmp_path / "got", overwrite=overwrite)
+    assert content(tmp_path) == before
 
 
 def test_a_store_of_the_version_before_is_read_and_what_nobody_needs_removed(tmp_path: Path):
@@ -100,6 +112,78 @@ def test_a_store_of_the_version_before_is_read_and_what_nobody_needs_removed(tmp
     (run / "new.txt").write_text("other")
     push(run, open_quietly(f"file://{store}"))
     assert not unused.exists()
+
+
+def test_a_push_removes_what_the_manifest_before_lists_and_nothing_else(tmp_path: Path):
+    store, run = tmp_path / "store", make_run(tmp_path / "run")
+    others = {f"objects/{name}": b"of others" for name in ("00/" + "00" * 32, ".DS_Store", "3f/.nfs0001", "notes/x")}
+    for name, data in others.items():
+        (store / name).parent.mkdir(parents=True, exist_ok=True)
+        (store / name).write_bytes(data)
+    for text in ("one", "two", "three"):
+        (run / "new.txt").write_text(text)
+        push(run, open_quietly(f"file://{store}"))
+    there = content(store)
+    assert others.items() <= there.items()
+    assert b"one" not in there.values()
+    assert {b"two", b"three"} <= set(there.values())
+
+
+@pytest.mark.parametrize("scheme", ["file", pytest.param("sftp", marks=pytest.mark.slow)])
+def test_nothing_is_written_through_a_link_in_a_store(scheme: str, tmp_path: Path, monkeypatch, request):
+    run, store, mine = make_run(tmp_path / "run"), tmp_path / "store", tmp_path / "thesis.tex"
+    url = f"file://{store}"
+    if scheme == "sftp":
+        server = request.getfixturevalue("sshd")
+        monkeypatch.setenv("HOME", str(server.home))
+        url = server.url(store)
+    mine.write_text("years of work")
+    sha256 = hashlib.sha256((run / "new.txt").read_bytes()).hexdigest()
+    (store / "objects" / sha256[:2]).mkdir(parents=True)
+    (store / "objects" / sha256[:2] / sha256).symlink_to(mine)
+    with pytest.raises(RemoteError, match="is a link"):
+        push(run, open_quietly(url))
+    assert mine.read_text() == "years of work"
+    (store / "objects" / sha256[:2] / sha256).unlink()
+    (store / "objects" / sha256[:2]).rmdir()
+    (tmp_path / "folder").mkdir()
+    (store / "objects" / sha256[:2]).symlink_to(tmp_path / "folder")
+    with pytest.raises(RemoteError, match="is a link"):
+        push(run, open_quietly(url))
+    assert not list((tmp_path / "folder").iterdir())
+
+
+@pytest.mark.parametrize("url", [DATASET, POLICY])
+def test_what_others_keep_in_a_repository_stays_and_a_card_that_was_edited_there(url: str, hub: Hub, tmp_path: Path):
+    source = tmp_path / "source"
+    shutil.copytree(SAMPLE, source) if url == DATASET else write_checkpoint(source, "act", Dataset.open(SAMPLE).spec)
+    (source / "notes.txt").write_text("ours")
+    push(source, open_quietly(url))
+    repo = hub.repos[url.removeprefix("hf://") if url == DATASET else "models/user/policy"]
+    files = repo.find("main")[1]
+    edited = {"README.md": files["README.md"] + b"Edited there.\n", "paper.pdf": b"of others"}
+    repo.commit("main", {**files, **edited})
+    for text in ("one", "two"):
+        (source / "more.txt").write_text(text)
+        (source / "notes.txt").unlink(missing_ok=True)
+        push(source, open_quietly(url))
+    after = repo.find("main")[1]
+    assert edited.items() <= after.items()
+    assert after["more.txt"] == b"two"
+    assert "notes.txt" not in after
+
+
+def test_a_dataset_replaces_that_of_another_program_without_what_is_beside_it(hub: Hub, tmp_path: Path):
+    push(SAMPLE, open_quietly(DATASET))
+    repo = hub.repos["datasets/user/demos"]
+    files = {path: data for path, data in repo.find("main")[1].items() if path != MANIFEST_FILE}
+    repo.commit("main", {**files, "data/chunk-000/file-001.parquet": b"PAR1", "paper.pdf": b"of others"})
+    demos = shutil.copytree(SAMPLE, tmp_path / "demos")
+    (demos / "notes.txt").write_text("more")
+    push(demos, open_quietly(DATASET))
+    after = repo.find("main")[1]
+    assert "paper.pdf" in after
+    assert "data/chunk-000/file-001.parquet" not in after
 
 
 def test_a_dataset_is_examined_before_its_push_and_links_are_not_followed(tmp_path: Path):
