@@ -17,6 +17,7 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
+FRAGMENT = ": it is a fragment; expected the model that includes it"
 KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
 
@@ -57,8 +58,10 @@ class ModelFiles:
                 included = {path: (home / path).read_bytes() for path in _included(model, home)}
                 spec = mujoco.MjSpec.from_string(model.decode(), include=included, assets=assets)
                 spec.meshdir = ""
+            if not spec.joints:
+                raise ManipError(f"{self.model} has no joints{FRAGMENT}")
         except (ManipError, ValueError) as error:
-            why = " ".join(str(error).split())
+            why = " ".join(str(error).split()) + FRAGMENT * ("XML model type" in str(error))
             named = "" if str(self.model) in why else f"cannot read {self.model}: "
             raise UsageError(f"robot {robot}: {named}{why}") from None
         return spec.copy()  # which does not repeat the warnings at every compilation
