@@ -18,6 +18,7 @@ from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
 _INCLUDE = re.compile(rb"<(?:include|model)\s[^>]*?\bfile\s*=\s*[\"']([^\"']+)")
+FRAGMENT = ": it is a fragment; expected the model that includes it"
 KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
 
@@ -58,8 +59,10 @@ class ModelFiles:
                 assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in sorted(meshes)}
                 spec = mujoco.MjSpec.from_string(model.decode(), include=included, assets=assets)
                 spec.meshdir = ""
+            if not spec.joints:
+                raise ManipError(f"{self.model} has no joints{FRAGMENT}")
         except (ManipError, ValueError) as error:
-            why = " ".join(str(error).split())
+            why = " ".join(str(error).split()) + FRAGMENT * ("XML model type" in str(error))
             named = "" if str(self.model) in why else f"cannot read {self.model}: "
             raise UsageError(f"robot {robot}: {named}{why}") from None
         return spec.copy()  # which does not repeat the warnings at every compilation

@@ -17,7 +17,7 @@ from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import EndEffector, Robot
 from manip_il.robots.rotations import hand_down, rotation_vector
-from manip_il.robots.spec import arm_spec, bare_spec, require
+from manip_il.robots.spec import arm_model, arm_spec, bare_spec, require
 
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
@@ -32,6 +32,7 @@ _METRES, _TURN = 4, 6  # decimals of positions [m] and of quaternions
 _STARTS, _STEPS = 40, 150  # inverse kinematics: number of random postures, and of steps from each
 _LONGEST = 0.2  # longest step of a joint [rad]
 _HIGHEST = 0.2  # height of the hand over the table, or half the workspace's height if that is less [m]
+_ON_PLACE = 0.05  # a root body nearer than this to where it would stand best needs no other `base` [m]
 _LOWER = (1.0, 0.7, 0.4)  # shares of that height, tried in order
 _ARRIVED = 0.01  # tolerated pose error [m], a radian counting as 5 cm
 _ANGLE_AS_LENGTH = 0.05
@@ -169,9 +170,21 @@ def find_home(robot: Robot, turns: bool) -> Robot:
         mount = " gripper.quaternion (how the gripper is mounted)," if robot.gripper.files else ""
         raise UsageError(
             f"robot {robot.name}: the hand cannot point down over the workspace's centre ({x:g}, {y:g});"
-            f" check workspace.centre,{mount} hand and base, or set home"
+            f" check workspace.centre,{mount} hand and base, or set home{_stance(robot)}"
         )
     return best[1]
+
+
+def _stance(robot: Robot) -> str:
+    """Propose the `base` on the table from which an arm whose model stands high or turned faces the workspace."""
+    model, ahead = arm_model(robot), np.zeros(3)
+    mujoco.mju_rotVecQuat(ahead, np.eye(3)[0], model.body_quat[1])
+    root, centre = model.body_pos[1], np.array([*robot.workspace.centre, 0.0])
+    base = centre - np.linalg.norm((centre - root)[:2]) * ahead * [1, 1, 0]
+    if np.allclose(base, root, atol=_ON_PLACE):
+        return ""
+    stands = f"the model's root stands at {_rounded(root, 2)} and faces {_rounded(ahead, 2)}"
+    return f"; {stands}: try base: {list(_rounded(base, 2))}"
 
 
 def _half_turned(ee: EndEffector) -> EndEffector:

@@ -7,7 +7,7 @@ the gap between the fingers is measured once they rest. Parallel, hinged and lin
 from __future__ import annotations
 
 import bisect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -156,11 +156,8 @@ def sweep(robot: Robot) -> Sweep:
         openings.append(min(float(one.min()) for one in gaps_at(pose, pads)))
         middle = nearest(model, data, pads)[1].mean(axis=0) - data.site("ee").xpos
         middles.append(float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle))
-    if openings[-1] - openings[0] < _LEAST_TRAVEL or (np.diff(openings) <= 0).any() or (np.diff(shares) <= 0).any():
-        raise UsageError(
-            f"robot {robot.name}: the fingers stand {openings[0]:.3f} m apart when closed, {openings[-1]:.3f} m "
-            "when open; expected the gap to grow all the way: check gripper.joints, closed, open and fingers"
-        )
+    linked = _linked(robot, model, wide)
+    _check_growth(robot, openings, shares, linked)
     holding = jaws  # a turning jaw holds wide objects farther from its tip
     if np.ptp(middles) < _LOPSIDED:
         middles = [0.0] * len(middles)
@@ -170,7 +167,22 @@ def sweep(robot: Robot) -> Sweep:
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
     ]
-    return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=_linked(robot, model, wide))
+    return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=linked)
+
+
+def _check_growth(robot: Robot, openings: Sequence[float], shares: Sequence[float], linked: Iterable[str]) -> None:
+    """Raise `UsageError` unless the gap grows with every command. linked: names of the undriven joints."""
+    growth = np.minimum(np.diff(openings), np.diff(shares))
+    if openings[-1] - openings[0] >= _LEAST_TRAVEL and growth.min() > 0:
+        return
+    config, place = robot.gripper, int((growth <= 0).argmax())  # the first step without growth
+    start, end = np.interp(shares[place : place + 2], [0, 1], [config.closed[0], config.open[0]])
+    raise UsageError(
+        f"robot {robot.name}: the fingers stand {openings[0]:.4f} m apart when closed, {openings[-1]:.4f} m when open, "
+        f"and go from {openings[place]:.4f} to {openings[place + 1]:.4f} m as {config.joints[0]} goes from {start:.3f} "
+        f"to {end:.3f}; expected the gap to grow all the way: check gripper.joints (undriven: "
+        f"{', '.join(linked) or 'none'}), closed, open and fingers"
+    )
 
 
 def _linked(robot: Robot, model: mujoco.MjModel, poses: Sequence[F64]) -> dict[str, F64]:

@@ -64,11 +64,11 @@ def _turn_inertias(spec: mujoco.MjSpec) -> None:
     Its reader gives `iquat`, the axes with that rotation, which its compiler replaces by the tensor's own axes.
     """
     for body in spec.bodies:
-        xx, yy, zz, xy, xz, yz = tensor = body.fullinertia
+        tensor = np.array(body.fullinertia)  # xx, yy, zz, xy, xz, yz
         if np.isnan(tensor).any() or tuple(body.iquat) == (1, 0, 0, 0):  # no tensor, or one of an MJCF
             continue
         moments = np.zeros(3)
-        mujoco.mju_eig3(moments, np.zeros(9), np.zeros(4), np.array([xx, xy, xz, xy, yy, yz, xz, yz, zz]))
+        mujoco.mju_eig3(moments, np.zeros(9), np.zeros(4), tensor[[0, 3, 4, 3, 1, 5, 4, 5, 2]])
         body.inertia, body.fullinertia = moments, np.full(6, np.nan)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,14 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from manip_il.errors import UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots.geometry import distance, outline
-from manip_il.robots.gripper import TOUCH
+from manip_il.robots.gripper import TOUCH, sweep
+from manip_il.robots.table import get_robot
 from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 
 from ..scenes import started, still, world_at_home
 from ..tables import every_robot
+from .own import model_of, tree_of, write
 
 EDGE = 0.05  # of the model's cube [m]
 
@@ -64,6 +69,18 @@ def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
             for other in pads
         )
         assert world.opening == pytest.approx(gap, abs=1e-3)
+
+
+def test_a_gap_that_stops_growing_is_refused_where_it_does_with_the_joints_that_nothing_drives(tmp_path: Path):
+    tree = tree_of("hinges")
+    tree["gripper"] |= {"joints": ["right"], "closed": [-0.2], "open": [2.8]}
+    model = model_of("hinges").replace('range="-0.4 0.8"', 'range="-0.4 3"')
+    with pytest.raises(UsageError, match=r"(?s)as right goes.*undriven: left") as refused:
+        sweep(get_robot(str(write(tmp_path, tree=tree, model=model))))
+    numbers = r"from (\S+) to (\S+) m as right goes from (\S+) to (\S+);"
+    before, after, start, end = map(float, re.search(numbers, str(refused.value)).groups())
+    assert before >= after > 0.05
+    assert 0.8 < start < end < 2.8
 
 
 @given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.1, 0.3))

@@ -56,6 +56,21 @@ def test_an_arm_without_fingers_is_refused_in_one_line(tmp_path: Path):
         suggest(path)
 
 
+PIECES = {
+    "assets": "<mujoco><asset/></mujoco>",
+    "a body": "<mujoco><body name='arm'><joint/><geom size='1'/></body></mujoco>",
+    "included": "<mujocoinclude><body name='arm'><joint/><geom size='1'/></body></mujocoinclude>",
+}
+
+
+@pytest.mark.parametrize("piece", PIECES)
+def test_a_piece_of_a_model_is_called_a_fragment(piece: str, tmp_path: Path):
+    path = tmp_path / "arm.xml"
+    path.write_text(PIECES[piece])
+    with pytest.raises(UsageError, match=r"arm\.xml.*is a fragment"):
+        suggest(path)
+
+
 def with_gripper(folder: Path, quat: str) -> list[str]:
     """The words that make a YAML for an arm and a gripper's model, whose palm is turned."""
     flange = '<body name="flange" pos="0 0 0.02"><geom size="0.01"/></body>'
